@@ -1,0 +1,103 @@
+"""Graph to GraphDef.
+
+Two dialects: *portable* writes only what TensorFlow 1.4 knows (no attribute or op newer than it, no ``_class``, no
+device, no function library), which every later version reads too; *explicit* writes every attribute, because
+TensorFlow.js applies no defaults to some of them (``dilations``).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from converters import schema
+from converters.frozen_graph.tensors import from_array
+from converters.graph.ops.base import REQUIRED, Attr
+from converters.graph.ops.table import op_of
+from converters.graph.shapes import Types, infer_types
+from signatures.errors import UnsupportedOpError
+from signatures.graph import Graph, Node, TensorShape
+
+#: GraphDef version written: that of TF 1.4. (Graphs frozen by TF 1.x carry none, which TensorFlow.js cannot read.)
+PRODUCER = 24
+#: Ops in the table that TF 1.4 lacks; the normalise pass leaves none of them, fused ops are for TensorFlow.js.
+_NEWER_OPS = frozenset(("BroadcastTo", "_FusedMatMul", "_FusedConv2D"))
+
+
+def encode(graph: Graph, *, explicit: bool = False) -> Any:
+    """A GraphDef message. Raises UnsupportedOpError when the portable dialect lacks an op."""
+    types = infer_types(graph)
+    message = schema.GraphDef()
+    message.versions.producer = PRODUCER
+    for node in graph.nodes:
+        if not explicit and node.op in _NEWER_OPS:
+            raise UnsupportedOpError(
+                f"{node.op} (node {node.name!r}) does not exist in TensorFlow 1.4",
+                issues=[(node.name, node.op)],
+                why="a .bytes graph must load in the runtimes of its time",
+                fix="write the other formats: --to saved_model,tfjs,onnx",
+            )
+        proto = message.node.add(name=node.name, op=node.op)
+        proto.input.extend(node.inputs)
+        if node.op == "Const":
+            assert node.value is not None
+            proto.attr["dtype"].type = schema.dtype_number(node.value.dtype)
+            proto.attr["value"].tensor.CopyFrom(from_array(node.value))
+            continue
+        for attr in op_of(node).attrs:
+            value = _value(node, attr, types)
+            if value is _OMIT or (not explicit and attr.since is not None and value == attr.default):
+                continue
+            _set(proto.attr[attr.name], attr, value)
+    return message
+
+
+_OMIT: Any = object()
+
+
+def _value(node: Node, attr: Attr, types: Types) -> Any:
+    if attr.derive is None:
+        value = node.attrs.get(attr.name, attr.default)
+        return _OMIT if value is REQUIRED else value
+    side, _, position = attr.derive.partition(":")
+    if side == "count":
+        return len(node.inputs) - int(position or 0)
+    if side == "in":
+        return types[node.inputs[int(position)]].dtype
+    return types[node.name].dtype
+
+
+def _set(proto: Any, attr: Attr, value: Any) -> None:
+    if isinstance(value, tuple):
+        proto.list.SetInParent()
+        if attr.kind == "int":
+            proto.list.i.extend(value)
+        else:
+            proto.list.s.extend(v.encode() for v in value)
+    elif attr.kind == "type":
+        proto.type = schema.dtype_number(np.dtype(value))
+    elif attr.kind == "int":
+        proto.i = int(value)
+    elif attr.kind == "float":
+        proto.f = float(value)
+    elif attr.kind == "bool":
+        proto.b = bool(value)
+    elif attr.kind == "str":
+        proto.s = value.encode()
+    else:
+        _set_shape(proto.shape, value)
+
+
+def _set_shape(proto: Any, value: TensorShape) -> None:
+    proto.SetInParent()
+    if value.dims is None:
+        proto.unknown_rank = True
+        return
+    for size in value.dims:
+        proto.dim.add(size=-1 if size is None else size)
+
+
+def string_constant(name: str, text: str) -> Node:
+    """An unconnected string Const: how a GraphDef carries the contract."""
+    return Node(name, "Const", value=np.array(text.encode(), np.bytes_))

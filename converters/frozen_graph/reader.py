@@ -1,0 +1,112 @@
+"""GraphDef bytes to Graph.
+
+The reader takes the file as it is: all ops, all attributes, training part included. What the policy needs is decided
+later (``converters.graph.passes``), so that a graph with unknown training ops can still be read.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from converters import schema
+from converters.frozen_graph.tensors import to_array
+from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.graph import Graph, Node, TensorShape, normal_ref, topological
+
+#: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).
+SCALAR_SHAPE_PRODUCER = 24
+
+
+def read_graph(data: bytes) -> Graph:
+    """Parse a serialised GraphDef.
+
+    Raises DamagedFileError when it cannot be decoded, GraphError on dangling inputs or cycles, NotAPolicyError when
+    it decodes to a graph without nodes.
+    """
+    return from_graph_def(schema.parse(schema.GraphDef, data, "TensorFlow graph"))
+
+
+def from_graph_def(graph_def: Any) -> Graph:
+    """A Graph of a GraphDef message (ours, or any object with the same fields)."""
+    if not graph_def.node:
+        raise NotAPolicyError("the graph has no nodes", fix="give the frozen graph that training wrote")
+    calls = {f.signature.name for f in graph_def.library.function}
+    nodes = [_node(n, graph_def.versions.producer) for n in graph_def.node]
+    for node in nodes:
+        if node.op in calls or node.op in ("PartitionedCall", "StatefulPartitionedCall"):
+            raise NotAPolicyError(
+                f"node {node.name!r} calls the function {node.op!r}",
+                why="the graph was saved from TensorFlow 2 functions and is not flat",
+                fix="freeze it with convert_variables_to_constants_v2(f, lower_control_flow=True), which inlines them",
+            )
+    return Graph(topological(nodes))
+
+
+def _node(proto: Any, producer: int) -> Node:
+    if not proto.name or not proto.op:
+        raise DamagedFileError(
+            "a node has no name or no op",
+            why="the bytes decode as protobuf but not as a TensorFlow graph",
+            fix="give the frozen graph (.bytes, frozen_graph_def.pb) that training wrote",
+        )
+    attrs: dict[str, Any] = {}
+    value: np.ndarray | None = None
+    for key in sorted(proto.attr):
+        if key.startswith("_"):
+            continue
+        if proto.op == "Const" and key == "value":
+            value = to_array(proto.attr[key].tensor, proto.name)
+        else:
+            attrs[key] = _attribute(proto.attr[key])
+    if proto.op == "Const":
+        if value is None:
+            raise DamagedFileError(
+                f"the constant {proto.name!r} has no value", fix="freeze the graph again; this file is damaged"
+            )
+        attrs = {}
+    if proto.op == "Placeholder" and attrs.get("shape") == TensorShape(()) and producer < SCALAR_SHAPE_PRODUCER:
+        attrs["shape"] = TensorShape(None)
+    inputs = tuple(normal_ref(i) for i in proto.input if not i.startswith("^"))
+    return Node(proto.name, proto.op, inputs, attrs, value, origin=f"{proto.name}:0")
+
+
+def _shape(proto: Any) -> TensorShape:
+    if proto.unknown_rank:
+        return TensorShape(None)
+    return TensorShape(tuple(None if d.size < 0 else int(d.size) for d in proto.dim))
+
+
+def _attribute(proto: Any) -> Any:
+    kind = proto.WhichOneof("value")
+    if kind == "s":
+        return _text(proto.s)
+    if kind in ("i", "f", "b"):
+        return getattr(proto, kind)
+    if kind == "type":
+        return schema.dtype_of(proto.type)
+    if kind == "shape":
+        return _shape(proto.shape)
+    if kind == "tensor":
+        return to_array(proto.tensor, "attribute")
+    if kind == "func":
+        return proto.func.name
+    if kind == "list":
+        items = proto.list
+        for field, convert in (
+            ("s", _text),
+            ("i", int),
+            ("f", float),
+            ("b", bool),
+            ("type", schema.dtype_of),
+            ("shape", _shape),
+        ):
+            if values := getattr(items, field):
+                return tuple(convert(v) for v in values)
+        return ()
+    return None
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")

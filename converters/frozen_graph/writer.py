@@ -1,0 +1,22 @@
+"""Policy to ``<policy>.bytes``: a frozen GraphDef that loads in every TensorFlow from 1.4 on."""
+
+from __future__ import annotations
+
+from converters import schema
+from converters.artifact import Artifact, WriteOptions
+from converters.frozen_graph.encode import encode, string_constant
+from converters.graph.compile import CONTRACT_NODE
+from signatures.graph import Graph
+from signatures.spec import Policy
+
+
+def with_contract(graph: Graph, contract: str) -> Graph:
+    """The graph with the contract as an unconnected string constant."""
+    return Graph((*graph.nodes, string_constant(CONTRACT_NODE, contract)))
+
+
+def write(policy: Policy, options: WriteOptions) -> Artifact:
+    """The ``.bytes`` artefact."""
+    message = encode(with_contract(policy.graph, options.contract))
+    path = f"{policy.name}.bytes"
+    return Artifact("bytes", path, {path: schema.serialise(message)})

@@ -1,0 +1,734 @@
+"""Ops that make, move and reshape arrays. Most kernels are structural: they also work on symbolic shape vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.base import (
+    Attr,
+    OnnxBuilder,
+    OpDef,
+    as_int64,
+    constant_input,
+    not_constant,
+    require_constant,
+    same_as,
+    shape_error,
+    squeezed,
+    type_attr,
+    unsqueezed,
+)
+from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, broadcast, of_array, product
+from signatures.graph import Node, TensorShape
+
+T = type_attr()
+
+
+# ------------------------------------------------------------------ sources and pass-throughs
+
+
+def _infer_const(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    assert node.value is not None
+    return [of_array(node.value)]
+
+
+def placeholder_type(node: Node, symbols: Symbols) -> TensorType:
+    """The type of a Placeholder: its leading free axis is the batch, further free axes are unknown lengths."""
+    shape: TensorShape = node.attrs["shape"]
+    if shape.dims is None:
+        return TensorType(node.attrs["dtype"], None)
+    dims: list[Dim] = [
+        (BATCH if i == 0 else symbols.fresh()) if d is None else int(d) for i, d in enumerate(shape.dims)
+    ]
+    return TensorType(node.attrs["dtype"], tuple(dims))
+
+
+def _infer_placeholder(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    return [placeholder_type(node, symbols)]
+
+
+def _identity(node: Node, x: np.ndarray) -> np.ndarray:
+    return x
+
+
+def _lower_identity(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.value(node.inputs[0])
+
+
+# ------------------------------------------------------------------ shape of things
+
+
+def _shape(node: Node, x: np.ndarray) -> np.ndarray:
+    return np.array(x.shape, node.attrs["out_type"])
+
+
+def _infer_shape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(node.attrs["out_type"], (symbols.fresh(),))]
+    if all(isinstance(d, int) for d in shape):
+        return [of_array(np.array(shape, node.attrs["out_type"]))]
+    value = np.empty(len(shape), object)
+    value[:] = shape
+    return [TensorType(node.attrs["out_type"], (len(shape),), value)]
+
+
+def _lower_shape(node: Node, builder: OnnxBuilder) -> Any:
+    value = builder.emit("Shape", [builder.value(node.inputs[0])])
+    return value if node.attrs["out_type"] != INT32 else builder.emit("Cast", [value], to=INT32)
+
+
+def _infer_size(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    dtype = node.attrs["out_type"]
+    if args[0].shape is None:
+        return [TensorType(dtype, ())]
+    total = product(args[0].shape, symbols)
+    value = np.array(total, dtype if isinstance(total, int) else object)
+    return [TensorType(dtype, (), value)]
+
+
+def _lower_size(node: Node, builder: OnnxBuilder) -> Any:
+    value = builder.emit("Size", [builder.value(node.inputs[0])])
+    return value if node.attrs["out_type"] != INT32 else builder.emit("Cast", [value], to=INT32)
+
+
+def _infer_rank(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    rank = args[0].rank
+    return [TensorType(INT32, (), None if rank is None else np.array(rank, np.int32))]
+
+
+def _target_dims(value: np.ndarray | None, kind: TensorType, symbols: Symbols) -> list[Dim] | None:
+    """The dims that a shape operand stands for; fresh symbols where it is not known."""
+    if value is not None:
+        return [d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist()]
+    if kind.shape is not None and len(kind.shape) == 1 and isinstance(kind.shape[0], int):
+        return [symbols.fresh() for _ in range(kind.shape[0])]
+    return None
+
+
+def _infer_reshape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    target = _target_dims(args[1].value, args[1], symbols)
+    if target is None:
+        return [TensorType(args[0].dtype, None)]
+    if target.count(-1) > 1:
+        raise shape_error(node, args, "the target shape leaves more than one axis open")
+    source = args[0].shape
+    if -1 in target:
+        target[target.index(-1)] = _open_length(node, args, source, target, symbols)
+    elif source is not None and all(isinstance(d, int) for d in (*source, *target)):
+        if product(source, symbols) != product(target, symbols):
+            raise shape_error(node, args, f"{list(source)} does not reshape to {target}")
+    value = args[0].value
+    if value is not None and all(isinstance(d, int) for d in target):
+        value = value.reshape([int(d) for d in target])
+    else:
+        value = None
+    return [TensorType(args[0].dtype, tuple(target), value)]
+
+
+def _open_length(
+    node: Node, args: Sequence[TensorType], source: tuple[Dim, ...] | None, target: list[Dim], symbols: Symbols
+) -> Dim:
+    """The length that -1 stands for: what is left of the source when the other axes are divided out."""
+    if source is None:
+        # Unknown source: [-1, n] of a graph without shapes is, in every policy seen, one row per agent.
+        return BATCH if target[0] == -1 else symbols.fresh()
+    names = [d for d in source if isinstance(d, str)]
+    number = 1
+    for d in source:
+        number *= d if isinstance(d, int) else 1
+    for d in target:
+        if isinstance(d, str):
+            if d not in names:
+                return symbols.fresh()
+            names.remove(d)
+        elif d != -1:
+            if d == 0 or (number % d and not names):
+                raise shape_error(node, args, f"{list(source)} does not reshape to {target}")
+            if number % d:
+                return symbols.fresh()
+            number //= d
+    if not names:
+        return number
+    return names[0] if len(names) == 1 and number == 1 else symbols.fresh()
+
+
+def _lower_reshape(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Reshape", [builder.value(node.inputs[0]), as_int64(node, builder, 1)], allowzero=0)
+
+
+def _squeeze_axes(node: Node, shape: Sequence[Dim]) -> tuple[int, ...]:
+    wanted = node.attrs["squeeze_dims"]
+    if wanted:
+        return tuple(sorted({int(a) % len(shape) for a in wanted}))
+    return tuple(i for i, d in enumerate(shape) if d == 1)
+
+
+def _squeeze(node: Node, x: np.ndarray) -> np.ndarray:
+    return np.squeeze(x, _squeeze_axes(node, x.shape))
+
+
+def _infer_squeeze(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    if not node.attrs["squeeze_dims"] and any(isinstance(d, str) and d != BATCH for d in shape):
+        raise not_constant(node, "a list of axes to squeeze")
+    axes = _squeeze_axes(node, shape)
+    return [TensorType(args[0].dtype, tuple(d for i, d in enumerate(shape) if i not in axes))]
+
+
+def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
+    shape = builder.type_of(node.inputs[0]).shape
+    assert shape is not None
+    return squeezed(builder, builder.value(node.inputs[0]), _squeeze_axes(node, shape))
+
+
+def _expand_dims(node: Node, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    return np.expand_dims(x, int(axis.reshape(())))
+
+
+def _infer_expand_dims(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    if args[0].shape is None:
+        return [TensorType(args[0].dtype, None)]
+    axis = int(require_constant(node, args, 1, "an axis").reshape(()))
+    dims = list(args[0].shape)
+    dims.insert(axis + len(dims) + 1 if axis < 0 else axis, 1)
+    return [TensorType(args[0].dtype, tuple(dims))]
+
+
+def _lower_expand_dims(node: Node, builder: OnnxBuilder) -> Any:
+    axis = int(constant_input(node, builder, 1, "an axis").reshape(()))
+    return unsqueezed(builder, builder.value(node.inputs[0]), [axis])
+
+
+def _transpose(node: Node, x: np.ndarray, permutation: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x.transpose([int(p) for p in permutation]))
+
+
+def _infer_transpose(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    permutation = require_constant(node, args, 1, "a permutation").tolist()
+    if sorted(permutation) != list(range(len(shape))):
+        raise shape_error(node, args, f"{permutation} is no permutation of {len(shape)} axes")
+    return [TensorType(args[0].dtype, tuple(shape[p] for p in permutation))]
+
+
+def _lower_transpose(node: Node, builder: OnnxBuilder) -> Any:
+    permutation = constant_input(node, builder, 1, "a permutation").tolist()
+    return builder.emit("Transpose", [builder.value(node.inputs[0])], perm=permutation)
+
+
+# ------------------------------------------------------------------ joining and cutting
+
+
+def _concat(node: Node, *arrays: np.ndarray) -> np.ndarray:
+    return np.concatenate(arrays[:-1], axis=int(arrays[-1]))
+
+
+def _infer_concat(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    parts = args[:-1]
+    axis = int(require_constant(node, args, len(args) - 1, "an axis"))
+    known = [p.shape for p in parts if p.shape is not None]
+    if len(known) < len(parts):
+        if not known:
+            return [TensorType(parts[0].dtype, None)]
+        # A part of unknown rank: the others tell all but the joined axis.
+        axis %= len(known[0])
+        return [TensorType(parts[0].dtype, (*known[0][:axis], symbols.fresh(), *known[0][axis + 1 :]))]
+    rank = len(known[0])
+    if not -rank <= axis < rank or any(len(s) != rank for s in known):
+        raise shape_error(node, args, f"parts of different rank, or axis {axis} outside of it")
+    axis %= rank
+    dims = list(known[0])
+    for shape in known[1:]:
+        for i, (a, b) in enumerate(zip(dims, shape, strict=True)):
+            if i != axis and a != b:
+                if isinstance(a, int) and isinstance(b, int):
+                    raise shape_error(node, args, f"axis {i} has lengths {a} and {b}")
+                dims[i] = a if isinstance(a, int) or a == BATCH else b
+    total: list[Dim] = [s[axis] for s in known]
+    dims[axis] = (
+        sum(d for d in total if isinstance(d, int)) if all(isinstance(d, int) for d in total) else symbols.fresh()
+    )
+    return [TensorType(parts[0].dtype, tuple(dims))]
+
+
+def _lower_concat(node: Node, builder: OnnxBuilder) -> Any:
+    axis = int(constant_input(node, builder, len(node.inputs) - 1, "an axis"))
+    return builder.emit("Concat", [builder.value(r) for r in node.inputs[:-1]], axis=axis)
+
+
+def _pack(node: Node, *arrays: np.ndarray) -> np.ndarray:
+    return np.stack(arrays, axis=node.attrs["axis"])
+
+
+def _infer_pack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = next((a.shape for a in args if a.shape is not None), None)
+    if shape is None:
+        # Scalars of unknown rank (an old sequence_length) packed with known scalars never get here.
+        return [TensorType(args[0].dtype, None)]
+    dims = list(shape)
+    axis = node.attrs["axis"]
+    dims.insert(axis + len(dims) + 1 if axis < 0 else axis, len(args))
+    return [TensorType(args[0].dtype, tuple(dims))]
+
+
+def _lower_pack(node: Node, builder: OnnxBuilder) -> Any:
+    axis = node.attrs["axis"]
+    parts = [unsqueezed(builder, builder.value(r), [axis]) for r in node.inputs]
+    return builder.emit("Concat", parts, axis=axis)
+
+
+def _unpack(node: Node, x: np.ndarray) -> tuple[np.ndarray, ...]:
+    axis = node.attrs["axis"]
+    return tuple(np.take(x, i, axis=axis) for i in range(x.shape[axis]))
+
+
+def _infer_unpack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape, axis, count = args[0].shape, node.attrs["axis"], node.attrs["num"]
+    if shape is None:
+        return [TensorType(args[0].dtype, None)] * count
+    axis %= len(shape)
+    return [TensorType(args[0].dtype, shape[:axis] + shape[axis + 1 :])] * count
+
+
+def _lower_unpack(node: Node, builder: OnnxBuilder) -> Any:
+    axis, value = node.attrs["axis"], builder.value(node.inputs[0])
+    return tuple(
+        builder.emit("Gather", [value, builder.const(np.array(i, np.int64), "index")], axis=axis)
+        for i in range(node.attrs["num"])
+    )
+
+
+def _split_sizes(node: Node, length: Dim, args: Sequence[TensorType]) -> list[Dim]:
+    if node.op == "SplitV":
+        sizes: list[Dim] = [int(s) for s in require_constant(node, args, 1, "sizes").tolist()]
+        if -1 in sizes and isinstance(length, int):
+            sizes[sizes.index(-1)] = length - sum(int(s) for s in sizes if s != -1)
+        return sizes
+    count = node.attrs["num_split"]
+    if isinstance(length, int) and length % count:
+        raise shape_error(node, args, f"a length of {length} does not split into {count}")
+    return [length // count if isinstance(length, int) else f"{length}/{count}"] * count
+
+
+def _split(node: Node, axis: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(np.split(x, node.attrs["num_split"], axis=int(axis)))
+
+
+def _split_v(node: Node, x: np.ndarray, sizes: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, ...]:
+    lengths = sizes.tolist()
+    if -1 in lengths:
+        lengths[lengths.index(-1)] = x.shape[int(axis)] - sum(s for s in lengths if s != -1)
+    return tuple(np.split(x, np.cumsum(lengths[:-1]), axis=int(axis)))
+
+
+def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    data, axis_at = (args[1], 0) if node.op == "Split" else (args[0], 2)
+    if data.shape is None:
+        return [TensorType(data.dtype, None)] * node.attrs["num_split"]
+    axis = int(require_constant(node, args, axis_at, "an axis")) % len(data.shape)
+    sizes = _split_sizes(node, data.shape[axis], args)
+    return [TensorType(data.dtype, (*data.shape[:axis], size, *data.shape[axis + 1 :])) for size in sizes]
+
+
+def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
+    data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
+    kind = builder.type_of(node.inputs[data_at])
+    assert kind.shape is not None
+    axis = int(constant_input(node, builder, axis_at, "an axis")) % len(kind.shape)
+    sizes = _split_sizes(node, kind.shape[axis], [builder.type_of(r) for r in node.inputs])
+    if any(not isinstance(s, int) for s in sizes):
+        raise not_constant(node, "a length to split")
+    value = builder.value(node.inputs[data_at])
+    if len(sizes) == 1:
+        return (value,)
+    return builder.emit(
+        "Split", [value, builder.const(np.array(sizes, np.int64), "sizes")], outputs=len(sizes), axis=axis
+    )
+
+
+# ------------------------------------------------------------------ slices
+
+
+def _slice(node: Node, x: np.ndarray, begin: np.ndarray, size: np.ndarray) -> np.ndarray:
+    index = tuple(slice(int(b), None if s == -1 else int(b) + int(s)) for b, s in zip(begin, size, strict=True))
+    return x[index]
+
+
+def _infer_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape, begin, size = args[0].shape, args[1].constant, args[2].constant
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    dims: list[Dim] = []
+    for i, length in enumerate(shape):
+        start = None if begin is None else int(begin[i])
+        wanted = None if size is None else int(size[i])
+        if wanted is not None and wanted >= 0:
+            dims.append(wanted)
+        elif wanted == -1 and start is not None and isinstance(length, int):
+            dims.append(length - start)
+        else:
+            dims.append(length if wanted == -1 and start == 0 else symbols.fresh())
+    return [TensorType(args[0].dtype, tuple(dims))]
+
+
+def _lower_slice(node: Node, builder: OnnxBuilder) -> Any:
+    rank = builder.type_of(node.inputs[0]).rank
+    begin = constant_input(node, builder, 1, "the beginning of a slice").astype(np.int64)
+    size = constant_input(node, builder, 2, "the size of a slice").astype(np.int64)
+    ends = np.where(size == -1, np.int64(2**31 - 1), begin + size)
+    axes = builder.const(np.arange(rank or 0, dtype=np.int64), "axes")
+    return builder.emit(
+        "Slice", [builder.value(node.inputs[0]), builder.const(begin, "starts"), builder.const(ends, "ends"), axes]
+    )
+
+
+#: One entry of a strided slice: ("slice", begin, end, stride) | ("take", index) | ("new",)
+SliceStep = tuple[Any, ...]
+
+
+def strided_steps(
+    node: Node, rank: int, begin: Sequence[int], end: Sequence[int], strides: Sequence[int]
+) -> list[SliceStep]:
+    """TensorFlow's five masks resolved to one step per axis (plus "new" steps that insert an axis).
+
+    Source of the rules: the documentation of ``tf.strided_slice``: an ellipsis stands for as many whole axes as are
+    missing; a set bit of begin/end mask means "from the start"/"to the end"; shrink takes one element and drops the
+    axis; new axis inserts one.
+    """
+    masks = {k: int(node.attrs[f"{k}_mask"]) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis")}
+    steps: list[SliceStep] = []
+    added = sum(1 for i in range(len(begin)) if masks["new_axis"] >> i & 1)
+    covered = len(begin) - added - (1 if masks["ellipsis"] else 0)
+    for i in range(len(begin)):
+        if masks["ellipsis"] >> i & 1:
+            steps.extend([("slice", None, None, 1)] * (rank - covered))
+        elif masks["new_axis"] >> i & 1:
+            steps.append(("new",))
+        elif masks["shrink_axis"] >> i & 1:
+            steps.append(("take", int(begin[i])))
+        else:
+            first = None if masks["begin"] >> i & 1 else int(begin[i])
+            last = None if masks["end"] >> i & 1 else int(end[i])
+            steps.append(("slice", first, last, int(strides[i])))
+    used = sum(1 for s in steps if s[0] != "new")
+    steps.extend([("slice", None, None, 1)] * (rank - used))
+    return steps
+
+
+def _strided_slice(node: Node, x: np.ndarray, begin: np.ndarray, end: np.ndarray, strides: np.ndarray) -> np.ndarray:
+    index: list[Any] = []
+    for step in strided_steps(node, x.ndim, begin.tolist(), end.tolist(), strides.tolist()):
+        if step[0] == "new":
+            index.append(None)
+        elif step[0] == "take":
+            index.append(step[1])
+        else:
+            index.append(slice(step[1], step[2], step[3]))
+    return np.asarray(x[tuple(index)])
+
+
+def _strided_operands(node: Node, args: Sequence[TensorType]) -> tuple[list[int], list[int], list[int]] | None:
+    values = [a.constant for a in args[1:4]]
+    if any(v is None for v in values):
+        return None
+    begin, end, strides = (v.tolist() for v in values if v is not None)
+    return begin, end, strides
+
+
+def _infer_strided_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    operands = _strided_operands(node, args)
+    if shape is None or operands is None:
+        return [TensorType(args[0].dtype, None)]
+    steps = strided_steps(node, len(shape), *operands)
+    if sum(1 for s in steps if s[0] != "new") != len(shape):
+        raise shape_error(node, args, "the slice has more axes than the tensor")
+    dims: list[Dim] = []
+    lengths = iter(shape)
+    for step in steps:
+        if step[0] == "new":
+            dims.append(1)
+            continue
+        length = next(lengths)
+        if step[0] == "take":
+            if isinstance(length, int) and not -length <= step[1] < length:
+                raise shape_error(node, args, f"index {step[1]} is outside of {length}")
+            continue
+        if isinstance(length, int):
+            dims.append(len(range(*slice(step[1], step[2], step[3]).indices(length))))
+        else:
+            dims.append(length if step[1:] in ((None, None, 1), (0, None, 1)) else symbols.fresh())
+    return [TensorType(args[0].dtype, tuple(dims))]
+
+
+def _lower_strided_slice(node: Node, builder: OnnxBuilder) -> Any:
+    kind = builder.type_of(node.inputs[0])
+    operands = _strided_operands(node, [builder.type_of(r) for r in node.inputs])
+    if operands is None or kind.shape is None:
+        raise not_constant(node, "the bounds of a slice")
+    steps = strided_steps(node, len(kind.shape), *operands)
+    limit = 2**31 - 1
+    starts, ends, axes, strides = [], [], [], []
+    drop, insert = [], []
+    axis = 0
+    for step in steps:
+        if step[0] == "new":
+            continue
+        if step[0] == "take":
+            bounds = (step[1], step[1] + 1 if step[1] != -1 else limit, 1)
+            drop.append(axis)
+        else:
+            first = step[1] if step[1] is not None else (0 if step[3] > 0 else limit)
+            bounds = (first, step[2] if step[2] is not None else (limit if step[3] > 0 else -limit), step[3])
+        if bounds != (0, limit, 1):
+            starts.append(bounds[0])
+            ends.append(bounds[1])
+            strides.append(bounds[2])
+            axes.append(axis)
+        axis += 1
+    position = 0
+    for step in steps:
+        if step[0] == "new":
+            insert.append(position)
+        position += step[0] != "take"
+    value = builder.value(node.inputs[0])
+    if axes:
+        operand = [builder.const(np.array(v, np.int64), "slice") for v in (starts, ends, axes, strides)]
+        value = builder.emit("Slice", [value, *operand])
+    return unsqueezed(builder, squeezed(builder, value, drop), insert)
+
+
+def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
+    return np.take(x, indices, axis=0 if axis is None else int(axis))
+
+
+def _infer_gather(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    if args[0].shape is None or args[1].shape is None:
+        return [TensorType(args[0].dtype, None)]
+    axis = 0 if len(args) < 3 else int(require_constant(node, args, 2, "an axis")) % len(args[0].shape)
+    return [TensorType(args[0].dtype, args[0].shape[:axis] + args[1].shape + args[0].shape[axis + 1 :])]
+
+
+def _lower_gather(node: Node, builder: OnnxBuilder) -> Any:
+    axis = 0 if len(node.inputs) < 3 else int(constant_input(node, builder, 2, "an axis"))
+    return builder.emit("Gather", [builder.value(r) for r in node.inputs[:2]], axis=axis)
+
+
+# ------------------------------------------------------------------ filling
+
+
+def _fill(node: Node, dims: np.ndarray, value: np.ndarray) -> np.ndarray:
+    return np.full([int(d) for d in dims], value, value.dtype)
+
+
+def _infer_fill(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    dims = _target_dims(args[0].value, args[0], symbols)
+    return [TensorType(args[1].dtype, None if dims is None else tuple(dims))]
+
+
+def _lower_fill(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Expand", [builder.value(node.inputs[1]), as_int64(node, builder, 0)])
+
+
+def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(np.broadcast_to(x, [int(d) for d in dims]))
+
+
+def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    dims = _target_dims(args[1].value, args[1], symbols)
+    return [TensorType(args[0].dtype, None if dims is None else broadcast(args[0].shape, tuple(dims), symbols))]
+
+
+def _lower_broadcast_to(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Expand", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
+
+
+def _tile(node: Node, x: np.ndarray, multiples: np.ndarray) -> np.ndarray:
+    return np.tile(x, [int(m) for m in multiples])
+
+
+def _infer_tile(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    multiples = _target_dims(args[1].value, args[1], symbols) or [symbols.fresh()] * len(shape)
+    return [TensorType(args[0].dtype, tuple(product((d, m), symbols) for d, m in zip(shape, multiples, strict=True)))]
+
+
+def _lower_tile(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Tile", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
+
+
+def _range(node: Node, start: np.ndarray, limit: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    return np.arange(start.item(), limit.item(), delta.item(), start.dtype)
+
+
+def _infer_range(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    values = [a.constant for a in args]
+    if any(v is None for v in values):
+        return [TensorType(args[0].dtype, (symbols.fresh(),))]
+    return [of_array(_range(node, *(v for v in values if v is not None)))]
+
+
+def _lower_range(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Range", [builder.value(r) for r in node.inputs])
+
+
+def _one_hot(node: Node, indices: np.ndarray, depth: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
+    axis = int(node.attrs["axis"])
+    hot = indices[..., None] == np.arange(int(depth))
+    return np.moveaxis(np.where(hot, on, off).astype(on.dtype), -1, axis if axis >= 0 else -1)
+
+
+def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[2].dtype, None)]
+    depth = int(require_constant(node, args, 1, "a depth"))
+    axis = int(node.attrs["axis"])
+    dims = list(shape)
+    dims.insert(len(dims) if axis < 0 else axis, depth)
+    return [TensorType(args[2].dtype, tuple(dims))]
+
+
+def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
+    """ONNX's OneHot wraps negative indices round where TensorFlow gives a row of off-values: compare instead."""
+    depth = int(constant_input(node, builder, 1, "a depth"))
+    kind = builder.type_of(node.inputs[0])
+    if kind.rank is None:
+        raise not_constant(node, "the rank of its indices")
+    axis = int(node.attrs["axis"])
+    axis = kind.rank if axis < 0 else axis
+    classes = np.arange(depth, dtype=kind.dtype).reshape([depth if i == axis else 1 for i in range(kind.rank + 1)])
+    index = unsqueezed(builder, builder.value(node.inputs[0]), [axis])
+    hot = builder.emit("Equal", [index, builder.const(classes, "classes")])
+    return builder.emit("Where", [hot, builder.value(node.inputs[2]), builder.value(node.inputs[3])])
+
+
+_PASS = ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
+_SHAPE_OF = (T, Attr("out_type", "type", INT32))
+_MASKS = tuple(Attr(f"{k}_mask", "int", 0) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis"))
+
+OPS = (
+    OpDef("Const", _infer_const, lambda node: node.value, attrs=(Attr("dtype", "type", derive="out:0"),)),
+    OpDef("Placeholder", _infer_placeholder, attrs=(Attr("dtype", "type"), Attr("shape", "shape", TensorShape(None)))),
+    OpDef(
+        "PlaceholderWithDefault",
+        same_as(0),
+        _identity,
+        _lower_identity,
+        (Attr("dtype", "type", derive="in:0"), Attr("shape", "shape", TensorShape(None))),
+    ),
+    *(
+        OpDef(
+            name,
+            same_as(0),
+            _identity,
+            _lower_identity,
+            (T, Attr("message", "str", "")) if name in ("PreventGradient", "CheckNumerics") else (T,),
+            structural=True,
+        )
+        for name in _PASS
+    ),
+    OpDef("Shape", _infer_shape, _shape, _lower_shape, _SHAPE_OF),
+    OpDef("Size", _infer_size, lambda node, x: np.array(x.size, node.attrs["out_type"]), _lower_size, _SHAPE_OF),
+    OpDef("Rank", _infer_rank, lambda node, x: np.array(x.ndim, np.int32), None, (T,)),
+    OpDef(
+        "Reshape",
+        _infer_reshape,
+        lambda node, x, shape: x.reshape([int(d) for d in shape.reshape(-1)]),
+        _lower_reshape,
+        (T, type_attr("Tshape", "in:1")),
+    ),
+    OpDef("Squeeze", _infer_squeeze, _squeeze, _lower_squeeze, (T, Attr("squeeze_dims", "int", ())), structural=True),
+    OpDef(
+        "ExpandDims",
+        _infer_expand_dims,
+        _expand_dims,
+        _lower_expand_dims,
+        (T, type_attr("Tdim", "in:1")),
+        structural=True,
+    ),
+    OpDef("Transpose", _infer_transpose, _transpose, _lower_transpose, (T, type_attr("Tperm", "in:1"))),
+    OpDef(
+        "ConcatV2",
+        _infer_concat,
+        _concat,
+        _lower_concat,
+        (Attr("N", "int", derive="count:1"), T, type_attr("Tidx", "in:-1")),
+        structural=True,
+    ),
+    OpDef(
+        "Pack",
+        _infer_pack,
+        _pack,
+        _lower_pack,
+        (Attr("N", "int", derive="count"), T, Attr("axis", "int", 0)),
+        structural=True,
+    ),
+    OpDef("Unpack", _infer_unpack, _unpack, _lower_unpack, (Attr("num", "int"), T, Attr("axis", "int", 0)), outputs=-1),
+    OpDef("Split", _infer_split, _split, _lower_split, (Attr("num_split", "int"), type_attr("T", "in:1")), outputs=-1),
+    OpDef(
+        "SplitV",
+        _infer_split,
+        _split_v,
+        _lower_split,
+        (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
+        outputs=-1,
+    ),
+    OpDef("Slice", _infer_slice, _slice, _lower_slice, (T, type_attr("Index", "in:1")), structural=True),
+    OpDef(
+        "StridedSlice",
+        _infer_strided_slice,
+        _strided_slice,
+        _lower_strided_slice,
+        (T, type_attr("Index", "in:1"), *_MASKS),
+        structural=True,
+    ),
+    OpDef(
+        "Gather",
+        _infer_gather,
+        _gather,
+        _lower_gather,
+        (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
+        structural=True,
+    ),
+    OpDef(
+        "GatherV2",
+        _infer_gather,
+        _gather,
+        _lower_gather,
+        (
+            type_attr("Tparams"),
+            type_attr("Tindices", "in:1"),
+            type_attr("Taxis", "in:2"),
+            Attr("batch_dims", "int", 0, since="1.14", supported=False),
+        ),
+        structural=True,
+    ),
+    OpDef(
+        "Fill",
+        _infer_fill,
+        _fill,
+        _lower_fill,
+        (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
+    ),
+    OpDef("BroadcastTo", _infer_broadcast_to, _broadcast_to, _lower_broadcast_to, (T, type_attr("Tidx", "in:1"))),
+    OpDef("Tile", _infer_tile, _tile, _lower_tile, (T, type_attr("Tmultiples", "in:1"))),
+    OpDef("Range", _infer_range, _range, _lower_range, (type_attr("Tidx"),)),
+    OpDef(
+        "OneHot",
+        _infer_one_hot,
+        _one_hot,
+        _lower_one_hot,
+        (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
+    ),
+)

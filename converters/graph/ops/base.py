@@ -1,0 +1,212 @@
+"""What an entry of the op table is made of, and the helpers that entries share.
+
+One entry holds everything the compiler knows of an op: its numpy *kernel* (the oracle, and what folds constants), its
+*infer* rule (result dtype and shape), its ONNX *lowering*, and the attributes it has in a GraphDef.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
+from signatures.errors import GraphError, UnsupportedOpError
+from signatures.graph import Node
+
+Kernel = Callable[..., Any]
+Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]
+AttrKind = Literal["type", "int", "ints", "float", "bool", "str", "shape"]
+
+#: Marks an attribute that a GraphDef must carry.
+REQUIRED: Any = object()
+
+
+class OnnxBuilder(Protocol):
+    """What a lowering may use. Values are ONNX names; ``value`` gives the one that stands for a tensor of the graph."""
+
+    opset: int
+
+    def value(self, reference: str) -> str:
+        """The ONNX value of a tensor of the graph."""
+        ...
+
+    def type_of(self, reference: str) -> TensorType:
+        """What is known of a tensor of the graph."""
+        ...
+
+    def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
+        """Append an ONNX node; returns the name of its output, or a tuple of names if ``outputs`` is above 1."""
+        ...
+
+    def const(self, array: np.ndarray, hint: str = "const") -> str:
+        """An initializer; equal arrays share one."""
+        ...
+
+
+Lower = Callable[[Node, OnnxBuilder], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Attr:
+    """An attribute as a GraphDef has it.
+
+    ``derive`` says how the writers compute it (``"in:0"``: the dtype of input 0; ``"out:0"``; ``"count"``: the number
+    of inputs less the other ones); such attributes are not kept in nodes. ``since`` is the first TensorFlow that knows
+    the attribute when that is later than 1.4: it is then written only where it differs from its default.
+    """
+
+    name: str
+    kind: AttrKind
+    default: Any = REQUIRED
+    derive: str | None = None
+    since: str | None = None
+    #: False: any value but the default changes the result in a way no kernel here has, so the reader refuses it.
+    supported: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class OpDef:
+    """One op of the table; see the module's docstring."""
+
+    name: str
+    infer: Infer
+    kernel: Kernel | None = None
+    lower: Lower | None = None
+    attrs: tuple[Attr, ...] = ()
+    outputs: int = 1
+    #: Folding is wrong for samplers and for matrix products (whose rounding depends on the processor).
+    foldable: bool = True
+    #: The kernel moves elements without arithmetic, so it also works on shape vectors with symbols.
+    structural: bool = False
+
+
+def type_attr(name: str = "T", derive: str = "in:0") -> Attr:
+    """A dtype attribute that follows from an input or output."""
+    return Attr(name, "type", derive=derive)
+
+
+# ------------------------------------------------------------------ helpers for infer rules
+
+
+def same_as(position: int = 0) -> Infer:
+    """Result has the dtype and shape of input ``position``."""
+
+    def infer(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+        return [TensorType(args[position].dtype, args[position].shape)]
+
+    return infer
+
+
+def broadcast_of(dtype: np.dtype | None = None) -> Infer:
+    """Result has the broadcast shape of all inputs, and ``dtype`` or the first input's."""
+
+    def infer(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+        shape: tuple[Dim, ...] | None = ()
+        for arg in args:
+            try:
+                shape = broadcast(shape, arg.shape, symbols)
+            except ValueError as error:
+                raise shape_error(node, args, str(error)) from error
+        return [TensorType(dtype or args[0].dtype, shape)]
+
+    return infer
+
+
+def shape_error(node: Node, args: Sequence[TensorType], why: str) -> GraphError:
+    """A GraphError that names the node and the shapes that do not fit."""
+    shapes = ", ".join("?" if a.shape is None else str(list(a.shape)) for a in args)
+    return GraphError(
+        f"node {node.name!r} ({node.op}) cannot take inputs of shape {shapes}",
+        why=why,
+        fix="the graph is damaged or its placeholders have other shapes than the file says",
+    )
+
+
+def require_constant(node: Node, args: Sequence[TensorType], position: int, meaning: str) -> np.ndarray:
+    """The constant value of an input, or UnsupportedOpError."""
+    value = args[position].constant
+    if value is None:
+        raise not_constant(node, meaning)
+    return value
+
+
+def not_constant(node: Node, meaning: str) -> UnsupportedOpError:
+    """The error for an operand that must be known before the graph runs."""
+    return UnsupportedOpError(
+        f"node {node.name!r} ({node.op}) has {meaning} that is computed while the graph runs",
+        issues=[(node.name, node.op)],
+        why=f"{meaning} must be a constant in every target",
+        fix="if it comes from a placeholder, give it a value with --set NAME=VALUE",
+    )
+
+
+# ------------------------------------------------------------------ helpers for lowerings
+
+
+def as_int64(node: Node, builder: OnnxBuilder, position: int) -> str:
+    """Input ``position`` as the int64 vector that ONNX wants for shapes and indices."""
+    reference = node.inputs[position]
+    kind = builder.type_of(reference)
+    constant = kind.constant
+    if constant is not None:
+        return builder.const(np.atleast_1d(constant).astype(np.int64), "shape")
+    value = builder.value(reference)
+    if kind.dtype != INT64:
+        value = builder.emit("Cast", [value], to=INT64)
+    if kind.rank == 0:
+        value = builder.emit("Reshape", [value, builder.const(np.array([1], np.int64), "shape")])
+    return value
+
+
+def constant_input(node: Node, builder: OnnxBuilder, position: int, meaning: str) -> np.ndarray:
+    """The constant value of an input during lowering."""
+    value = builder.type_of(node.inputs[position]).constant
+    if value is None:
+        raise not_constant(node, meaning)
+    return value
+
+
+def direct(onnx_op: str, **attributes: Any) -> Lower:
+    """A lowering to one ONNX node with the same inputs."""
+
+    def lower(node: Node, builder: OnnxBuilder) -> str:
+        value: str = builder.emit(onnx_op, [builder.value(r) for r in node.inputs], **attributes)
+        return value
+
+    return lower
+
+
+def scalar(builder: OnnxBuilder, node: Node, number: float) -> str:
+    """A scalar constant of the dtype of the node's first input."""
+    return builder.const(np.array(number, builder.type_of(node.inputs[0]).dtype), "scalar")
+
+
+def squeezed(builder: OnnxBuilder, value: str, axes: Sequence[int]) -> str:
+    """ONNX Squeeze of constant ``axes`` (an input since opset 13)."""
+    if not axes:
+        return value
+    result: str = builder.emit("Squeeze", [value, builder.const(np.array(axes, np.int64), "axes")])
+    return result
+
+
+def unsqueezed(builder: OnnxBuilder, value: str, axes: Sequence[int]) -> str:
+    """ONNX Unsqueeze at constant ``axes``."""
+    if not axes:
+        return value
+    result: str = builder.emit("Unsqueeze", [value, builder.const(np.array(axes, np.int64), "axes")])
+    return result
+
+
+def reduced(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[int], keepdims: bool) -> str:
+    """An ONNX reduction; its axes are an attribute before opset 18 (13 for ReduceSum) and an input from there on."""
+    if not axes:
+        return value
+    if builder.opset >= (13 if onnx_op == "ReduceSum" else 18):
+        axes_value = builder.const(np.array(axes, np.int64), "axes")
+        result: str = builder.emit(onnx_op, [value, axes_value], keepdims=int(keepdims))
+    else:
+        result = builder.emit(onnx_op, [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
+    return result

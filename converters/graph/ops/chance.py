@@ -1,0 +1,98 @@
+"""Samplers. Their kernels draw from a numpy generator; the numpy runner feeds recorded draws in their place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, constant_input, type_attr
+from converters.graph.types import INT64, Dim, Symbols, TensorType
+from signatures.graph import Node
+
+#: Ops whose output is N(0, 1); the lift pass turns them into the input ``epsilon``.
+NORMAL_SAMPLERS = ("RandomStandardNormal",)
+#: Ops that draw a class from log-probabilities.
+CATEGORICAL_SAMPLERS = ("Multinomial",)
+SAMPLERS = (*NORMAL_SAMPLERS, *CATEGORICAL_SAMPLERS, "RandomUniform", "TruncatedNormal")
+
+_SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
+_generator = np.random.default_rng(0)
+
+
+def reseed(seed: int) -> None:
+    """Restart the stream that the kernels draw from."""
+    global _generator
+    _generator = np.random.default_rng(seed)
+
+
+def _infer_random(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    value, dims = args[0].value, None
+    if value is not None:
+        dims = tuple(d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist())
+    elif args[0].shape is not None and len(args[0].shape) == 1 and isinstance(args[0].shape[0], int):
+        dims = tuple(symbols.fresh() for _ in range(args[0].shape[0]))
+    return [TensorType(node.attrs["dtype"], dims)]
+
+
+def _normal(node: Node, shape: np.ndarray) -> np.ndarray:
+    return _generator.standard_normal([int(d) for d in shape]).astype(node.attrs["dtype"])
+
+
+def _uniform(node: Node, shape: np.ndarray) -> np.ndarray:
+    return _generator.random([int(d) for d in shape]).astype(node.attrs["dtype"])
+
+
+def _truncated(node: Node, shape: np.ndarray) -> np.ndarray:
+    draws = _generator.standard_normal([int(d) for d in shape])
+    while (outside := np.abs(draws) > 2).any():
+        draws[outside] = _generator.standard_normal(int(outside.sum()))
+    return draws.astype(node.attrs["dtype"])
+
+
+def _lower_random(onnx_op: str) -> Any:
+    def lower(node: Node, builder: OnnxBuilder) -> Any:
+        shape = builder.emit("ConstantOfShape", [as_int64(node, builder, 0)], value=np.zeros(1, node.attrs["dtype"]))
+        return builder.emit(onnx_op, [shape])
+
+    return lower
+
+
+def _multinomial(node: Node, logits: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Draws by the Gumbel trick: argmax of logits + Gumbel noise has the softmax distribution."""
+    with np.errstate(all="ignore"):
+        uniform = _generator.random((logits.shape[0], int(count), logits.shape[1]))
+        gumbel = -np.log(-np.log(uniform + 1e-300))
+        return np.asarray(np.argmax(logits[:, None, :] + gumbel, axis=-1)).astype(node.attrs["output_dtype"])
+
+
+def _infer_multinomial(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    count = args[1].constant
+    columns: Dim = symbols.fresh() if count is None else int(count)
+    rows = symbols.fresh() if args[0].shape is None else args[0].shape[0]
+    return [TensorType(node.attrs["output_dtype"], (rows, columns))]
+
+
+def _lower_multinomial(node: Node, builder: OnnxBuilder) -> Any:
+    count = int(constant_input(node, builder, 1, "the number of draws"))
+    return builder.emit(
+        "Multinomial", [builder.value(node.inputs[0])], dtype=node.attrs["output_dtype"], sample_size=count
+    )
+
+
+_RANDOM = (*_SEEDS, Attr("dtype", "type"), type_attr("T"))
+
+OPS = (
+    OpDef("RandomStandardNormal", _infer_random, _normal, _lower_random("RandomNormalLike"), _RANDOM, foldable=False),
+    OpDef("RandomUniform", _infer_random, _uniform, _lower_random("RandomUniformLike"), _RANDOM, foldable=False),
+    OpDef("TruncatedNormal", _infer_random, _truncated, None, _RANDOM, foldable=False),
+    OpDef(
+        "Multinomial",
+        _infer_multinomial,
+        _multinomial,
+        _lower_multinomial,
+        (*_SEEDS, type_attr("T"), Attr("output_dtype", "type", INT64, since="1.7")),
+        foldable=False,
+    ),
+)

@@ -1,0 +1,238 @@
+"""Convolutions, pooling and padding, all NHWC (graphs written NCHW are turned round by the canonicalise pass)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.base import (
+    REQUIRED,
+    Attr,
+    OnnxBuilder,
+    OpDef,
+    constant_input,
+    require_constant,
+    shape_error,
+    type_attr,
+)
+from converters.graph.types import Dim, Symbols, TensorType
+from signatures.graph import Node
+
+T = type_attr()
+_TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]
+
+
+def window_padding(size: int, window: int, stride: int, padding: str) -> tuple[int, int, int]:
+    """(result length, padding before, padding after) of a sliding window: TensorFlow's SAME and VALID.
+
+    ``window`` counts its dilation in. SAME puts the odd element of padding at the end.
+    """
+    if padding == "VALID":
+        return max(-(-(size - window + 1) // stride), 0), 0, 0
+    result = -(-size // stride)
+    total = max((result - 1) * stride + window - size, 0)
+    return result, total // 2, total - total // 2
+
+
+def _spatial(node: Node, window: Sequence[int]) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
+    """(strides, dilations, dilated window) over height and width."""
+    strides, dilations = node.attrs["strides"], node.attrs.get("dilations", (1, 1, 1, 1))
+    grown = tuple((k - 1) * d + 1 for k, d in zip(window, dilations[1:3], strict=True))
+    return (strides[1], strides[2]), (dilations[1], dilations[2]), (grown[0], grown[1])
+
+
+def _patches(node: Node, x: np.ndarray, window: tuple[int, int], fill: float) -> np.ndarray:
+    """[B, H', W', kh, kw, C] windows of an NHWC image, a view on the padded image."""
+    strides, dilations, grown = _spatial(node, window)
+    pads = [(0, 0)]
+    for size, span, stride in zip(x.shape[1:3], grown, strides, strict=True):
+        _, before, after = window_padding(size, span, stride, node.attrs["padding"])
+        pads.append((before, after))
+    padded = np.pad(x, [*pads, (0, 0)], constant_values=fill)
+    view = np.lib.stride_tricks.sliding_window_view(padded, grown, axis=(1, 2))
+    view = view[:, :: strides[0], :: strides[1], :, :: dilations[0], :: dilations[1]]
+    return np.moveaxis(view, 3, 5)
+
+
+def _conv2d(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    patches = _patches(node, x, kernel.shape[:2], 0.0)
+    rows = patches.reshape(-1, int(np.prod(kernel.shape[:3]))).astype(np.float64)
+    with np.errstate(all="ignore"):
+        result = rows @ kernel.reshape(-1, kernel.shape[3]).astype(np.float64)
+    return np.asarray(result.reshape(*patches.shape[:3], kernel.shape[3])).astype(x.dtype)
+
+
+def _fused_conv2d(node: Node, x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    from converters.graph.ops.linear import activation
+
+    result = _conv2d(node, x, kernel) + bias
+    for name in node.attrs["fused_ops"][1:]:
+        result = activation(name, result)
+    return result
+
+
+def _depthwise(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    patches = _patches(node, x, kernel.shape[:2], 0.0).astype(np.float64)
+    with np.errstate(all="ignore"):
+        result = np.einsum("bhwijc,ijcm->bhwcm", patches, kernel.astype(np.float64))
+    return result.reshape(*result.shape[:3], -1).astype(x.dtype)
+
+
+def _window_of(node: Node, args: Sequence[TensorType]) -> tuple[tuple[Dim, ...], tuple[int, int], Dim]:
+    """(image shape, window, result channels) of a node, checked."""
+    image = args[0].shape
+    if image is None or len(image) != 4:
+        raise shape_error(node, args, "an image has four axes: batch, height, width, channels")
+    if node.op in ("MaxPool", "AvgPool"):
+        window = node.attrs["ksize"]
+        if window[0] != 1 or window[3] != 1:
+            raise shape_error(node, args, "pooling over batch or channels is not supported")
+        return image, (window[1], window[2]), image[3]
+    kernel = args[1].shape
+    if kernel is None or len(kernel) != 4 or not all(isinstance(k, int) for k in kernel):
+        raise shape_error(node, args, "the kernel's shape must be known and have four axes")
+    height, width, channels, last = (int(k) for k in kernel)
+    if isinstance(image[3], int) and image[3] != channels:
+        raise shape_error(node, args, f"the image has {image[3]} channels, the kernel takes {channels}")
+    return image, (height, width), channels * last if node.op == "DepthwiseConv2dNative" else last
+
+
+def _infer_window(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    image, window, channels = _window_of(node, args)
+    strides, _, grown = _spatial(node, window)
+    spatial: list[Dim] = []
+    for size, span, stride in zip(image[1:3], grown, strides, strict=True):
+        if isinstance(size, str):
+            spatial.append(symbols.fresh())
+            continue
+        result = window_padding(size, span, stride, node.attrs["padding"])[0]
+        if result < 1:
+            raise shape_error(node, args, f"a window of {span} does not fit into {size}")
+        spatial.append(result)
+    return [TensorType(args[0].dtype, (image[0], *spatial, channels))]
+
+
+def _lower_window(node: Node, builder: OnnxBuilder, onnx_op: str, inputs: list[str], **attributes: Any) -> Any:
+    """Frame an ONNX window op with the transposes that its NCHW layout needs."""
+    window = attributes["kernel_shape"]
+    strides, dilations, grown = _spatial(node, window)
+    image = builder.type_of(node.inputs[0]).shape
+    assert image is not None
+    attributes["strides"] = list(strides)
+    if onnx_op == "Conv":
+        attributes["dilations"] = list(dilations)
+    if node.attrs["padding"] == "SAME":
+        if all(isinstance(size, int) for size in image[1:3]):
+            pads = [window_padding(int(image[i + 1]), grown[i], strides[i], "SAME")[1:] for i in range(2)]
+            attributes["pads"] = [pads[0][0], pads[1][0], pads[0][1], pads[1][1]]
+        else:
+            attributes["auto_pad"] = "SAME_UPPER"
+    value = builder.emit("Transpose", [builder.value(node.inputs[0])], perm=_TO_NCHW)
+    value = builder.emit(onnx_op, [value, *inputs], **attributes)
+    return builder.emit("Transpose", [value], perm=_TO_NHWC)
+
+
+def _lower_conv2d(node: Node, builder: OnnxBuilder) -> Any:
+    kernel = constant_input(node, builder, 1, "a kernel")
+    weights = builder.const(np.ascontiguousarray(kernel.transpose(3, 2, 0, 1)), "kernel")
+    inputs = [weights] + [builder.value(r) for r in node.inputs[2:]]
+    value = _lower_window(node, builder, "Conv", inputs, kernel_shape=list(kernel.shape[:2]))
+    for name in node.attrs.get("fused_ops", ())[1:]:
+        value = builder.emit(name, [value])
+    return value
+
+
+def _lower_depthwise(node: Node, builder: OnnxBuilder) -> Any:
+    kernel = constant_input(node, builder, 1, "a kernel")
+    height, width, channels, multiplier = kernel.shape
+    grouped = kernel.transpose(2, 3, 0, 1).reshape(channels * multiplier, 1, height, width)
+    weights = builder.const(np.ascontiguousarray(grouped), "kernel")
+    return _lower_window(node, builder, "Conv", [weights], kernel_shape=[height, width], group=channels)
+
+
+def _lower_pool(onnx_op: str) -> Any:
+    def lower(node: Node, builder: OnnxBuilder) -> Any:
+        return _lower_window(node, builder, onnx_op, [], kernel_shape=list(node.attrs["ksize"][1:3]))
+
+    return lower
+
+
+def _max_pool(node: Node, x: np.ndarray) -> np.ndarray:
+    window = node.attrs["ksize"][1:3]
+    return np.asarray(_patches(node, x, window, -np.inf).max(axis=(3, 4))).astype(x.dtype)
+
+
+def _avg_pool(node: Node, x: np.ndarray) -> np.ndarray:
+    """Elements of the padding do not count (TensorFlow's rule)."""
+    window = node.attrs["ksize"][1:3]
+    total = _patches(node, x.astype(np.float64), window, 0.0).sum(axis=(3, 4))
+    count = _patches(node, np.ones(x.shape, np.float64), window, 0.0).sum(axis=(3, 4))
+    return np.asarray(total / count).astype(x.dtype)
+
+
+# ------------------------------------------------------------------ padding
+
+
+def _pad(node: Node, x: np.ndarray, paddings: np.ndarray, value: np.ndarray | None = None) -> np.ndarray:
+    fill = 0 if value is None else value
+    return np.pad(x, [(int(a), int(b)) for a, b in paddings], constant_values=fill)
+
+
+def _infer_pad(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    paddings = require_constant(node, args, 1, "paddings")
+    if paddings.shape != (len(shape), 2):
+        raise shape_error(node, args, "paddings must hold a pair for each axis")
+    dims: list[Dim] = []
+    for size, (before, after) in zip(shape, paddings.tolist(), strict=True):
+        both = before + after
+        dims.append(size + both if isinstance(size, int) else size if both == 0 else symbols.fresh())
+    return [TensorType(args[0].dtype, tuple(dims))]
+
+
+def _lower_pad(node: Node, builder: OnnxBuilder) -> Any:
+    paddings = constant_input(node, builder, 1, "paddings")
+    inputs = [builder.value(node.inputs[0]), builder.const(paddings.T.reshape(-1).astype(np.int64), "pads")]
+    if len(node.inputs) > 2:
+        inputs.append(builder.value(node.inputs[2]))
+    return builder.emit("Pad", inputs)
+
+
+_STRIDES = Attr("strides", "int", REQUIRED)
+_PADDING = Attr("padding", "str", REQUIRED)
+_FORMAT = Attr("data_format", "str", "NHWC")
+# An EXPLICIT padding is split off as a Pad node by the reader (frozen_graph/reader.py), so none is left here.
+_EXPLICIT = Attr("explicit_paddings", "int", (), since="1.14", supported=False)
+_DILATIONS = Attr("dilations", "int", (1, 1, 1, 1), since="1.7")
+_CUDNN = Attr("use_cudnn_on_gpu", "bool", True)
+
+_CONV = (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT, _CUDNN)
+_POOL = (T, Attr("ksize", "int", REQUIRED), _STRIDES, _PADDING, _FORMAT, _EXPLICIT)
+
+OPS = (
+    OpDef("Conv2D", _infer_window, _conv2d, _lower_conv2d, _CONV, foldable=False),
+    OpDef(
+        "_FusedConv2D",
+        _infer_window,
+        _fused_conv2d,
+        _lower_conv2d,
+        (*_CONV, Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001)),
+        foldable=False,
+    ),
+    OpDef(
+        "DepthwiseConv2dNative",
+        _infer_window,
+        _depthwise,
+        _lower_depthwise,
+        (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT),
+        foldable=False,
+    ),
+    OpDef("MaxPool", _infer_window, _max_pool, _lower_pool("MaxPool"), _POOL),
+    OpDef("AvgPool", _infer_window, _avg_pool, _lower_pool("AveragePool"), _POOL[:-1]),
+    OpDef("Pad", _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1"))),
+    OpDef("PadV2", _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1"))),
+)

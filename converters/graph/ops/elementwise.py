@@ -1,0 +1,295 @@
+"""Elementwise ops: arithmetic, activations, comparisons, casts.
+
+Kernels of transcendental functions compute in float64 and round once, so constant folding gives the same bytes on
+every processor, and the oracle is closer to the true value than any runtime it judges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.base import (
+    REQUIRED,
+    Attr,
+    Lower,
+    OnnxBuilder,
+    OpDef,
+    broadcast_of,
+    direct,
+    same_as,
+    scalar,
+    type_attr,
+)
+from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
+from signatures.graph import Node
+
+T = type_attr()
+
+
+def _wide(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """A kernel that computes floats in float64 and rounds once to the dtype of the first operand."""
+
+    def kernel(node: Node, *arrays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            wide = [a.astype(np.float64) if a.dtype.kind == "f" else a for a in arrays]
+            return np.asarray(function(*wide)).astype(arrays[0].dtype)
+
+    return kernel
+
+
+def _plain(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """A kernel whose result IEEE rounds once anyway (add, multiply, divide, compare) or is an integer's."""
+
+    def kernel(node: Node, *arrays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return np.asarray(function(*arrays))
+
+    return kernel
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return np.where(x >= 0, 1 / (1 + np.exp(-np.abs(x))), np.exp(-np.abs(x)) / (1 + np.exp(-np.abs(x))))
+
+
+_SELU_ALPHA, _SELU_SCALE = 1.6732632423543772, 1.0507009873554805
+_erf = np.vectorize(math.erf, otypes=[np.float64])
+
+
+def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
+    return OpDef(name, same_as(0), kernel, direct(lower) if isinstance(lower, str) else lower, (T,))
+
+
+def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
+    lowering = direct(lower) if isinstance(lower, str) else lower
+    return OpDef(name, broadcast_of(), _plain(function), lowering, (T,))
+
+
+def _comparison(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
+    attrs: tuple[Attr, ...] = (T,)
+    if name in ("Equal", "NotEqual"):
+        attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
+    lowering = direct(lower) if isinstance(lower, str) else lower
+    return OpDef(name, broadcast_of(BOOL), _plain(function), lowering, attrs)
+
+
+def _chain(*steps: tuple[str, float | None]) -> Lower:
+    """ONNX ops one after the other; a number is the second operand of its op."""
+
+    def lower(node: Node, builder: OnnxBuilder) -> str:
+        value = builder.value(node.inputs[0])
+        for op, number in steps:
+            value = builder.emit(op, [value] if number is None else [value, scalar(builder, node, number)])
+        return value
+
+    return lower
+
+
+def _lower_square(node: Node, builder: OnnxBuilder) -> Any:
+    value = builder.value(node.inputs[0])
+    return builder.emit("Mul", [value, value])
+
+
+def _lower_squared_difference(node: Node, builder: OnnxBuilder) -> Any:
+    value = builder.emit("Sub", [builder.value(r) for r in node.inputs])
+    return builder.emit("Mul", [value, value])
+
+
+def _lower_clip(node: Node, builder: OnnxBuilder) -> Any:
+    low, high = builder.value(node.inputs[1]), builder.value(node.inputs[2])
+    return builder.emit("Max", [builder.emit("Min", [builder.value(node.inputs[0]), high]), low])
+
+
+def _lower_floor_div(node: Node, builder: OnnxBuilder) -> Any:
+    a, b = (builder.value(r) for r in node.inputs)
+    if builder.type_of(node.inputs[0]).dtype.kind == "f":
+        return builder.emit("Floor", [builder.emit("Div", [a, b])])
+    # ONNX divides integers towards zero: subtract the remainder (which has the divisor's sign) first.
+    rest = builder.emit("Mod", [a, b])
+    return builder.emit("Div", [builder.emit("Sub", [a, rest]), b])
+
+
+def _lower_floor_mod(node: Node, builder: OnnxBuilder) -> Any:
+    a, b = (builder.value(r) for r in node.inputs)
+    if builder.type_of(node.inputs[0]).dtype.kind != "f":
+        return builder.emit("Mod", [a, b])
+    whole = builder.emit("Floor", [builder.emit("Div", [a, b])])
+    return builder.emit("Sub", [a, builder.emit("Mul", [whole, b])])
+
+
+def _lower_not_equal(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Not", [builder.emit("Equal", [builder.value(r) for r in node.inputs])])
+
+
+def _lower_leaky_relu(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("LeakyRelu", [builder.value(node.inputs[0])], alpha=float(node.attrs["alpha"]))
+
+
+def _leaky_relu(node: Node, x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, x * x.dtype.type(node.attrs["alpha"]))
+
+
+def _cast(node: Node, x: np.ndarray) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        return x.astype(node.attrs["DstT"])
+
+
+def _infer_cast(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    value = args[0].value
+    # A symbolic shape vector keeps its symbols through int32 → int64.
+    keep = value if value is not None and value.dtype == object and node.attrs["DstT"] in (INT32, INT64) else None
+    return [TensorType(node.attrs["DstT"], args[0].shape, keep)]
+
+
+def _lower_cast(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Cast", [builder.value(node.inputs[0])], to=node.attrs["DstT"])
+
+
+def _infer_select(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    return [TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)]
+
+
+def _select(node: Node, condition: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """TF 1's Select: a rank-1 condition chooses whole rows."""
+    if condition.ndim == 1 and a.ndim > 1:
+        condition = condition.reshape(condition.shape + (1,) * (a.ndim - 1))
+    return np.where(condition, a, b)
+
+
+def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
+    condition, a, b = (builder.value(r) for r in node.inputs)
+    rank, wide = builder.type_of(node.inputs[0]).rank, builder.type_of(node.inputs[1]).rank
+    if rank == 1 and wide is not None and wide > 1:
+        axes = builder.const(np.arange(1, wide, dtype=np.int64), "axes")
+        condition = builder.emit("Unsqueeze", [condition, axes])
+    return builder.emit("Where", [condition, a, b])
+
+
+def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    return [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)]
+
+
+def _add_n(node: Node, *arrays: np.ndarray) -> np.ndarray:
+    total = arrays[0]
+    for array in arrays[1:]:
+        total = total + array
+    return np.asarray(total)
+
+
+def _lower_add_n(node: Node, builder: OnnxBuilder) -> Any:
+    value = builder.value(node.inputs[0])
+    for reference in node.inputs[1:]:
+        value = builder.emit("Add", [value, builder.value(reference)])
+    return value
+
+
+def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
+    dtype = builder.type_of(node.inputs[0]).dtype
+    shape = builder.emit("Shape", [builder.value(node.inputs[0])])
+    return builder.emit("Expand", [builder.const(np.zeros((), dtype), "zero"), shape])
+
+
+def _lower_ones_like(node: Node, builder: OnnxBuilder) -> Any:
+    dtype = builder.type_of(node.inputs[0]).dtype
+    shape = builder.emit("Shape", [builder.value(node.inputs[0])])
+    return builder.emit("Expand", [builder.const(np.ones((), dtype), "one"), shape])
+
+
+UNARY = (
+    _unary("Neg", _plain(np.negative), "Neg"),
+    _unary("Abs", _plain(np.abs), "Abs"),
+    _unary("Sign", _plain(np.sign), "Sign"),
+    _unary("Square", _plain(np.square), _lower_square),
+    _unary("Reciprocal", _plain(np.reciprocal), "Reciprocal"),
+    _unary("Floor", _plain(np.floor), "Floor"),
+    _unary("Ceil", _plain(np.ceil), "Ceil"),
+    _unary("Round", _plain(np.rint), "Round"),
+    _unary("Exp", _wide(np.exp), "Exp"),
+    _unary("Expm1", _wide(np.expm1), _chain(("Exp", None), ("Sub", 1.0))),
+    _unary("Log", _wide(np.log), "Log"),
+    _unary("Log1p", _wide(np.log1p), _chain(("Add", 1.0), ("Log", None))),
+    _unary("Sqrt", _wide(np.sqrt), "Sqrt"),
+    _unary("Rsqrt", _wide(lambda x: 1 / np.sqrt(x)), _chain(("Sqrt", None), ("Reciprocal", None))),
+    _unary("Sin", _wide(np.sin), "Sin"),
+    _unary("Cos", _wide(np.cos), "Cos"),
+    _unary("Tan", _wide(np.tan), "Tan"),
+    _unary("Erf", _wide(_erf), "Erf"),
+    _unary("Sigmoid", _wide(_sigmoid), "Sigmoid"),
+    _unary("Tanh", _wide(np.tanh), "Tanh"),
+    _unary("Relu", _plain(lambda x: np.maximum(x, x.dtype.type(0))), "Relu"),
+    _unary("Relu6", _plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))), _chain(("Max", 0.0), ("Min", 6.0))),
+    _unary("Elu", _wide(lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0)))), "Elu"),
+    _unary(
+        "Selu",
+        _wide(lambda x: _SELU_SCALE * np.where(x > 0, x, _SELU_ALPHA * np.expm1(np.minimum(x, 0)))),
+        "Selu",
+    ),
+    _unary("Softplus", _wide(lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))), "Softplus"),
+    _unary("Softsign", _wide(lambda x: x / (1 + np.abs(x))), "Softsign"),
+    OpDef("LogicalNot", same_as(0), _plain(np.logical_not), direct("Not")),
+    OpDef(
+        "LeakyRelu",
+        same_as(0),
+        _leaky_relu,
+        _lower_leaky_relu,
+        (T, Attr("alpha", "float", 0.20000000298023224)),
+    ),
+    OpDef(
+        "Cast",
+        _infer_cast,
+        _cast,
+        _lower_cast,
+        (
+            type_attr("SrcT"),
+            Attr("DstT", "type", REQUIRED),
+            Attr("Truncate", "bool", False, since="1.14", supported=False),
+        ),
+    ),
+    OpDef("ZerosLike", same_as(0), lambda node, x: np.zeros_like(x), _lower_zeros_like, (T,)),
+    OpDef("OnesLike", same_as(0), lambda node, x: np.ones_like(x), _lower_ones_like, (T,)),
+)
+
+BINARY = (
+    _binary("Add", np.add, "Add"),
+    _binary("Sub", np.subtract, "Sub"),
+    _binary("Mul", np.multiply, "Mul"),
+    _binary("RealDiv", np.divide, "Div"),
+    _binary("FloorDiv", np.floor_divide, _lower_floor_div),
+    _binary("FloorMod", np.mod, _lower_floor_mod),
+    _binary("Maximum", np.maximum, "Max"),
+    _binary("Minimum", np.minimum, "Min"),
+    OpDef("Pow", broadcast_of(), _wide(np.power), direct("Pow"), (T,)),
+    _binary("SquaredDifference", lambda a, b: np.square(a - b), _lower_squared_difference),
+    OpDef(
+        "ClipByValue",
+        broadcast_of(),
+        _plain(lambda x, low, high: np.maximum(np.minimum(x, high), low)),
+        _lower_clip,
+        (T,),
+    ),
+    OpDef("AddN", broadcast_of(), _add_n, _lower_add_n, (Attr("N", "int", derive="count"), T)),
+)
+
+LOGIC = (
+    _comparison("Less", np.less, "Less"),
+    _comparison("LessEqual", np.less_equal, "LessOrEqual"),
+    _comparison("Greater", np.greater, "Greater"),
+    _comparison("GreaterEqual", np.greater_equal, "GreaterOrEqual"),
+    _comparison("Equal", np.equal, "Equal"),
+    _comparison("NotEqual", np.not_equal, _lower_not_equal),
+    OpDef("LogicalAnd", broadcast_of(BOOL), _plain(np.logical_and), direct("And")),
+    OpDef("LogicalOr", broadcast_of(BOOL), _plain(np.logical_or), direct("Or")),
+    OpDef("Select", _infer_select, _select, _lower_select, (type_attr("T", "in:1"),)),
+    OpDef(
+        "SelectV2",
+        _infer_select_v2,
+        lambda node, c, a, b: np.where(c, a, b),
+        direct("Where"),
+        (type_attr("T", "in:1"),),
+    ),
+)
+
+OPS = UNARY + BINARY + LOGIC

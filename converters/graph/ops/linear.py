@@ -1,0 +1,281 @@
+"""Matrix products, bias, reductions, softmax, argmax."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.base import (
+    Attr,
+    OnnxBuilder,
+    OpDef,
+    constant_input,
+    reduced,
+    require_constant,
+    same_as,
+    shape_error,
+    type_attr,
+)
+from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
+from signatures.graph import Node
+
+T = type_attr()
+
+
+def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    if node.attrs.get("transpose_a") or node.attrs.get("adj_x"):
+        a = np.swapaxes(a, -1, -2)
+    if node.attrs.get("transpose_b") or node.attrs.get("adj_y"):
+        b = np.swapaxes(b, -1, -2)
+    with np.errstate(all="ignore"):
+        if a.dtype.kind != "f":
+            return np.asarray(a @ b)
+        return np.asarray(a.astype(np.float64) @ b.astype(np.float64)).astype(a.dtype)
+
+
+def _infer_matmul(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    a, b = args[0].shape, args[1].shape
+    if a is None or b is None:
+        return [TensorType(args[0].dtype, (symbols.fresh(), symbols.fresh()) if node.op == "MatMul" else None)]
+    if len(a) < 2 or len(b) < 2 or (node.op == "MatMul" and (len(a), len(b)) != (2, 2)):
+        raise shape_error(node, args, "a matrix product takes matrices")
+    if node.attrs.get("transpose_a") or node.attrs.get("adj_x"):
+        a = (*a[:-2], a[-1], a[-2])
+    if node.attrs.get("transpose_b") or node.attrs.get("adj_y"):
+        b = (*b[:-2], b[-1], b[-2])
+    if isinstance(a[-1], int) and isinstance(b[-2], int) and a[-1] != b[-2]:
+        raise shape_error(node, args, f"the inner lengths {a[-1]} and {b[-2]} differ")
+    try:
+        batch = broadcast(a[:-2], b[:-2], symbols)
+    except ValueError as error:
+        raise shape_error(node, args, str(error)) from error
+    assert batch is not None
+    return [TensorType(args[0].dtype, (*batch, a[-2], b[-1]))]
+
+
+def _lower_matmul(node: Node, builder: OnnxBuilder) -> Any:
+    values = []
+    for position, flags in enumerate((("transpose_a", "adj_x"), ("transpose_b", "adj_y"))):
+        value = builder.value(node.inputs[position])
+        if any(node.attrs.get(flag) for flag in flags):
+            constant = builder.type_of(node.inputs[position]).constant
+            rank = builder.type_of(node.inputs[position]).rank or 2
+            if constant is not None:
+                value = builder.const(np.ascontiguousarray(np.swapaxes(constant, -1, -2)), "weights")
+            else:
+                value = builder.emit("Transpose", [value], perm=[*range(rank - 2), rank - 1, rank - 2])
+        values.append(value)
+    return builder.emit("MatMul", values)
+
+
+def _bias_add(node: Node, x: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        return np.asarray(x + bias)
+
+
+def _lower_bias_add(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Add", [builder.value(r) for r in node.inputs])
+
+
+def activation(name: str, x: np.ndarray) -> np.ndarray:
+    """The activations that fused ops may carry."""
+    from converters.graph.ops.elementwise import OPS as elementwise
+
+    kernel = next(op.kernel for op in elementwise if op.name == name)
+    assert kernel is not None
+    return np.asarray(kernel(Node(name, name), x))
+
+
+def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    x = _bias_add(node, _matmul(node, a, b), bias)
+    for name in node.attrs["fused_ops"][1:]:
+        x = activation(name, x)
+    return x
+
+
+def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
+    value = builder.emit(
+        "Gemm",
+        [builder.value(r) for r in node.inputs],
+        transA=int(bool(node.attrs.get("transpose_a"))),
+        transB=int(bool(node.attrs.get("transpose_b"))),
+    )
+    for name in node.attrs["fused_ops"][1:]:
+        value = builder.emit(name, [value])
+    return value
+
+
+# ------------------------------------------------------------------ reductions
+
+
+def _axes(node: Node, axes: np.ndarray, rank: int) -> tuple[int, ...]:
+    wanted = [int(a) for a in np.atleast_1d(axes)]
+    return tuple(sorted({a + rank if a < 0 else a for a in wanted}))
+
+
+def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[..., np.ndarray]:
+    def kernel(node: Node, x: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        work = x.astype(np.float64) if wide and x.dtype.kind == "f" else x
+        chosen = _axes(node, axes, x.ndim)
+        with np.errstate(all="ignore"):
+            result = function(work, axis=chosen, keepdims=bool(node.attrs["keep_dims"])) if chosen else work
+        return np.asarray(result).astype(x.dtype)
+
+    return kernel
+
+
+def _infer_reduction(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    keep = bool(node.attrs["keep_dims"])
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    axes = _axes(node, require_constant(node, args, 1, "the axes to reduce over"), len(shape))
+    if any(a >= len(shape) or a < 0 for a in axes):
+        raise shape_error(node, args, f"axes {axes} are outside the tensor's rank")
+    kept: list[Dim] = [1 if i in axes else d for i, d in enumerate(shape) if keep or i not in axes]
+    return [TensorType(args[0].dtype, tuple(kept))]
+
+
+def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
+    def lower(node: Node, builder: OnnxBuilder) -> Any:
+        kind = builder.type_of(node.inputs[0])
+        assert kind.shape is not None
+        axes = _axes(node, constant_input(node, builder, 1, "the axes to reduce over"), len(kind.shape))
+        value = builder.value(node.inputs[0])
+        keep = bool(node.attrs["keep_dims"])
+        if kind.dtype == BOOL:  # ONNX does not reduce booleans
+            value = builder.emit("Cast", [value], to=INT32)
+            return builder.emit("Cast", [reduced(builder, onnx_op, value, axes, keep)], to=BOOL)
+        return reduced(builder, onnx_op, value, axes, keep)
+
+    return lower
+
+
+def _reduce(name: str, function: Callable[..., Any], onnx_op: str, *, wide: bool = False) -> OpDef:
+    attrs: tuple[Attr, ...] = (Attr("keep_dims", "bool", False), type_attr("Tidx", "in:1"))
+    if name not in ("All", "Any"):
+        attrs = (T, *attrs)
+    return OpDef(name, _infer_reduction, _reduction(function, wide=wide), _lower_reduction(onnx_op), attrs)
+
+
+def _arg(function: Callable[..., Any]) -> Callable[..., np.ndarray]:
+    def kernel(node: Node, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
+        return np.asarray(function(x, axis=int(axis))).astype(node.attrs["output_type"])
+
+    return kernel
+
+
+def _infer_arg(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(node.attrs["output_type"], None)]
+    axis = int(require_constant(node, args, 1, "an axis"))
+    if not -len(shape) <= axis < len(shape):
+        raise shape_error(node, args, f"axis {axis} is outside the tensor's rank")
+    axis %= len(shape)
+    return [TensorType(node.attrs["output_type"], shape[:axis] + shape[axis + 1 :])]
+
+
+def _lower_arg(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
+    def lower(node: Node, builder: OnnxBuilder) -> Any:
+        axis = int(constant_input(node, builder, 1, "an axis"))
+        value = builder.emit(onnx_op, [builder.value(node.inputs[0])], axis=axis, keepdims=0)
+        return value if node.attrs["output_type"] == INT64 else builder.emit("Cast", [value], to=INT32)
+
+    return lower
+
+
+_ARG_ATTRS = (T, type_attr("Tidx", "in:1"), Attr("output_type", "type", INT64))
+
+
+# ------------------------------------------------------------------ softmax
+
+
+def softmax64(x: np.ndarray) -> np.ndarray:
+    """Softmax over the last axis in float64."""
+    wide = x.astype(np.float64)
+    with np.errstate(all="ignore"):
+        e = np.exp(wide - wide.max(axis=-1, keepdims=True))
+        return np.asarray(e / e.sum(axis=-1, keepdims=True))
+
+
+def _log_softmax(node: Node, x: np.ndarray) -> np.ndarray:
+    wide = x.astype(np.float64)
+    with np.errstate(all="ignore"):
+        shifted = wide - wide.max(axis=-1, keepdims=True)
+        return np.asarray(shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))).astype(x.dtype)
+
+
+def _lower_softmax(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
+    def lower(node: Node, builder: OnnxBuilder) -> Any:
+        return builder.emit(onnx_op, [builder.value(node.inputs[0])], axis=-1)
+
+    return lower
+
+
+OPS = (
+    OpDef(
+        "MatMul",
+        _infer_matmul,
+        _matmul,
+        _lower_matmul,
+        (
+            T,
+            Attr("transpose_a", "bool", False),
+            Attr("transpose_b", "bool", False),
+            # Written by TF 2.16 and later; marks products that belong to a gradient, which changes nothing here.
+            Attr("grad_a", "bool", False, since="2.16"),
+            Attr("grad_b", "bool", False, since="2.16"),
+        ),
+        foldable=False,
+    ),
+    OpDef(
+        "BatchMatMul",
+        _infer_matmul,
+        _matmul,
+        _lower_matmul,
+        (T, Attr("adj_x", "bool", False), Attr("adj_y", "bool", False)),
+        foldable=False,
+    ),
+    OpDef(
+        "_FusedMatMul",
+        _infer_matmul,
+        _fused_matmul,
+        _lower_fused_matmul,
+        (
+            T,
+            Attr("transpose_a", "bool", False),
+            Attr("transpose_b", "bool", False),
+            Attr("num_args", "int", 1),
+            Attr("fused_ops", "str"),
+            Attr("epsilon", "float", 0.0001),
+        ),
+        foldable=False,
+    ),
+    OpDef(
+        "BiasAdd",
+        same_as(0),
+        _bias_add,
+        _lower_bias_add,
+        (T, Attr("data_format", "str", "NHWC")),
+    ),
+    _reduce("Sum", np.sum, "ReduceSum", wide=True),
+    _reduce("Mean", np.mean, "ReduceMean", wide=True),
+    _reduce("Prod", np.prod, "ReduceProd", wide=True),
+    _reduce("Max", np.max, "ReduceMax"),
+    _reduce("Min", np.min, "ReduceMin"),
+    _reduce("All", np.all, "ReduceMin"),
+    _reduce("Any", np.any, "ReduceMax"),
+    OpDef("ArgMax", _infer_arg, _arg(np.argmax), _lower_arg("ArgMax"), _ARG_ATTRS),
+    OpDef("ArgMin", _infer_arg, _arg(np.argmin), _lower_arg("ArgMin"), _ARG_ATTRS),
+    OpDef(
+        "Softmax",
+        same_as(0),
+        lambda node, x: softmax64(x).astype(x.dtype),
+        _lower_softmax("Softmax"),
+        (T,),
+    ),
+    OpDef("LogSoftmax", same_as(0), _log_softmax, _lower_softmax("LogSoftmax"), (T,)),
+)

@@ -1,0 +1,77 @@
+"""The outputs that stand beside ``action``: the action without chance, and the log-probabilities of a drawn one.
+
+Precondition: straight, folded graph; noise lifted or kept. Postcondition: ``deterministic_action`` exists for every
+policy (continuous: the action at zero noise; discrete: int64 [B, branches], the argmax of each branch), and
+``action_log_probs`` (float32 [B, ΣB]) for a sampled one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from converters.graph.editor import Editor
+from converters.graph.passes.noise import without_noise
+from converters.graph.shapes import infer_types
+from converters.graph.types import INT32, INT64
+from signatures.graph import Graph
+from signatures.infer import ActionMeaning
+from signatures.roles import Role
+
+DETERMINISTIC, LOG_PROBS = "deterministic_action", "action_log_probs"
+
+
+def add_companions(
+    graph: Graph, fetches: Mapping[str, str], meaning: ActionMeaning, noise: Mapping[str, tuple[int | None, ...]]
+) -> tuple[Graph, dict[str, str]]:
+    """The graph with the companions, and the fetches with their tensors added."""
+    added = dict(fetches)
+    if meaning.role is Role.CONTINUOUS:
+        if DETERMINISTIC not in fetches:
+            graph, added[DETERMINISTIC] = without_noise(graph, fetches["action"], noise, DETERMINISTIC)
+        return graph, added
+    editor = Editor(graph)
+    for node in graph.nodes:
+        editor.keep(node)
+    if meaning.role is Role.SAMPLED and LOG_PROBS not in fetches:
+        parts = [editor.add("LogSoftmax", [b], f"{LOG_PROBS}/branch_{i}") for i, b in enumerate(meaning.branches)]
+        added[LOG_PROBS] = _joined(editor, parts, LOG_PROBS)
+    if DETERMINISTIC not in fetches:
+        if meaning.branches:
+            added[DETERMINISTIC] = _argmax(editor, meaning.branches)
+        else:
+            added[DETERMINISTIC] = _as_columns(editor, graph, fetches["action"])
+    return editor.graph(), added
+
+
+def _joined(editor: Editor, parts: Sequence[str], name: str) -> str:
+    if len(parts) == 1:
+        return parts[0]
+    axis = editor.const(np.array(1, INT32), f"{name}/axis")
+    return editor.add("ConcatV2", [*parts, axis], f"{name}/concat")
+
+
+def _argmax(editor: Editor, branches: Sequence[str]) -> str:
+    columns = []
+    for i, branch in enumerate(branches):
+        prefix = f"{DETERMINISTIC}/branch_{i}"
+        axis = editor.const(np.array(1, INT32), f"{prefix}/axis")
+        best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
+        columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))
+    return _joined(editor, columns, DETERMINISTIC)
+
+
+def _as_columns(editor: Editor, graph: Graph, action: str) -> str:
+    """An integer action whose scores are not in the graph: itself, as int64 [B, n]."""
+    kind = infer_types(graph)[action]
+    value = action
+    if kind.dtype != INT64:
+        value = editor.add("Cast", [value], f"{DETERMINISTIC}/int64", DstT=INT64)
+    if kind.rank == 1:
+        value = editor.add("Reshape", [value, _column_shape(editor, DETERMINISTIC)], f"{DETERMINISTIC}/column")
+    return value
+
+
+def _column_shape(editor: Editor, prefix: str) -> str:
+    return editor.const(np.array([-1, 1], np.int32), f"{prefix}/column_shape")

@@ -1,0 +1,53 @@
+"""Compute what does not depend on an input; give every Reshape a constant shape.
+
+Precondition: no control flow. Postcondition: a node whose result is known is a Const; a Reshape whose target depends
+on the batch alone has -1 there. Transcendental functions are folded in float64 and rounded once; matrix products and
+samplers are never folded, so the bytes do not depend on the processor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from converters.graph.editor import Editor
+from converters.graph.ops.table import op_of
+from converters.graph.shapes import infer_types
+from converters.graph.types import INT32, TensorType
+from signatures.graph import Graph, ref
+
+
+def fold(graph: Graph) -> Graph:
+    """See the module."""
+    types = infer_types(graph)
+    editor = Editor(graph)
+    for node in graph.nodes:
+        if node.op in ("Const", "Placeholder"):
+            editor.keep(node)
+            continue
+        count = op_of(node).outputs if op_of(node).outputs > 0 else _outputs(types, node.name)
+        constants = [types[ref(node.name, i)].constant for i in range(count)]
+        if all(c is not None for c in constants):
+            for i, constant in enumerate(constants):
+                assert constant is not None
+                name = node.name if i == 0 else f"{node.name}/{i}"
+                made = editor.replace_const(name, np.asarray(constant), node.origin if i == 0 else None)
+                editor.redirect(ref(node.name, i), made)
+        elif node.op == "Reshape" and (target := types[node.inputs[1]].value) is not None and target.dtype == object:
+            cells = target.reshape(-1).tolist()
+            open_axes = [c for c in cells if isinstance(c, str)]
+            if len(open_axes) == 1 and -1 not in cells:
+                shape = np.array([-1 if isinstance(c, str) else int(c) for c in cells], INT32)
+                constant_shape = editor.const(shape, f"{node.name}/shape")
+                editor.keep(node.with_inputs((node.inputs[0], constant_shape)))
+            else:
+                editor.keep(node)
+        else:
+            editor.keep(node)
+    return editor.graph()
+
+
+def _outputs(types: dict[str, TensorType], name: str) -> int:
+    count = 1
+    while ref(name, count) in types:
+        count += 1
+    return count

@@ -1,0 +1,182 @@
+"""Placeholders: fix the ones that get a value, derive the batch size, find shapes that the file does not say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from converters.graph.editor import Editor
+from converters.graph.ops.convolution import window_padding
+from converters.graph.passes.normalise import as_placeholder
+from converters.graph.types import INT32
+from signatures.errors import UsageError
+from signatures.graph import Graph, Node, TensorShape, node_of
+from signatures.infer import placeholder_rank
+from signatures.roles import OBSERVATIONS, Role
+
+_LARGEST_IMAGE = 512
+
+
+def set_values(graph: Graph, values: Mapping[str, float]) -> Graph:
+    """Placeholders with a value from ``--set`` become constants of their dtype and (free axes: 1) shape."""
+    missing = [name for name in values if name not in graph]
+    if missing:
+        raise UsageError(
+            f"--set names {missing[0]!r}, which is not in the graph", fix="export-model inspect FILE lists the inputs"
+        )
+    nodes = []
+    for node in graph.nodes:
+        if node.name in values:
+            if node.op not in ("Placeholder", "PlaceholderWithDefault"):
+                raise UsageError(f"--set names {node.name!r}, which is a {node.op}, not a placeholder")
+            node = constant_for(node, values[node.name])
+        nodes.append(node)
+    return Graph(tuple(nodes))
+
+
+def constant_value(node: Node, value: float) -> np.ndarray:
+    """The array that a placeholder with one fixed value stands for (free axes: length 1)."""
+    shape: TensorShape | None = node.attrs.get("shape")
+    dims = () if shape is None or shape.dims is None else tuple(1 if d is None else d for d in shape.dims)
+    return np.full(dims, value, node.attrs["dtype"])
+
+
+def constant_for(node: Node, value: float) -> Node:
+    """A Const in place of a placeholder."""
+    return Node(node.name, "Const", value=constant_value(node, value), origin=node.origin)
+
+
+def settle_inputs(graph: Graph, roles: Mapping[str, Role]) -> Graph:
+    """``sequence_length`` becomes 1, ``batch_size`` the length of an observation's first axis.
+
+    Postcondition: the placeholders left are those whose role stays in the signature; defaults that the signature
+    names are plain placeholders.
+    """
+    observation = next(name for name, role in roles.items() if role in OBSERVATIONS)
+    editor = Editor(graph)
+    for node in graph.nodes:
+        role = roles.get(node.name)
+        if role is Role.SEQUENCE_LENGTH:
+            editor.keep(constant_for(node, 1))
+        elif role is Role.BATCH_SIZE:
+            editor.redirect(node.name, _batch_size(editor, graph, node, observation))
+        elif role is not None and node.op == "PlaceholderWithDefault":
+            editor.keep(as_placeholder(node))
+        else:
+            editor.keep(node)
+    return editor.graph()
+
+
+def batch_size_rank(graph: Graph, node: Node) -> int:
+    """0 where the graph uses ``batch_size`` as a number, 1 where as a vector of one (Unity fed it so)."""
+    joined = any(reader.op == "ConcatV2" for reader in graph.consumers()[node.name])
+    return 1 if placeholder_rank(node) == 1 or joined else 0
+
+
+def _batch_size(editor: Editor, graph: Graph, node: Node, observation: str) -> str:
+    """Shape(observation)[0]: a scalar, or a vector of one where the graph uses it as one."""
+    wants_vector = batch_size_rank(graph, node) == 1
+    shape = editor.add("Shape", [observation], f"{node.name}/shape", out_type=INT32)
+    bounds = [editor.const(np.array([v], np.int32), f"{node.name}/{k}") for k, v in (("b", 0), ("e", 1), ("s", 1))]
+    return editor.add(
+        "StridedSlice", [shape, *bounds], f"{node.name}/derived", shrink_axis_mask=0 if wants_vector else 1
+    )
+
+
+def complete_shapes(graph: Graph, roles: Mapping[str, Role]) -> Graph:
+    """Shapes for placeholders that have none, from what reads them.
+
+    A vector observation's length is the kernel's of the dense layer it feeds; an image's channels are the kernel's of
+    its convolution, and its sides the smallest square that makes the flattened features fit the next dense layer.
+    """
+    consumers = graph.consumers()
+    found: dict[str, TensorShape] = {}
+    for name, role in roles.items():
+        node = graph.get(name)
+        if node is None or node.op != "Placeholder":
+            continue
+        shape: TensorShape = node.attrs["shape"]
+        if role is Role.VISUAL and (shape.dims is None or any(d is None for d in shape.dims[1:])):
+            found[name] = _image_shape(graph, node, consumers, shape)
+        elif role is not Role.PARAMETER and shape.dims is None:
+            length = _dense_length(graph, node, consumers)
+            if length is not None:
+                found[name] = TensorShape((None, length))
+    if not found:
+        return graph
+    return Graph(
+        tuple(replace(n, attrs={**n.attrs, "shape": found[n.name]}) if n.name in found else n for n in graph.nodes)
+    )
+
+
+def _dense_length(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> int | None:
+    for reader in consumers[node.name]:
+        if reader.op == "MatMul" and node_of(reader.inputs[0]) == node.name:
+            kernel = graph.constant(reader.inputs[1])
+            if kernel is not None:
+                return int(kernel.shape[1 if reader.attrs.get("transpose_b") else 0])
+        if reader.op in ("Identity", "Sub", "Sigmoid", "Tanh"):
+            return _dense_length(graph, reader, consumers)
+    return None
+
+
+def _image_shape(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], known: TensorShape) -> TensorShape:
+    first = _next(graph, node, consumers, ("Conv2D", "DepthwiseConv2dNative"))
+    if first is None:
+        return known
+    kernel = graph.constant(first.inputs[1])
+    channels = None if kernel is None else int(kernel.shape[2])
+    dims = known.dims if known.dims is not None and len(known.dims) == 4 else (None, None, None, channels)
+    if any(d is not None for d in dims[1:3]) and None not in dims[1:3]:
+        return TensorShape((None, dims[1], dims[2], dims[3] or channels))
+    layers, last = _window_chain(graph, first, consumers)
+    dense = _next(graph, last, consumers, ("MatMul",))
+    weights = None if dense is None else graph.constant(dense.inputs[1])
+    if weights is None:
+        return TensorShape((None, dims[1], dims[2], dims[3] or channels))
+    for side in range(1, _LARGEST_IMAGE + 1):
+        height, width = dims[1] or side, dims[2] or side
+        if _flattened(layers, graph, height, width) == weights.shape[0]:
+            return TensorShape((None, height, width, dims[3] or channels))
+    return TensorShape((None, dims[1], dims[2], dims[3] or channels))
+
+
+def _next(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], ops: tuple[str, ...]) -> Node | None:
+    """The first node of one of ``ops`` downstream, nearest first."""
+    queue, seen = [node], {node.name}
+    while queue:
+        for reader in consumers[queue.pop(0).name]:
+            if reader.op in ops:
+                return reader
+            if reader.name not in seen:
+                seen.add(reader.name)
+                queue.append(reader)
+    return None
+
+
+def _window_chain(graph: Graph, first: Node, consumers: Mapping[str, list[Node]]) -> tuple[list[Node], Node]:
+    """Convolutions and pools in a row from ``first`` on."""
+    chain, node = [first], first
+    while (following := _next(graph, node, consumers, ("Conv2D", "DepthwiseConv2dNative", "MaxPool", "MatMul"))) and (
+        following.op != "MatMul"
+    ):
+        chain.append(following)
+        node = following
+    return chain, node
+
+
+def _flattened(layers: list[Node], graph: Graph, height: int, width: int) -> int:
+    channels = 0
+    for layer in layers:
+        kernel = None if layer.op == "MaxPool" else graph.constant(layer.inputs[1])
+        window = layer.attrs["ksize"][1:3] if kernel is None else kernel.shape[:2]
+        if kernel is not None:
+            channels = int(kernel.shape[3]) * (int(kernel.shape[2]) if layer.op == "DepthwiseConv2dNative" else 1)
+        strides = layer.attrs["strides"][1:3]
+        height = window_padding(height, int(window[0]), int(strides[0]), layer.attrs["padding"])[0]
+        width = window_padding(width, int(window[1]), int(strides[1]), layer.attrs["padding"])[0]
+        if height < 1 or width < 1:
+            return 0
+    return height * width * channels

@@ -1,0 +1,109 @@
+"""In-graph samplers of N(0, 1) become an input, a zero, or stay.
+
+Lifted, the policy is a pure function of its inputs: TFJS has no RandomStandardNormal (tfjs #4156), and a run can be
+repeated in any runtime by feeding the same draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from converters.graph.editor import Editor
+from converters.graph.ops.chance import NORMAL_SAMPLERS
+from converters.graph.shapes import infer_types
+from converters.graph.types import FLOAT32, static_shape
+from signatures.errors import UnsupportedOpError
+from signatures.graph import Graph, Node, TensorShape
+
+NoiseMode = Literal["lift", "keep", "zero"]
+
+
+def samplers(graph: Graph) -> list[Node]:
+    """The nodes that draw from N(0, 1), in graph order."""
+    return [n for n in graph.nodes if n.op in NORMAL_SAMPLERS]
+
+
+def lift_noise(graph: Graph, mode: NoiseMode) -> Graph:
+    """Placeholders (``lift``) or zeros (``zero``) in place of the samplers, under their names; ``keep`` leaves them."""
+    if mode == "keep" or not samplers(graph):
+        return graph
+    types = infer_types(graph)
+    editor = Editor(graph)
+    for node in graph.nodes:
+        if node.op not in NORMAL_SAMPLERS:
+            editor.keep(node)
+            continue
+        shape = types[node.name].shape
+        if shape is None:
+            raise UnsupportedOpError(
+                f"cannot lift the noise of {node.name!r}: its shape is not known before the graph runs",
+                issues=[(node.name, node.op)],
+                why="an input needs a number of axes",
+                fix="use --noise keep or --noise zero",
+            )
+        dims = static_shape(shape)
+        assert dims is not None
+        if mode == "lift":
+            attrs = {"dtype": FLOAT32, "shape": TensorShape(dims)}
+            editor.nodes.append(Node(node.name, "Placeholder", attrs=attrs, origin=node.origin))
+        else:
+            # One row of zeros broadcasts over the batch.
+            zeros = np.zeros([1 if d is None else d for d in dims], np.float32)
+            editor.nodes.append(Node(node.name, "Const", value=zeros, origin=node.origin))
+    return editor.graph()
+
+
+def without_noise(
+    graph: Graph, reference: str, noise: Mapping[str, tuple[int | None, ...]], prefix: str
+) -> tuple[Graph, str]:
+    """``reference`` computed at zero noise beside the graph it stands in.
+
+    ``noise`` maps the names of noise nodes (inputs or samplers) to their shapes. Nodes between them and ``reference``
+    are copied under ``prefix``. A product with an all-zero constant is taken to be zero: true for every finite factor,
+    and where a standard deviation overflows, the mean is what a policy without chance should give.
+    """
+    touched: set[str] = set(noise)
+    for node in graph.nodes:
+        if any(r.rpartition(":")[0] in touched or r in touched for r in node.inputs):
+            touched.add(node.name)
+    wanted = graph.ancestors([reference]) & touched
+    if not wanted:
+        return graph, reference
+    types = infer_types(graph)
+    editor = Editor(graph)
+    copies: dict[str, str] = {}
+    zeros: set[str] = set()
+    for node in graph.nodes:
+        editor.keep(node)
+    for node in graph.nodes:
+        if node.name not in wanted:
+            continue
+        if node.name in noise:
+            shape = [1 if d is None else d for d in noise[node.name]]
+            copies[node.name] = editor.const(np.zeros(shape, np.float32), f"{prefix}/zero")
+            zeros.add(copies[node.name])
+            continue
+        inputs = [_moved(r, copies) for r in node.inputs]
+        zero = next((i for i in inputs if i in zeros), None)
+        if node.op == "Mul" and zero is not None:
+            copies[node.name] = zero
+            continue
+        if node.op == "Add" and zero is not None:
+            side = 1 - inputs.index(zero)
+            if inputs[side] not in zeros and types[node.inputs[side]].shape == types[node.name].shape:
+                copies[node.name] = inputs[side]
+                continue
+        name = editor.add_name(f"{prefix}/{node.name}")
+        editor.nodes.append(Node(name, node.op, tuple(inputs), node.attrs, node.value))
+        copies[node.name] = name
+    return editor.graph(), _moved(reference, copies)
+
+
+def _moved(reference: str, copies: Mapping[str, str]) -> str:
+    name, colon, index = reference.rpartition(":")
+    if colon and index.isdigit() and name in copies:
+        return f"{copies[name]}:{index}"
+    return copies.get(reference, reference)

@@ -1,0 +1,95 @@
+"""Take out what changes nothing: identities, reshapes that reshape nothing, chains of them, dead nodes.
+
+Precondition: folded graph. Postcondition: no Identity-like op is left; a chain of ops that only renames axes of
+length 1 is one Reshape or none; everything left is upstream of ``roots``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from converters.graph.editor import Editor
+from converters.graph.ops.arrays import strided_steps
+from converters.graph.shapes import Types, infer_types
+from converters.graph.types import INT32
+from signatures.graph import Graph, Node
+
+IDENTITIES = frozenset(("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"))
+
+
+def drop_identities(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
+    """The graph without pass-through ops, and where the fetched tensors are now."""
+    editor = Editor(graph)
+    for node in graph.nodes:
+        if node.op in IDENTITIES:
+            editor.redirect(node.name, editor.resolve(node.inputs[0]))
+        else:
+            editor.keep(node)
+    moved = {name: editor.resolve(reference) for name, reference in fetches.items()}
+    return editor.graph().pruned(moved.values()), moved
+
+
+def collapse_views(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
+    """The graph with chains of reshaping ops collapsed, and where the fetched tensors are now."""
+    types = infer_types(graph)
+    editor = Editor(graph)
+    base: dict[str, str] = {}  # output of a view → the tensor whose elements it shows, in the same order
+    for node in graph.nodes:
+        if not _is_view(node, types):
+            editor.keep(node)
+            continue
+        source = base.get(node.inputs[0], node.inputs[0])
+        base[node.name] = source
+        shape = types[node.name].shape
+        if shape == types[source].shape:
+            editor.redirect(node.name, editor.resolve(source))
+        elif shape is not None and sum(1 for d in shape if isinstance(d, str)) <= 1:
+            target = np.array([-1 if isinstance(d, str) else d for d in shape], INT32)
+            made = editor.add(
+                "Reshape", [source, editor.const(target, f"{node.name}/to")], f"{node.name}/view", node.origin
+            )
+            editor.redirect(node.name, made)
+        else:
+            del base[node.name]
+            editor.keep(node)
+    moved = {name: editor.resolve(reference) for name, reference in fetches.items()}
+    return editor.graph().pruned(moved.values()), moved
+
+
+def _is_view(node: Node, types: Types) -> bool:
+    """Whether a node shows the same elements in the same order under another shape."""
+    if node.op in ("Reshape", "Squeeze", "ExpandDims"):
+        return types[node.inputs[0]].shape is not None and types[node.name].shape is not None
+    if node.op in ("Pack", "ConcatV2"):
+        return len(node.inputs) == (1 if node.op == "Pack" else 2) and types[node.name].shape is not None
+    before = types[node.inputs[0]].shape if node.inputs else None
+    if before is None:
+        return False
+    if node.op == "Transpose":
+        permutation = types[node.inputs[1]].constant
+        if permutation is None:
+            return False
+        moved = [int(p) for p in permutation if before[int(p)] != 1]
+        return moved == sorted(moved)
+    if node.op == "StridedSlice":
+        operands = [types[r].constant for r in node.inputs[1:4]]
+        if any(o is None for o in operands):
+            return False
+        steps = strided_steps(node, len(before), *(o.tolist() for o in operands if o is not None))
+        lengths = iter(before)
+        for step in steps:
+            if step[0] == "new":
+                continue
+            length = next(lengths)
+            if step[0] == "take" and length != 1:
+                return False
+            if step[0] == "slice" and step[1:] not in ((None, None, 1), (0, None, 1)):
+                first, last, stride = step[1:]
+                if not isinstance(length, int) or len(range(*slice(first, last, stride).indices(length))) != length:
+                    return False
+                if stride < 0 and length != 1:
+                    return False
+        return True
+    return False

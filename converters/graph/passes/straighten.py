@@ -1,0 +1,296 @@
+"""Loops into straight lines.
+
+``dynamic_rnn`` is a while loop over time; a policy runs it for one step. With ``sequence_length`` fixed, the number of
+turns is known before the graph runs, so the loop is unrolled: each node of the body becomes a node per turn, tensor
+arrays become the tensors that were written to them. Nothing is assumed of the cell, so LSTM, GRU and hand-written
+cells go the same way, as do ``tf.cond`` branches whose predicate is a constant.
+
+Precondition: normalised graph, ``sequence_length`` constant. Postcondition: no control flow is left. Raises
+UnsupportedOpError where a predicate is not constant or a loop runs for more than ``MAX_TURNS``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from converters.graph.editor import Editor
+from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
+from converters.graph.shapes import Types, infer_types, run_kernel
+from converters.graph.types import INT32
+from signatures.errors import UnsupportedOpError
+from signatures.graph import Graph, Node, ref, split_ref
+
+MAX_TURNS = 64
+
+
+@dataclass(frozen=True)
+class _Flow:
+    """The content of a tensor array at one point of the program: index → tensor of the new graph."""
+
+    size: int | None
+    items: tuple[tuple[int, str], ...] = ()
+
+    def get(self, index: int) -> str:
+        return dict(self.items)[index]
+
+
+class _Dead(Exception):
+    """A tensor on the branch that is not taken."""
+
+
+def straighten(graph: Graph) -> Graph:
+    """See the module."""
+    if not any(n.op in CONTROL_FLOW for n in graph.nodes):
+        return graph
+    return _Unroller(graph).run()
+
+
+class _Unroller:
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.types: Types = infer_types(graph, partial=True)
+        self.editor = Editor(graph)
+        self.frames = _frames(graph)
+        self.made: dict[str, Node] = {}
+        self.memo: dict[tuple[str, int | None], str | _Flow | None] = {}
+        self.turns: dict[str, int] = {}
+        self.predicates = {self.frames[n.name]: n for n in graph.nodes if n.op == "LoopCond" and n.name in self.frames}
+
+    def run(self) -> Graph:
+        for node in self.graph.nodes:
+            if node.name in self.frames:
+                continue  # loop bodies are made on demand, once per turn
+            try:
+                self.tensor(node.name, None)
+            except _Dead:
+                continue
+        return self.editor.graph()
+
+    # ---- one tensor of the old graph, at one turn of its loop
+
+    def tensor(self, reference: str, turn: int | None) -> str | _Flow:
+        name, index = split_ref(reference)
+        node = self.graph[name]
+        if name not in self.frames:
+            turn = None
+        elif node.op == "Identity":
+            return self.tensor(node.inputs[0], turn)  # it may pass on a tensor array, which is no tensor here
+        if node.op in CONTROL_FLOW:
+            key = (reference, turn)
+            if key not in self.memo:
+                self.memo[key] = self._control(node, index, turn)
+            return _alive(self.memo[key])
+        key = (name, turn)
+        if key not in self.memo:
+            self.memo[key] = self._copy(node, turn)
+        made = _alive(self.memo[key])
+        assert isinstance(made, str)
+        return ref(made, index)
+
+    def plain(self, reference: str, turn: int | None) -> str:
+        value = self.tensor(reference, turn)
+        if not isinstance(value, str):
+            raise unsupported([self.graph.producer(reference)])
+        return value
+
+    def _copy(self, node: Node, turn: int | None) -> str | None:
+        try:
+            inputs = tuple(self.plain(r, turn) for r in node.inputs)
+        except _Dead:
+            return None
+        name = node.name if not turn else self.editor.add_name(f"{node.name}/turn_{turn}")
+        copy = Node(name, node.op, inputs, node.attrs, node.value, node.origin)
+        self.editor.nodes.append(copy)
+        self.made[name] = copy
+        return name
+
+    def _control(self, node: Node, index: int, turn: int | None) -> str | _Flow | None:
+        try:
+            return getattr(self, "_" + _METHODS[node.op])(node, index, turn)  # type: ignore[no-any-return]
+        except _Dead:
+            return None
+
+    # ---- loops and branches
+
+    def _enter(self, node: Node, index: int, turn: int | None) -> str | _Flow:
+        return self.tensor(node.inputs[0], None)
+
+    def _merge(self, node: Node, index: int, turn: int | None) -> str | _Flow:
+        back = [r for r in node.inputs if self.graph.producer(r).op == "NextIteration"]
+        if back and turn is not None:
+            if turn == 0:
+                return self.tensor(next(r for r in node.inputs if r not in back), 0)
+            return self.tensor(self.graph.producer(back[0]).inputs[0], turn - 1)
+        for reference in node.inputs:
+            try:
+                return self.tensor(reference, turn)
+            except _Dead:
+                continue
+        raise _Dead
+
+    def _switch(self, node: Node, index: int, turn: int | None) -> str | _Flow:
+        if self.graph.producer(node.inputs[1]).op == "LoopCond":
+            return self.tensor(node.inputs[0], turn)
+        predicate = self.constant(self.plain(node.inputs[1], turn))
+        if predicate is None:
+            raise _undecided(node, "the condition of a branch")
+        if bool(predicate) != bool(index):
+            raise _Dead
+        return self.tensor(node.inputs[0], turn)
+
+    def _exit(self, node: Node, index: int, turn: int | None) -> str | _Flow:
+        switch = self.graph.producer(node.inputs[0])
+        return self.tensor(switch.inputs[0], self._turns(self.frames[switch.name]))
+
+    def _loop_cond(self, node: Node, index: int, turn: int | None) -> str | _Flow:
+        return self.tensor(node.inputs[0], turn)
+
+    def _turns(self, frame: str) -> int:
+        """How often the body of a loop runs."""
+        if frame not in self.turns:
+            condition = self.predicates.get(frame)
+            if condition is None:
+                raise unsupported([n for n in self.graph.nodes if self.frames.get(n.name) == frame][:1])
+            for turn in range(MAX_TURNS + 1):
+                predicate = self.constant(self.plain(condition.inputs[0], turn))
+                if predicate is None:
+                    raise _undecided(condition, "a loop's condition")
+                if not bool(predicate):
+                    self.turns[frame] = turn
+                    break
+            else:
+                raise _undecided(condition, f"more than {MAX_TURNS} turns of a loop, or a number of them")
+        return self.turns[frame]
+
+    # ---- tensor arrays
+
+    def _array(self, node: Node, index: int, turn: int | None) -> _Flow:
+        size = self.constant(self.plain(node.inputs[0], turn))
+        return _Flow(None if size is None else int(size))
+
+    def _flow(self, reference: str, turn: int | None) -> _Flow:
+        flow = self.tensor(reference, turn)
+        if not isinstance(flow, _Flow):
+            raise unsupported([self.graph.producer(reference)])
+        return flow
+
+    def _indices(self, node: Node, reference: str, turn: int | None) -> list[int]:
+        value = self.constant(self.plain(reference, turn))
+        if value is None:
+            raise _undecided(node, "the indices of a tensor array")
+        return [int(i) for i in np.atleast_1d(value)]
+
+    def _scatter(self, node: Node, index: int, turn: int | None) -> _Flow:
+        _, indices, value, flow_in = node.inputs
+        flow, source = self._flow(flow_in, turn), self.plain(value, turn)
+        items = dict(flow.items)
+        for position, i in enumerate(self._indices(node, indices, turn)):
+            items[i] = self._element(source, position, f"{node.name}/{i}")
+        return _Flow(flow.size, tuple(items.items()))
+
+    def _element(self, source: str, position: int, name: str) -> str:
+        bounds = [
+            self._const(np.array([v], np.int32), f"{name}/{k}")
+            for k, v in (("begin", position), ("end", position + 1), ("strides", 1))
+        ]
+        return self._add("StridedSlice", [source, *bounds], name, shrink_axis_mask=1)
+
+    def _read(self, node: Node, index: int, turn: int | None) -> str:
+        (position,) = self._indices(node, node.inputs[1], turn)
+        return self._flow(node.inputs[2], turn).get(position)
+
+    def _write(self, node: Node, index: int, turn: int | None) -> _Flow:
+        (position,) = self._indices(node, node.inputs[1], turn)
+        flow = self._flow(node.inputs[3], turn)
+        value = self.plain(node.inputs[2], turn)
+        return _Flow(flow.size, tuple({**dict(flow.items), position: value}.items()))
+
+    def _gather(self, node: Node, index: int, turn: int | None) -> str:
+        flow = self._flow(node.inputs[2], turn)
+        parts = [flow.get(i) for i in self._indices(node, node.inputs[1], turn)]
+        return self._add("Pack", parts, f"{node.name}/pack", axis=0)
+
+    def _size(self, node: Node, index: int, turn: int | None) -> str:
+        flow = self._flow(node.inputs[1], turn)
+        if flow.size is None:
+            raise _undecided(node, "the size of a tensor array")
+        return self._const(np.array(flow.size, INT32), f"{node.name}/size")
+
+    # ---- new nodes
+
+    def _add(self, op: str, inputs: list[str], name: str, **attrs: object) -> str:
+        made = self.editor.add(op, inputs, name, **attrs)
+        self.made[made] = self.editor.nodes[-1]
+        return made
+
+    def _const(self, array: np.ndarray, name: str) -> str:
+        made = self.editor.const(array, name)
+        self.made[made] = self.editor.nodes[-1]
+        return made
+
+    def constant(self, reference: str) -> np.ndarray | None:
+        """The value of a tensor of the new graph, if it does not depend on an input."""
+        name, index = split_ref(reference)
+        node = self.made[name]
+        if node.value is not None:
+            return node.value
+        if name in self.graph and (known := self.types.get(reference)) is not None and known.constant is not None:
+            return known.constant
+        operands = [self.constant(r) for r in node.inputs]
+        if not operands or any(o is None for o in operands) or not op_of(node).foldable:
+            return None
+        return run_kernel(op_of(node), node, [o for o in operands if o is not None])[index]
+
+
+_METHODS = {
+    "Enter": "enter",
+    "Merge": "merge",
+    "Switch": "switch",
+    "Exit": "exit",
+    "LoopCond": "loop_cond",
+    "NextIteration": "enter",
+    "TensorArrayV3": "array",
+    "TensorArrayScatterV3": "scatter",
+    "TensorArrayReadV3": "read",
+    "TensorArrayWriteV3": "write",
+    "TensorArrayGatherV3": "gather",
+    "TensorArraySizeV3": "size",
+    **{f"Ref{op}": op.lower() for op in ("Enter", "Merge", "Switch", "Exit")},
+    "RefNextIteration": "enter",
+}
+
+
+def _alive(value: str | _Flow | None) -> str | _Flow:
+    if value is None:
+        raise _Dead
+    return value
+
+
+def _frames(graph: Graph) -> dict[str, str]:
+    """Node name → the frame (loop) it runs in; nodes outside of loops are left out."""
+    frames: dict[str, str] = {}
+    for node in graph.nodes:
+        inside = [frames[n] for n in (split_ref(r)[0] for r in node.inputs) if n in frames]
+        if node.op in ("Enter", "RefEnter"):
+            if inside:
+                raise UnsupportedOpError(
+                    f"cannot convert Enter (node {node.name!r}): a loop inside a loop",
+                    issues=[(node.name, node.op)],
+                    why="nested loops do not occur in policies and are not unrolled",
+                    fix="please open an issue with the graph",
+                )
+            frames[node.name] = str(node.attrs.get("frame_name", ""))
+        elif inside and node.op not in ("Exit", "RefExit"):
+            frames[node.name] = inside[0]
+    return frames
+
+
+def _undecided(node: Node, meaning: str) -> UnsupportedOpError:
+    return UnsupportedOpError(
+        f"cannot convert {node.op} (node {node.name!r}): {meaning} is not known before the graph runs",
+        issues=[(node.name, node.op)],
+        why="it depends on an input of the graph",
+        fix="if a placeholder decides it (sequence_length, is_training), give it a value: --set NAME=VALUE",
+    )

@@ -1,0 +1,37 @@
+"""Run a straight graph with the kernels of the op table: the numpy reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from converters.graph.ops.table import op_of
+from converters.graph.shapes import run_kernel
+from signatures.errors import GraphError
+from signatures.graph import Graph, normal_ref, ref, split_ref
+
+
+def run_graph(graph: Graph, feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> dict[str, np.ndarray]:
+    """Values of the tensors in ``fetch``, by the names they were asked under.
+
+    ``feeds`` may name any tensor, not only placeholders: a recorded draw can stand for a sampler's output. Raises
+    GraphError when a placeholder is not fed or a kernel fails.
+    """
+    values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
+    needed = graph.ancestors(fetch, stop=frozenset(split_ref(name)[0] for name in values))
+    for node in graph.nodes:
+        if node.name not in needed or (node.name in values and node.op != "Split"):
+            continue
+        if node.op == "Placeholder":
+            raise GraphError(
+                f"the input {node.name!r} is not fed", fix="feed every input that the outputs asked for depend on"
+            )
+        if node.op == "Const":
+            assert node.value is not None
+            values[node.name] = node.value
+            continue
+        results = run_kernel(op_of(node), node, [values[r] for r in node.inputs])
+        for index, result in enumerate(results):
+            values.setdefault(ref(node.name, index), result)
+    return {name: values[normal_ref(name)] for name in fetch}

@@ -1,0 +1,140 @@
+"""dtype, shape and, where it can be known, value of every tensor of a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from converters.graph.ops.base import OpDef
+from converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of
+from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, product
+from signatures.errors import ExportModelError, GraphError
+from signatures.graph import Graph, Node, ref
+
+Types = dict[str, TensorType]
+
+#: Where a structural op's data operands are; the others are indices that must be plain numbers.
+_DATA = {"ConcatV2": slice(0, -1), "Pack": slice(None)}
+#: Folding may not make a constant of more elements than this out of smaller ones.
+_MAX_FOLD = 1 << 20
+
+
+def infer_types(graph: Graph, *, partial: bool = False) -> Types:
+    """The type of every output in ``graph``, by reference.
+
+    ``partial`` lets loops through (their outputs have unknown shapes), for the passes that come before the
+    straightening. Otherwise they raise UnsupportedOpError, as unknown ops always do. Raises GraphError where shapes
+    contradict each other.
+    """
+    types: Types = {}
+    symbols = Symbols()
+    for node in graph.nodes:
+        if node.op in CONTROL_FLOW and partial:
+            dtype = types[node.inputs[0]].dtype if node.inputs and node.inputs[0] in types else FLOAT32
+            if node.op == "TensorArraySizeV3":
+                dtype = INT32
+            results: Sequence[TensorType] = [TensorType(node.attrs.get("dtype", dtype), None)] * 2
+        else:
+            results = _results(op_of(node), node, _arguments(node, types), symbols)
+        for index, result in enumerate(results):
+            types[ref(node.name, index)] = result
+    return types
+
+
+def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:
+    try:
+        return [types[r] for r in node.inputs]
+    except KeyError as error:
+        raise GraphError(
+            f"node {node.name!r} ({node.op}) reads {error.args[0]!r}, an output that its producer does not have",
+            why="the graph is damaged or was edited",
+            fix="freeze the graph again from its checkpoint",
+        ) from error
+
+
+def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    try:
+        results = op.infer(node, args, symbols)
+    except ExportModelError:
+        raise
+    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise GraphError(
+            f"node {node.name!r} ({node.op}) has inputs or attributes that its op does not allow",
+            why=f"{type(error).__name__}: {error}",
+            fix="the graph is damaged; freeze it again from its checkpoint",
+        ) from error
+    if op.kernel is None or not op.foldable or results[0].value is not None or not args:
+        return results
+    values = [a.value for a in args]
+    if any(v is None for v in values):
+        return results
+    known = [v for v in values if v is not None]
+    if all(v.dtype != object for v in known):
+        sizes = [r.shape for r in results]
+        if any(s is not None and np.prod([d for d in s if isinstance(d, int)] or [1]) > _MAX_FOLD for s in sizes):
+            return results
+        return [TensorType(v.dtype, tuple(int(d) for d in v.shape), v) for v in run_kernel(op, node, known)]
+    return _symbolic(op, node, args, known, results, symbols)
+
+
+def run_kernel(op: OpDef, node: Node, arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """The outputs of a node's kernel; raises GraphError that names the node."""
+    assert op.kernel is not None
+    try:
+        result = op.kernel(node, *arrays)
+    except (IndexError, KeyError, TypeError, ValueError) as error:
+        raise GraphError(
+            f"node {node.name!r} ({node.op}) cannot be computed",
+            why=f"{type(error).__name__}: {error}",
+            fix="the inputs do not have the shapes that the graph asks for, or the graph is damaged",
+        ) from error
+    return result if isinstance(result, tuple) else (result,)
+
+
+def _symbolic(
+    op: OpDef,
+    node: Node,
+    args: Sequence[TensorType],
+    values: Sequence[np.ndarray],
+    results: Sequence[TensorType],
+    symbols: Symbols,
+) -> Sequence[TensorType]:
+    """Follow shape vectors that hold symbols through the ops that shape arithmetic is made of."""
+    if op.structural:
+        data = _DATA.get(node.op, slice(0, 1))
+        positions = set(range(len(values))[data])
+        if any(v.dtype == object for i, v in enumerate(values) if i not in positions):
+            return results
+        objects = [v.astype(object) if i in positions else v for i, v in enumerate(values)]
+        outputs = run_kernel(op, node, objects)
+        return [
+            TensorType(
+                args[min(positions)].dtype, tuple(int(d) for d in v.shape), _plain(v, args[min(positions)].dtype)
+            )
+            for v in (np.asarray(o, dtype=object) for o in outputs)
+        ]
+    if node.op == "Mul":
+        shape = broadcast(args[0].shape, args[1].shape, symbols)
+        a, b = np.broadcast_arrays(values[0].astype(object), values[1].astype(object))
+        cells = np.empty(a.shape, object)
+        for index in np.ndindex(a.shape):
+            cells[index] = product((a[index], b[index]), symbols)
+        return [TensorType(args[0].dtype, shape, _plain(cells, args[0].dtype))]
+    if node.op == "Prod" and results[0].shape in ((), (1,)):
+        total = np.empty(() if results[0].shape == () else (1,), object)
+        total[...] = product(values[0].reshape(-1).tolist(), symbols)
+        return [TensorType(args[0].dtype, results[0].shape, _plain(total, args[0].dtype))]
+    return results
+
+
+def _plain(cells: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """An object array as a plain one if no symbol is left in it."""
+    if all(not isinstance(c, str) for c in cells.reshape(-1).tolist()):
+        return cells.astype(dtype)
+    return cells
+
+
+def known_op(node: Node) -> bool:
+    """Whether the table or the straightener covers a node's op."""
+    return node.op in TABLE or node.op in CONTROL_FLOW

@@ -1,0 +1,180 @@
+"""Policy to ONNX: each node through its lowering in the op table.
+
+Canonical names for inputs and outputs, the batch axis symbolic, the contract in ``metadata_props``, checked by
+``onnx.checker`` with full shape inference before anything is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.artifact import Artifact, WriteOptions
+from converters.graph.ops.table import op_of, unsupported
+from converters.graph.passes.fuse import fuse
+from converters.graph.shapes import Types, infer_types
+from converters.graph.types import TensorType
+from signatures.errors import GraphError, UsageError
+from signatures.graph import Node, ref
+from signatures.spec import Policy, TensorSpec
+
+#: Opset → the IR version of the same ONNX release (onnx/helper.py, OP_SET_ID_VERSION_MAP).
+IR_VERSIONS = {13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
+PRODUCER = "export-model"
+CONTRACT_KEY = "export_model_contract"
+
+
+class _Builder:
+    """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
+
+    def __init__(self, types: Types, opset: int) -> None:
+        import onnx
+
+        self.onnx = onnx
+        self.opset = opset
+        self.types = types
+        self.nodes: list[Any] = []
+        self.initializers: list[Any] = []
+        self.sources: dict[str, str] = {}
+        self._values: dict[str, str] = {}
+        self._constants: dict[tuple[Any, ...], str] = {}
+        self._taken: set[str] = set()
+        self._prefix = ""
+
+    def value(self, reference: str) -> str:
+        return self._values[reference]
+
+    def type_of(self, reference: str) -> TensorType:
+        return self.types[reference]
+
+    def bind(self, reference: str, value: str) -> None:
+        """Let ``value`` stand for a tensor of the graph."""
+        self._values[reference] = value
+        self._taken.add(value)
+
+    def fresh(self, wish: str) -> str:
+        name, number = wish, 0
+        while name in self._taken:
+            number += 1
+            name = f"{wish}_{number}"
+        self._taken.add(name)
+        return name
+
+    def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
+        names = [self.fresh(f"{self._prefix}/{op}" if self._prefix else op) for _ in range(outputs)]
+        for key, value in attributes.items():
+            if isinstance(value, np.dtype):
+                attributes[key] = self.onnx.helper.np_dtype_to_tensor_dtype(value)
+            elif isinstance(value, np.ndarray):
+                attributes[key] = self.onnx.numpy_helper.from_array(value)
+        self.nodes.append(self.onnx.helper.make_node(op, list(inputs), names, name=names[0], **attributes))
+        return names[0] if outputs == 1 else tuple(names)
+
+    def const(self, array: np.ndarray, hint: str = "const") -> str:
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._constants:
+            name = self.fresh(f"{self._prefix}/{hint}" if self._prefix else hint)
+            self._constants[key] = name
+            self.initializers.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return self._constants[key]
+
+    def lower(self, node: Node) -> None:
+        """Append what a node of the graph becomes, its result under the node's own name."""
+        self._prefix = node.name
+        if node.op == "Const":
+            assert node.value is not None
+            self.bind(node.name, self.const(node.value, "value"))
+            return
+        entry = op_of(node)
+        if entry.lower is None:
+            raise unsupported([node])
+        before = len(self.nodes)
+        result = entry.lower(node, self)
+        values = result if isinstance(result, tuple) else (result,)
+        for index, value in enumerate(values):
+            reference = ref(node.name, index)
+            made = next((n for n in reversed(self.nodes[before:]) if value in n.output), None)
+            if made is not None and reference not in self._taken:
+                self._rename(before, value, reference)
+                value = reference
+                if node.origin is not None and index == 0:
+                    self.sources[value] = node.origin
+            self.bind(reference, value)
+
+    def _rename(self, start: int, old: str, new: str) -> None:
+        for node in self.nodes[start:]:
+            for names in (node.input, node.output):
+                for i, name in enumerate(names):
+                    if name == old:
+                        names[i] = new
+            if node.name == old:
+                node.name = new
+        self._taken.discard(old)
+        self._taken.add(new)
+
+
+def _value_info(onnx: Any, spec: TensorSpec, batch: str = "batch") -> Any:
+    dims = [
+        (batch if i == 0 else f"{spec.name}_dim_{i}") if size is None else size for i, size in enumerate(spec.shape)
+    ]
+    return onnx.helper.make_tensor_value_info(
+        spec.name, onnx.helper.np_dtype_to_tensor_dtype(np.dtype(spec.dtype)), dims
+    )
+
+
+def write(policy: Policy, options: WriteOptions) -> Artifact:
+    """The ONNX artefact. Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering,
+    GraphError when the checker refuses the result (a fault of this tool).
+    """
+    import onnx
+    import onnx.checker
+    import onnx.helper
+    import onnx.numpy_helper
+
+    if options.opset not in IR_VERSIONS:
+        raise UsageError(
+            f"opset {options.opset} is not written",
+            why=f"the lowerings are made for opsets {min(IR_VERSIONS)} to {max(IR_VERSIONS)}",
+            fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
+        )
+    graph = fuse(policy.graph, policy.fetches.values(), activations=())
+    builder = _Builder(infer_types(graph), options.opset)
+    for spec in policy.signature.inputs:
+        builder.bind(spec.name, spec.name)
+    for node in graph.nodes:
+        if node.op != "Placeholder":
+            builder.lower(node)
+    for spec in policy.signature.outputs:
+        if builder.value(spec.name) != spec.name:  # an input or a constant that is an output as well
+            builder.nodes.append(onnx.helper.make_node("Identity", [builder.value(spec.name)], [spec.name]))
+    used = {name for node in builder.nodes for name in node.input}
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(
+            builder.nodes,
+            policy.name,
+            [_value_info(onnx, s) for s in policy.signature.inputs],
+            [_value_info(onnx, s) for s in policy.signature.outputs],
+            [i for i in builder.initializers if i.name in used],
+        ),
+        producer_name=PRODUCER,
+        ir_version=IR_VERSIONS[options.opset],
+        opset_imports=[onnx.helper.make_opsetid("", options.opset)],
+    )
+    onnx.helper.set_model_props(model, {CONTRACT_KEY: options.contract})
+    data: bytes = model.SerializeToString(deterministic=True)
+    _check(onnx, data, policy.name)
+    path = f"{policy.name}.onnx"
+    return Artifact("onnx", path, {path: data})
+
+
+def _check(onnx: Any, data: bytes, name: str) -> None:
+    try:
+        onnx.checker.check_model(data, full_check=True)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
+        raise GraphError(
+            f"the ONNX model made of {name!r} is not valid",
+            why=str(error).strip().splitlines()[0],
+            fix="this is a fault of export-model; please open an issue with the source",
+        ) from error

@@ -1,0 +1,34 @@
+"""Which room reads and writes which format. To add a format is to add a room and a line here."""
+
+from __future__ import annotations
+
+import importlib
+from types import MappingProxyType
+
+from converters.artifact import Writer
+from signatures.errors import UsageError
+
+#: Target on the command line → module whose ``write`` makes it.
+WRITERS = MappingProxyType(
+    {
+        "bytes": "converters.frozen_graph.writer",
+        "saved_model": "converters.saved_model.writer",
+        "tfjs": "converters.tfjs.writer",
+        "onnx": "converters.onnx.writer",
+    }
+)
+TARGETS = tuple(WRITERS)
+
+
+def writer(target: str) -> Writer:
+    """The writer of a target; its module is imported here, not before. Raises UsageError."""
+    if target not in WRITERS:
+        import difflib
+
+        close = difflib.get_close_matches(target, TARGETS, n=1)
+        raise UsageError(
+            f"--to {target}: there is no such format",
+            fix=(f"did you mean {close[0]}? " if close else "") + f"the formats are {', '.join(TARGETS)}",
+        )
+    write: Writer = importlib.import_module(WRITERS[target]).write
+    return write

@@ -1,0 +1,59 @@
+"""The loop of a Python child process: load models, run them, answer frames.
+
+A fault in a model must not end the process that other models wait for, so every request is answered, with the error's
+text if it failed. What native code prints goes to stderr; stdout carries frames only.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, BinaryIO, Protocol
+
+from converters.runner.wire import Tensors, read_frame, write_frame
+
+
+class Model(Protocol):
+    """A loaded model."""
+
+    def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+        """Outputs by name."""
+        ...
+
+
+Loader = Callable[[Mapping[str, Any]], Model]
+
+
+def claim_stdout() -> BinaryIO:
+    """A stream to the real stdout; file descriptor 1 becomes stderr, so that no library can write between frames."""
+    stream = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return stream
+
+
+def serve(runtime: str, version: str, load: Loader, faults: tuple[type[BaseException], ...], out: BinaryIO) -> None:
+    """Answer requests until stdin ends. ``faults`` are what the runtime raises on bad models and inputs."""
+    models: dict[str, Model] = {}
+    source = sys.stdin.buffer
+    while True:
+        try:
+            header, tensors = read_frame(source)
+        except EOFError:
+            return
+        try:
+            command = header["cmd"]
+            if command == "hello":
+                write_frame(out, {"ok": True, "runtime": runtime, "version": version})
+            elif command == "load":
+                models[header["id"]] = load(header)
+                write_frame(out, {"ok": True})
+            elif command == "run":
+                write_frame(out, {"ok": True}, models[header["id"]].run(tensors, header["fetch"]))
+            elif command == "unload":
+                models.pop(header["id"], None)
+                write_frame(out, {"ok": True})
+            else:
+                write_frame(out, {"ok": False, "error": f"unknown command {command!r}"})
+        except (*faults, KeyError, ValueError, TypeError, OSError) as error:
+            write_frame(out, {"ok": False, "error": f"{type(error).__name__}: {error}"})

@@ -1,0 +1,45 @@
+"""The numpy reference in its own process: a frozen graph of ours, run by the kernels of the op table.
+
+``python -m converters.runner.numpy_child``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.frozen_graph.reader import read_graph
+from converters.graph.ops.chance import reseed
+from converters.graph.passes.normalise import normalise
+from converters.graph.run import run_graph
+from converters.runner.child import claim_stdout, serve
+from converters.runner.wire import Tensors
+from signatures.errors import ExportModelError
+from signatures.graph import Graph
+
+
+class _Model:
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+
+    def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+        return run_graph(self.graph, feeds, fetch)
+
+
+def _load(header: Mapping[str, Any]) -> _Model:
+    reseed(int(header.get("seed", 0)))
+    graph = read_graph(Path(header["path"]).read_bytes())
+    return _Model(normalise(Graph(tuple(n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S"))))
+
+
+def main() -> None:
+    """Entry of the child process."""
+    out = claim_stdout()
+    serve("numpy", np.__version__, _load, (ExportModelError,), out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""A runtime's process, seen from this side."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import threading
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+
+from converters.runner.wire import Tensors, read_frame, write_frame
+from signatures.errors import ExportModelError, RuntimeUnavailableError
+
+#: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
+TIMEOUT = 300.0
+
+
+class RunFailed(ExportModelError):
+    """A runtime refused a model or failed while running it. This is what verification reports, not a crash of it."""
+
+    exit_status = 1
+
+
+class RuntimeProcess:
+    """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
+
+    def __init__(self, name: str, command: Sequence[str]) -> None:
+        self.name = name
+        self.command = list(command)
+        self.version: str | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._errors: IO[bytes] | None = None
+        self._loaded = 0
+
+    def start(self) -> str:
+        """Start the process if it is not running; returns the runtime's version.
+
+        Raises RuntimeUnavailableError when it does not start.
+        """
+        if self._process is not None and self.version is not None:
+            return self.version
+        self._errors = tempfile.TemporaryFile()
+        try:
+            self._process = subprocess.Popen(
+                self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
+            )
+        except OSError as error:
+            raise RuntimeUnavailableError(
+                f"the runtime {self.name} did not start", why=str(error), fix="export-model runtimes shows what is here"
+            ) from error
+        try:
+            answer, _ = self.request({"cmd": "hello"})
+        except RunFailed as error:
+            raise RuntimeUnavailableError(
+                f"the runtime {self.name} did not start",
+                why=error.why or error.what,
+                fix="export-model runtimes shows what is here and how to install what is not",
+            ) from error
+        self.version = str(answer["version"])
+        return self.version
+
+    def load(self, path: str, **options: Any) -> LoadedModel:
+        """Load a model; raises RunFailed with the runtime's own message."""
+        self.start()
+        self._loaded += 1
+        identity = f"m{self._loaded}"
+        self.request({"cmd": "load", "id": identity, "path": path, **options})
+        return LoadedModel(self, identity)
+
+    def request(
+        self, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None
+    ) -> tuple[dict[str, Any], Tensors]:
+        """Send a frame and wait for the answer; raises RunFailed where it is an error, the process died, or hangs."""
+        process = self._process
+        if process is None or process.stdin is None or process.stdout is None:
+            raise RunFailed(f"{self.name} is not running")
+        watchdog = threading.Timer(TIMEOUT, process.kill)
+        watchdog.start()
+        try:
+            write_frame(process.stdin, header, tensors)  # type: ignore[arg-type]
+            answer, results = read_frame(process.stdout)  # type: ignore[arg-type]
+        except (EOFError, BrokenPipeError, OSError) as error:
+            status = process.poll() if process.poll() is not None else process.wait(5)
+            said = self._last_errors()
+            self.close()
+            raise RunFailed(
+                f"{self.name} ended while it was working (status {status})",
+                why=said or "it printed nothing",
+                fix="a native runtime aborts on some malformed graphs; the model is not safe to use there",
+            ) from error
+        finally:
+            watchdog.cancel()
+        if answer.get("broken"):  # a WebAssembly trap: the heap is not to be trusted any more
+            self.close()
+        if not answer.get("ok"):
+            raise RunFailed(f"{self.name} failed", why=str(answer.get("error", "no message")))
+        return answer, results
+
+    def _last_errors(self) -> str:
+        if self._errors is None:
+            return ""
+        self._errors.seek(0)
+        lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
+        return "\n".join(lines[-8:])
+
+    def close(self) -> None:
+        """End the process."""
+        process, self._process, self.version = self._process, None, None
+        if process is not None:
+            for stream in (process.stdin, process.stdout):
+                if stream is not None:
+                    try:
+                        stream.close()
+                    except BrokenPipeError:
+                        continue
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        if self._errors is not None:
+            self._errors.close()
+            self._errors = None
+
+    def __enter__(self) -> RuntimeProcess:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class LoadedModel:
+    """A model in a runtime's process."""
+
+    def __init__(self, process: RuntimeProcess, identity: str) -> None:
+        self._process = process
+        self._identity = identity
+
+    def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
+        """The outputs in ``fetch`` by name; raises RunFailed."""
+        return self._run({"fetch": list(fetch)}, feeds, fetch)
+
+    def predict(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str]) -> Tensors:
+        """All outputs, by the call that users of the runtime make (TensorFlow.js: ``model.predict``)."""
+        return self._run({}, feeds, outputs)
+
+    def _run(self, header: Mapping[str, Any], feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
+        _, results = self._process.request({"cmd": "run", "id": self._identity, **header}, dict(feeds))
+        missing = [name for name in fetch if name not in results]
+        if missing:
+            raise RunFailed(f"{self._process.name} gave no output {missing[0]!r}")
+        return results
+
+    def unload(self) -> None:
+        """Free it."""
+        self._process.request({"cmd": "unload", "id": self._identity})

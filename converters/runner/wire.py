@@ -1,0 +1,53 @@
+"""Frames between this process and a runtime's: tensors cross as raw bytes, never as printed decimals.
+
+A frame is a little-endian uint32, the length of a JSON header; the header; then the bytes of the tensors that
+``header["tensors"]`` lists (``{"name", "dtype", "shape"}``), one after the other, little-endian, in C order.
+``converters/tfjs/js/runner.mjs`` speaks the same.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from typing import Any, BinaryIO
+
+import numpy as np
+
+Tensors = dict[str, np.ndarray]
+
+
+def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None) -> None:
+    """Send a header with its tensors."""
+    parts = []
+    entries = []
+    for name, array in (tensors or {}).items():
+        entries.append({"name": name, "dtype": array.dtype.name, "shape": list(array.shape)})
+        parts.append(np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
+    text = json.dumps({**header, "tensors": entries} if tensors is not None else dict(header)).encode()
+    stream.write(struct.pack("<I", len(text)) + text + b"".join(parts))
+    stream.flush()
+
+
+def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
+    """Receive a frame; EOFError at the end of the stream."""
+    (length,) = struct.unpack("<I", _exactly(stream, 4))
+    header: dict[str, Any] = json.loads(_exactly(stream, length))
+    tensors: Tensors = {}
+    for entry in header.get("tensors", ()):
+        dtype = np.dtype(entry["dtype"])
+        count = math.prod(entry["shape"])
+        data = _exactly(stream, count * dtype.itemsize)
+        tensors[entry["name"]] = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype).reshape(entry["shape"])
+    return header, tensors
+
+
+def _exactly(stream: BinaryIO, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        chunk = stream.read(count - len(data))
+        if not chunk:
+            raise EOFError("the other process ended")
+        data = chunk if not data else data + chunk
+    return data

@@ -1,0 +1,64 @@
+"""Policy to a SavedModel (saved_model.proto, meta_graph.proto), without TensorFlow.
+
+There is no ``variables`` folder: the graph has no variables, and neither loader of TensorFlow nor TensorFlow Serving
+asks for one then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from converters import schema
+from converters.artifact import Artifact, WriteOptions
+from converters.frozen_graph.encode import encode
+from converters.frozen_graph.writer import with_contract
+from signatures.roles import Role
+from signatures.spec import Policy, TensorSpec
+
+PATH = "saved_model/saved_model.pb"
+SERVING, DETERMINISTIC = "serving_default", "deterministic"
+_METHOD = "tensorflow/serving/predict"
+
+
+def signatures_of(policy: Policy) -> dict[str, tuple[list[TensorSpec], list[TensorSpec]]]:
+    """Signature key → (inputs, outputs).
+
+    ``serving_default`` has all of both; ``deterministic`` has the outputs that need no noise, and their inputs.
+    """
+    every = policy.signature
+    signatures = {SERVING: (list(every.inputs), list(every.outputs))}
+    noise = {policy.feeds[s.name] for s in every.inputs if s.role is Role.NOISE}
+    samplers = {n.name for n in policy.graph.nodes if n.op in ("Multinomial", "RandomStandardNormal", "RandomUniform")}
+    needs = {s.name: policy.graph.ancestors([policy.fetches[s.name]]) for s in every.outputs}
+    outputs = [s for s in every.outputs if not needs[s.name] & (noise | samplers)]
+    upstream = set().union(*(needs[s.name] for s in outputs)) if outputs else set()
+    inputs = [s for s in every.inputs if policy.feeds[s.name] in upstream]
+    if outputs and inputs:
+        signatures[DETERMINISTIC] = (inputs, outputs)
+    return signatures
+
+
+def _fill(entries: Any, specs: Iterable[TensorSpec]) -> None:
+    for spec in specs:
+        info = entries[spec.name]
+        info.name = f"{spec.name}:0"
+        info.dtype = schema.dtype_number(np.dtype(spec.dtype))
+        for size in spec.shape:
+            info.tensor_shape.dim.add(size=-1 if size is None else size)
+
+
+def write(policy: Policy, options: WriteOptions) -> Artifact:
+    """The SavedModel artefact."""
+    message = schema.SavedModel(saved_model_schema_version=1)
+    meta = message.meta_graphs.add()
+    meta.meta_info_def.tags.append("serve")
+    meta.graph_def.CopyFrom(encode(with_contract(policy.graph, options.contract)))
+    for key, (inputs, outputs) in signatures_of(policy).items():
+        definition = meta.signature_def[key]
+        definition.method_name = _METHOD
+        _fill(definition.inputs, inputs)
+        _fill(definition.outputs, outputs)
+    return Artifact("saved_model", "saved_model", {PATH: schema.serialise(message)})

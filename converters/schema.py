@@ -1,0 +1,173 @@
+"""The TensorFlow messages this project reads and writes, in a descriptor pool of their own.
+
+Only the fields that are needed, by the numbers of TensorFlow's public .proto files (graph.proto, node_def.proto,
+attr_value.proto, tensor.proto, tensor_shape.proto, versions.proto, saved_model.proto, meta_graph.proto). Fields that
+are not listed survive as unknown fields. A private pool, so that a real ``tensorflow`` in the same process does not
+clash, and so that no generated code has to match the installed protobuf.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+
+from signatures.errors import DamagedFileError
+
+_SCALARS = {
+    "string": 9,
+    "bytes": 12,
+    "int32": 5,
+    "int64": 3,
+    "uint32": 13,
+    "uint64": 4,
+    "float": 2,
+    "double": 1,
+    "bool": 8,
+}
+_MESSAGE_KIND, _OPTIONAL, _REPEATED = 11, 1, 3
+
+#: message → fields, each "number name kind", kind with * for repeated and <K for a map from string to message K.
+_MESSAGES = {
+    "Dim": "1 size int64, 2 name string",
+    "TensorShapeProto": "2 dim Dim*, 3 unknown_rank bool",
+    "TensorProto": (
+        "1 dtype int32, 2 tensor_shape TensorShapeProto, 4 tensor_content bytes, 5 float_val float*, "
+        "6 double_val double*, 7 int_val int32*, 8 string_val bytes*, 10 int64_val int64*, 11 bool_val bool*, "
+        "13 half_val int32*, 16 uint32_val uint32*, 17 uint64_val uint64*"
+    ),
+    "ListValue": (
+        "2 s bytes*, 3 i int64*, 4 f float*, 5 b bool*, 6 type int32*, 7 shape TensorShapeProto*, 8 tensor TensorProto*"
+    ),
+    "NameAttrList": "1 name string",
+    "AttrValue": (
+        "1 list ListValue, 2 s bytes, 3 i int64, 4 f float, 5 b bool, 6 type int32, 7 shape TensorShapeProto, "
+        "8 tensor TensorProto, 9 placeholder string, 10 func NameAttrList"
+    ),
+    "NodeDef": "1 name string, 2 op string, 3 input string*, 4 device string, 5 attr <AttrValue",
+    "VersionDef": "1 producer int32, 2 min_consumer int32, 3 bad_consumers int32*",
+    "FunctionSignature": "1 name string",
+    "FunctionDef": "1 signature FunctionSignature",
+    "FunctionDefLibrary": "1 function FunctionDef*",
+    "GraphDef": "1 node NodeDef*, 2 library FunctionDefLibrary, 4 versions VersionDef",
+    "TensorInfo": "1 name string, 2 dtype int32, 3 tensor_shape TensorShapeProto",
+    "SignatureDef": "1 inputs <TensorInfo, 2 outputs <TensorInfo, 3 method_name string",
+    "MetaInfoDef": "1 meta_graph_version string, 4 tags string*, 5 tensorflow_version string",
+    "MetaGraphDef": "1 meta_info_def MetaInfoDef, 2 graph_def GraphDef, 5 signature_def <SignatureDef",
+    "SavedModel": "1 saved_model_schema_version int64, 2 meta_graphs MetaGraphDef*",
+}
+#: Fields of AttrValue and TensorInfo that are members of a oneof: presence must be visible even at the default value.
+_ONEOFS = {"AttrValue": "value"}
+
+
+def _add_message(file: Any, name: str, fields: str) -> None:
+    message = file.message_type.add(name=name)
+    if name in _ONEOFS:
+        message.oneof_decl.add(name=_ONEOFS[name])
+    for text in fields.split(", "):
+        number, field_name, kind = text.split()
+        field = message.field.add(name=field_name, number=int(number))
+        field.label = _REPEATED if kind.endswith("*") or kind.startswith("<") else _OPTIONAL
+        if kind.startswith("<"):
+            entry_name = "".join(part.capitalize() for part in field_name.split("_")) + "Entry"
+            entry = message.nested_type.add(name=entry_name)
+            entry.options.map_entry = True
+            entry.field.add(name="key", number=1, type=9, label=_OPTIONAL)
+            entry.field.add(
+                name="value", number=2, type=_MESSAGE_KIND, label=_OPTIONAL, type_name=f".export_model.{kind[1:]}"
+            )
+            field.type, field.type_name = _MESSAGE_KIND, f".export_model.{name}.{entry_name}"
+        elif kind.rstrip("*") in _SCALARS:
+            field.type = _SCALARS[kind.rstrip("*")]
+        else:
+            field.type, field.type_name = _MESSAGE_KIND, f".export_model.{kind.rstrip('*')}"
+        if name in _ONEOFS:
+            field.oneof_index = 0
+
+
+def _build() -> dict[str, Any]:
+    file = descriptor_pb2.FileDescriptorProto(name="export_model.proto", package="export_model", syntax="proto3")
+    for name, fields in _MESSAGES.items():
+        _add_message(file, name, fields)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"export_model.{name}")) for name in _MESSAGES
+    }
+
+
+_CLASSES = _build()
+GraphDef = _CLASSES["GraphDef"]
+NodeDef = _CLASSES["NodeDef"]
+AttrValue = _CLASSES["AttrValue"]
+TensorProto = _CLASSES["TensorProto"]
+MetaGraphDef = _CLASSES["MetaGraphDef"]
+SavedModel = _CLASSES["SavedModel"]
+
+
+def parse(message_class: Any, data: bytes, what: str) -> Any:
+    """The message in ``data``; raises DamagedFileError that calls it ``what``."""
+    message = message_class()
+    try:
+        message.ParseFromString(data)
+    except DecodeError as error:
+        raise DamagedFileError(
+            f"this is not a whole {what}",
+            why=f"protobuf cannot decode it ({str(error) or 'truncated message'})",
+            fix="copy the file again (binary, not through a text filter), or fetch it from where it was trained",
+        ) from error
+    return message
+
+
+def serialise(message: Any) -> bytes:
+    """Bytes with map entries in a fixed order."""
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+# ------------------------------------------------------------------ dtypes (types.proto)
+
+#: DataType number → numpy dtype. 20 (resource) and 21 (variant) have none.
+_DTYPES: dict[int, np.dtype] = {
+    1: np.dtype(np.float32),
+    2: np.dtype(np.float64),
+    3: np.dtype(np.int32),
+    4: np.dtype(np.uint8),
+    5: np.dtype(np.int16),
+    6: np.dtype(np.int8),
+    7: np.dtype(np.bytes_),
+    9: np.dtype(np.int64),
+    10: np.dtype(np.bool_),
+    17: np.dtype(np.uint16),
+    19: np.dtype(np.float16),
+    20: np.dtype(object),
+    21: np.dtype(object),
+    22: np.dtype(np.uint32),
+    23: np.dtype(np.uint64),
+}
+_NUMBERS = {dtype: number for number, dtype in _DTYPES.items() if number not in (20, 21)}
+_NAMES = {1: "DT_FLOAT", 2: "DT_DOUBLE", 3: "DT_INT32", 4: "DT_UINT8", 7: "DT_STRING", 9: "DT_INT64", 10: "DT_BOOL"}
+
+
+def dtype_of(number: int) -> np.dtype:
+    """The numpy dtype of a DataType; reference types (number + 100) count as their base."""
+    dtype = _DTYPES.get(number - 100 if number > 100 else number)
+    if dtype is None:
+        raise DamagedFileError(
+            f"dtype number {number} is not one this tool knows",
+            why="quantised, complex and bfloat16 tensors do not occur in ML-Agents policies",
+            fix="export the policy in float32",
+        )
+    return dtype
+
+
+def dtype_number(dtype: np.dtype) -> int:
+    """The DataType of a numpy dtype."""
+    return _NUMBERS[np.dtype(np.bytes_) if dtype.kind == "S" else dtype]
+
+
+def dtype_name(dtype: np.dtype) -> str:
+    """``"DT_FLOAT"``: how JSON forms of a GraphDef write a DataType."""
+    return _NAMES[dtype_number(dtype)]

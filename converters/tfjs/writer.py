@@ -1,0 +1,162 @@
+"""Policy to a TensorFlow.js graph model, as ``tf.loadGraphModel`` reads it (tfjs-core io types, tfjs-converter).
+
+- Weights are taken from the ``Const`` nodes by name; their bytes lie in shards of 4 MiB, as the official converter
+  cuts them (so that browsers cache them).
+- TensorFlow.js has float32, int32 and bool only: int64 is narrowed here (never out of range: checked), float64 and
+  float16 become float32, and every dtype attribute says so.
+- An output is a node of its own (the naming pass sees to it): tfjs-converter silently mixes up two outputs of one node
+  and two names of one tensor.
+- The signature has the canonical names for inputs *and* outputs (the official converter loses them where two tensors
+  have the same shape), and ``structuredOutputKeys`` makes ``predict`` return results by name.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from converters import schema
+from converters.artifact import Artifact, WriteOptions
+from converters.frozen_graph.encode import encode
+from converters.graph.passes.fuse import fuse
+from converters.graph.types import FLOAT32, INT32
+from converters.tfjs.dialect import for_tfjs
+from signatures.errors import UnsupportedOpError
+from signatures.graph import Graph, Node
+from signatures.spec import Policy, TensorSpec
+
+SHARD_BYTES = 4 << 20
+#: Activations that TensorFlow.js fuses into a product on every backend (tfjs-core ops/fused_util).
+FUSED_ACTIVATIONS = ("Relu", "Relu6", "Elu", "Sigmoid")
+_NARROW = {
+    np.dtype(np.int64): INT32,
+    np.dtype(np.float64): FLOAT32,
+    np.dtype(np.float16): FLOAT32,
+    np.dtype(np.uint8): INT32,
+    np.dtype(np.int8): INT32,
+    np.dtype(np.int16): INT32,
+    np.dtype(np.uint16): INT32,
+}
+_DTYPE_NAMES = {"DT_INT64": "DT_INT32", "DT_DOUBLE": "DT_FLOAT", "DT_UINT8": "DT_INT32"}
+
+
+def _narrowed(node: Node) -> np.ndarray:
+    value = node.value
+    assert value is not None
+    target = _NARROW.get(value.dtype, value.dtype)
+    if target == INT32 and value.size and (value.max() > 2**31 - 1 or value.min() < -(2**31)):
+        raise UnsupportedOpError(
+            f"the constant {node.name!r} does not fit into 32 bits",
+            issues=[(node.name, node.op)],
+            why="TensorFlow.js has no int64",
+            fix="write the other formats: --to bytes,saved_model,onnx",
+        )
+    return np.ascontiguousarray(value.astype(target, copy=False))
+
+
+# ------------------------------------------------------------------ GraphDef as JSON
+
+
+def _attribute(proto: Any) -> dict[str, Any]:
+    kind = proto.WhichOneof("value")
+    if kind == "type":
+        return {"type": _dtype(proto.type)}
+    if kind == "i":
+        return {"i": str(proto.i)}
+    if kind in ("f", "b"):
+        return {kind: getattr(proto, kind)}
+    if kind == "s":
+        return {"s": base64.b64encode(proto.s).decode()}
+    if kind == "shape":
+        return {"shape": _shape(proto.shape)}
+    if proto.list.s:
+        return {"list": {"s": [base64.b64encode(v).decode() for v in proto.list.s]}}
+    return {"list": {"i": [str(v) for v in proto.list.i]} if proto.list.i else {}}
+
+
+def _dtype(number: int) -> str:
+    name = schema.dtype_name(schema.dtype_of(number))
+    return _DTYPE_NAMES.get(name, name)
+
+
+def _shape(proto: Any) -> dict[str, Any]:
+    if proto.unknown_rank:
+        return {"unknownRank": True}
+    return {"dim": [{"size": str(d.size)} for d in proto.dim]}
+
+
+def _topology(graph: Graph) -> dict[str, Any]:
+    nodes = []
+    for proto in encode(graph, explicit=True).node:
+        entry: dict[str, Any] = {"name": proto.name, "op": proto.op}
+        if proto.input:
+            entry["input"] = list(proto.input)
+        if proto.op == "Const":
+            # tfjs looks the values up among the weights; the attribute only says dtype and shape.
+            tensor = proto.attr["value"].tensor
+            kind = _dtype(tensor.dtype)
+            entry["attr"] = {
+                "dtype": {"type": kind},
+                "value": {"tensor": {"dtype": kind, "tensorShape": _shape(tensor.tensor_shape)}},
+            }
+        else:
+            entry["attr"] = {key: _attribute(proto.attr[key]) for key in sorted(proto.attr)}
+        nodes.append(entry)
+    return {"node": nodes, "library": {}, "versions": {"producer": 24, "minConsumer": 12}}
+
+
+# ------------------------------------------------------------------ signature and weights
+
+
+def _tensor_info(spec: TensorSpec) -> dict[str, Any]:
+    name = schema.dtype_name(np.dtype(spec.dtype))
+    return {
+        "name": f"{spec.name}:0",
+        "dtype": _DTYPE_NAMES.get(name, name),
+        "tensorShape": {"dim": [{"size": str(-1 if n is None else n)} for n in spec.shape]},
+    }
+
+
+def _weights(graph: Graph) -> tuple[list[dict[str, Any]], bytes]:
+    entries, blob = [], bytearray()
+    for node in graph.nodes:
+        if node.op != "Const":
+            continue
+        value = _narrowed(node)
+        entries.append({"name": node.name, "shape": list(value.shape), "dtype": value.dtype.name})
+        blob += value.astype(value.dtype.newbyteorder("<"), copy=False).tobytes()
+    return entries, bytes(blob)
+
+
+def _shards(blob: bytes) -> Mapping[str, bytes]:
+    count = max(-(-len(blob) // SHARD_BYTES), 1)
+    return {f"group1-shard{i + 1}of{count}.bin": blob[i * SHARD_BYTES : (i + 1) * SHARD_BYTES] for i in range(count)}
+
+
+def write(policy: Policy, options: WriteOptions) -> Artifact:
+    """The TensorFlow.js artefact."""
+    graph = fuse(for_tfjs(policy.graph), policy.fetches.values(), FUSED_ACTIVATIONS)
+    entries, blob = _weights(graph)
+    shards = _shards(blob)
+    contract = json.loads(options.contract)
+    model = {
+        "format": "graph-model",
+        "generatedBy": f"export-model {contract.get('tool', {}).get('version', '')}".strip(),
+        "convertedBy": "export-model",
+        "signature": {
+            "inputs": {s.name: _tensor_info(s) for s in policy.signature.inputs},
+            "outputs": {s.name: _tensor_info(s) for s in policy.signature.outputs},
+        },
+        "modelTopology": _topology(graph),
+        "weightsManifest": [{"paths": list(shards), "weights": entries}],
+        "userDefinedMetadata": {
+            "structuredOutputKeys": [s.name for s in policy.signature.outputs],
+            "contract": contract,
+        },
+    }
+    text = json.dumps(model, separators=(",", ":"), ensure_ascii=True).encode()
+    return Artifact("tfjs", "tfjs", {"tfjs/model.json": text, **{f"tfjs/{k}": v for k, v in shards.items()}})

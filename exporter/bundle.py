@@ -1,0 +1,199 @@
+"""Bundles: the folder that one policy is written to, with its contract.
+
+A bundle is written beside its place and exchanged with what was there, so that a killed run leaves the old one whole.
+Only a folder that holds a policy.json of ours is ever replaced.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from converters.artifact import Artifact
+from exporter.version import __version__
+from signatures.errors import BundleError, UsageError
+from signatures.spec import Policy, PolicySignature, SourceMap
+
+POLICY, PARITY = "policy.json", "parity.json"
+SCHEMA = 1
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+
+
+def safe_name(name: str) -> str:
+    """A name for files and folders: characters outside [A-Za-z0-9._-] become ``-``."""
+    cleaned = re.sub(r"[^A-Za-z0-9._-]", "-", name)
+    return cleaned if cleaned.strip(".") else "policy"
+
+
+def distinct_names(policies: Sequence[tuple[str, str]]) -> None:
+    """Raise UsageError when two (name, where it comes from) fall together on a file system that folds case."""
+    seen: dict[str, str] = {}
+    for name, where in policies:
+        other = seen.setdefault(name.casefold(), where)
+        if other != where:
+            raise UsageError(
+                f"two policies would be written to {name!r}: {other} and {where}",
+                why="their names are the same once case and special characters are folded",
+                fix="export them one by one, each with --name",
+            )
+
+
+def contract(policy: Policy, source: Mapping[str, Any]) -> dict[str, Any]:
+    """The contract as every artefact embeds it: policy.json without the hashes of the files."""
+    return {
+        "schema": SCHEMA,
+        "name": policy.name,
+        **policy.signature.to_dict(),
+        "source": {**source, **policy.source.to_dict()},
+        "tool": {"name": "export-model", "version": __version__},
+    }
+
+
+def dumps(content: Mapping[str, Any]) -> bytes:
+    """JSON as the bundle's files have it: keys in their given order, floats at full precision, a final newline."""
+    return (json.dumps(content, indent=1, ensure_ascii=True, allow_nan=False) + "\n").encode()
+
+
+def compact(content: Mapping[str, Any]) -> str:
+    """JSON on one line, for embedding."""
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+
+
+def write_staged(parent: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]) -> Path:
+    """Write a bundle into a new hidden folder in ``parent``; returns that folder."""
+    files = {path: data for artifact in artifacts for path, data in artifact.files.items()}
+    hashes = {p: {"sha256": hashlib.sha256(d).hexdigest(), "bytes": len(d)} for p, d in sorted(files.items())}
+    tool = content["tool"]
+    body = {**{k: v for k, v in content.items() if k != "tool"}, "files": hashes, "tool": tool}
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        stage = Path(tempfile.mkdtemp(prefix=f".{content['name']}.", dir=parent))
+    except OSError as error:
+        raise BundleError(
+            "the output folder cannot be written", where=str(parent), why=error.strerror, fix="choose another with -o"
+        ) from error
+    try:
+        for relative, data in files.items():
+            target = stage / relative
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(data)
+        (stage / POLICY).write_bytes(dumps(body))
+        stage.chmod(0o755)
+    except OSError as error:
+        shutil.rmtree(stage, ignore_errors=True)
+        raise BundleError(
+            "the bundle cannot be written", where=str(parent), why=error.strerror, fix="make room, or choose another -o"
+        ) from error
+    return stage
+
+
+def check_replaceable(place: Path) -> None:
+    """Raise BundleError when ``place`` exists and is not a bundle of ours."""
+    if not place.exists() and not place.is_symlink():
+        return
+    if place.is_dir() and not place.is_symlink() and (not any(place.iterdir()) or (place / POLICY).is_file()):
+        return
+    raise BundleError(
+        "is in the way and is not a bundle",
+        where=str(place),
+        why=f"it has no {POLICY}, so it is not this tool's to replace",
+        fix="move it, or choose another folder with -o or another --name",
+    )
+
+
+def put_in_place(stage: Path, place: Path) -> None:
+    """Exchange a staged bundle with what is at ``place``, and remove the old one."""
+    check_replaceable(place)
+    if not place.exists():
+        stage.rename(place)
+        return
+    if _exchange(stage, place):
+        shutil.rmtree(stage)
+        return
+    # No exchange on this system: two renames. If the process dies between them, the next run finds the old bundle
+    # under its hidden name and puts it back (recover).
+    old = place.with_name(f".{place.name}.old")
+    if old.exists():
+        shutil.rmtree(old)
+    place.rename(old)
+    stage.rename(place)
+    shutil.rmtree(old)
+
+
+def recover(place: Path) -> None:
+    """Put back a bundle that a killed run had moved aside."""
+    old = place.with_name(f".{place.name}.old")
+    if old.is_dir() and not place.exists():
+        old.rename(place)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """renameat2(RENAME_EXCHANGE): both paths change places in one step. Linux only; False where it is not to be had."""
+    platform: str = sys.platform
+    if platform != "linux":
+        return False
+    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if function is None:
+        return False
+    result: int = function(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE)
+    return result == 0
+
+
+# ------------------------------------------------------------------ reading a bundle
+
+
+def read_policy_json(folder: Path) -> dict[str, Any]:
+    """policy.json of a bundle; raises BundleError."""
+    path = folder / POLICY
+    try:
+        content: dict[str, Any] = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise BundleError(
+            "is no bundle", where=str(folder), why=f"it has no {POLICY}", fix="give the folder that export-model wrote"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise BundleError("cannot be read", where=str(path), why=str(error), fix="export the policy again") from error
+    if content.get("schema") != SCHEMA:
+        raise BundleError(
+            f"has schema {content.get('schema')!r}, this version reads {SCHEMA}",
+            where=str(path),
+            fix="export the policy again, or use the version of export-model that wrote it",
+        )
+    return content
+
+
+def check_hashes(folder: Path, content: Mapping[str, Any]) -> None:
+    """Raise BundleError that names the first file which is missing or not the one that was written."""
+    for relative, entry in content["files"].items():
+        path = folder / relative
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise BundleError(f"names a file outside of the bundle: {relative}", where=str(folder / POLICY))
+        if not path.is_file():
+            raise BundleError("is missing", where=str(path), why=f"{POLICY} names it", fix="export the policy again")
+        if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
+            raise BundleError(
+                "has been changed since it was exported",
+                where=str(path),
+                why=f"its sha256 is not the one in {POLICY}",
+                fix="export the policy again; compare foreign artefacts with export-model compare",
+            )
+
+
+def signature_of(content: Mapping[str, Any]) -> tuple[PolicySignature, SourceMap]:
+    """The signature and source map that a policy.json holds."""
+    try:
+        signature = PolicySignature.from_dict(content)
+        return signature, SourceMap.from_dict(content["source"], signature)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BundleError(
+            f"{POLICY} is not complete", why=f"{type(error).__name__}: {error}", fix="export the policy again"
+        ) from error

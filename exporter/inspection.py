@@ -1,0 +1,156 @@
+"""What is in a source: generation, brains, inputs with what to feed, outputs with what they mean, targets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from converters.artifact import WriteOptions
+from converters.graph.compile import CompileOptions
+from converters.registry import TARGETS, writer
+from exporter.bundle import safe_name
+from exporter.sources import read_source
+from exporter.tables import size_text, table
+from signatures.errors import ExportModelError
+from signatures.roles import Role
+from signatures.spec import Policy, TensorSpec
+
+_FEED = {
+    Role.VECTOR: "the agent's vector observation, as the environment gives it (normalised inside the policy)",
+    Role.VISUAL: "camera image, NHWC, colours from 0 to 1 (divide bytes by 255), first row at the top",
+    Role.ENTITIES: "variable-length observation",
+    Role.NOISE: "N(0, 1) draws, or zeros for the action without chance",
+    Role.MASKS: "1 = allowed, 0 = forbidden; branches side by side",
+    Role.PREV_ACTION: "the action of the step before, an integer per branch",
+    Role.MEMORY_IN: "recurrent_out of the step before; zeros at the start of an episode",
+    Role.PARAMETER: "not known to ML-Agents; feed it, or fix it with --set NAME=VALUE",
+}
+_MEANING = {
+    Role.CONTINUOUS: "continuous action",
+    Role.SAMPLED: "action drawn inside the graph, an integer per branch",
+    Role.LOG_PROBS: "log-probabilities per branch; draw from them, or take the argmax",
+    Role.PROBS: "probabilities per branch",
+    Role.DETERMINISTIC: "action without chance",
+    Role.ACTION_PROBS: "the trainer's action_probs (its meaning changed from version to version)",
+    Role.VALUE: "the critic's value",
+    Role.MEMORY_OUT: "memory for the next step",
+    Role.OTHER: "another output",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyInspection:
+    """One policy of a source."""
+
+    policy: Policy
+    ops: Mapping[str, int]
+    #: target → None where it can be written, else why not
+    targets: Mapping[str, str | None]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "name": self.policy.name,
+            **self.policy.signature.to_dict(),
+            "ops": dict(self.ops),
+            "targets": {t: {"ok": reason is None, "reason": reason} for t, reason in self.targets.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """A source and its policies."""
+
+    path: Path
+    kind: str
+    sha256: str
+    size: int
+    nodes: int
+    policies: Sequence[PolicyInspection]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "schema": 1,
+            "path": str(self.path),
+            "kind": self.kind,
+            "sha256": self.sha256,
+            "bytes": self.size,
+            "nodes": self.nodes,
+            "policies": [p.to_dict() for p in self.policies],
+        }
+
+
+def inspect_source(path: Path | str, options: CompileOptions | None = None) -> Inspection:
+    """Read and understand a source without writing anything. Raises what the export would raise."""
+    source = read_source(path)
+    found = []
+    for policy in source.policies(options):
+        ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
+        found.append(PolicyInspection(policy, ops, {t: _refusal(policy, t) for t in TARGETS}))
+    return Inspection(source.path, source.kind.label, source.sha256, source.size, len(source.graph.nodes), found)
+
+
+def _refusal(policy: Policy, target: str) -> str | None:
+    """Why a target cannot take the policy, None if it can: the writer is asked, nothing is kept."""
+    try:
+        writer(target)(policy, WriteOptions("{}"))
+    except ExportModelError as error:
+        return error.what
+    return None
+
+
+def inspection_text(inspection: Inspection) -> str:
+    """For the terminal."""
+    parts = [
+        f"{inspection.path}: {inspection.kind}, {size_text(inspection.size)}, {inspection.nodes} nodes, "
+        f"{len(inspection.policies)} {'policy' if len(inspection.policies) == 1 else 'policies'}"
+    ]
+    parts.extend(_policy_text(p) for p in inspection.policies)
+    return "\n\n".join(parts)
+
+
+def _policy_text(inspected: PolicyInspection) -> str:
+    signature = inspected.policy.signature
+    facts = [signature.family, f"{signature.action_space} actions"]
+    if signature.algorithm:
+        facts.append(signature.algorithm)
+    if signature.branches:
+        facts.append(f"branches {list(signature.branches)}")
+    if signature.memory is not None:
+        layout = f" [{'|'.join(signature.memory.layout)}]" if signature.memory.layout else ""
+        facts.append(f"memory {signature.memory.size}{layout}")
+    lines = [f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}", ""]
+    rows = [_row(s, _feed(s)) for s in signature.inputs]
+    lines.append(table(("input", "dtype", "shape", "in the source", "what to feed"), rows))
+    lines.append("")
+    rows = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
+    lines.append(table(("output", "dtype", "shape", "in the source", "meaning"), rows))
+    if signature.constants:
+        lines += ["", "constants: " + ", ".join(f"{k}={v}" for k, v in signature.constants.items())]
+    lines += [f"note: {note}" for note in signature.notes]
+    lines.append("ops: " + ", ".join(f"{op} {n}" for op, n in inspected.ops.items()))
+    able = [t for t, reason in inspected.targets.items() if reason is None]
+    lines.append(f"can be written as: {', '.join(able) or 'nothing'}")
+    lines += [f"cannot be written as {t}: {reason}" for t, reason in inspected.targets.items() if reason is not None]
+    return "\n".join(lines)
+
+
+def _feed(spec: TensorSpec) -> str:
+    known = spec.distribution or {}
+    if spec.role is Role.VECTOR and known.get("kind") == "integer":
+        return f"the discrete state, an integer from {known['low']} to {known['high']}"
+    return _FEED.get(spec.role, spec.role.value)
+
+
+def _row(spec: TensorSpec, text: str) -> list[str]:
+    shape = (
+        "["
+        + ", ".join("B" if i == 0 and n is None else "?" if n is None else str(n) for i, n in enumerate(spec.shape))
+        + "]"
+    )
+    source = ", ".join(spec.source) if isinstance(spec.source, tuple) else spec.source or "(made here)"
+    return [spec.name, spec.dtype, shape, source, text]

@@ -1,0 +1,1 @@
+"""Parity: the same inputs through every runtime, and whether the answers agree."""

@@ -1,0 +1,88 @@
+"""Two arrays that should be the same: numbers, decisions, NaNs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from exporter.parity.tolerances import Tolerance
+
+#: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
+NARROWED = {("int64", "int32")}
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How far a candidate is from the reference; ``reason`` says what is wrong where it is not a number."""
+
+    max_abs: float
+    max_rel: float
+    passed: bool
+    reason: str = ""
+    #: What rounding explains at the element that differs most, where that was asked for.
+    rounding: float = 0.0
+
+
+def compare(
+    reference: np.ndarray,
+    candidate: np.ndarray,
+    tolerance: Tolerance,
+    *,
+    free: np.ndarray | None = None,
+    narrowed: bool = False,
+    rounding: np.ndarray | None = None,
+) -> Difference:
+    """Compare by |a − b| ≤ atol + rtol·|b|, element by element.
+
+    ``free`` marks integer elements where another answer is right too (a tie). ``narrowed`` allows int32 for int64.
+    ``rounding`` is an absolute difference per element that float32 itself explains; where it is larger than the
+    tolerance it takes its place. A NaN or infinity must stand at the same place on both sides.
+    """
+    if reference.shape != candidate.shape:
+        return _wrong(f"shape {list(candidate.shape)} instead of {list(reference.shape)}")
+    names = (reference.dtype.name, candidate.dtype.name)
+    if names[0] != names[1] and not (narrowed and names in NARROWED):
+        return _wrong(f"dtype {names[1]} instead of {names[0]}")
+    if not reference.size:
+        return Difference(0.0, 0.0, True)
+    a, b = candidate.astype(np.float64), reference.astype(np.float64)
+    odd = ~np.isfinite(a) | ~np.isfinite(b)
+    if odd.any():
+        same = (np.isnan(a) & np.isnan(b)) | (a == b)
+        if not same[odd].all():
+            return _wrong("NaN or infinity on one side only")
+        a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)
+    difference = np.abs(a - b)
+    if free is not None:
+        difference = np.where(free, 0.0, difference)
+    relative = difference / np.maximum(np.abs(b), np.finfo(np.float64).tiny)
+    bound = tolerance.atol + tolerance.rtol * np.abs(b) if reference.dtype.kind == "f" else np.zeros_like(b)
+    if rounding is not None:
+        bound = np.maximum(bound, rounding)
+    passed = bool((difference <= bound).all())
+    worst_relative = float(np.where(difference > 0, np.minimum(relative, 1e30), 0.0).max())
+    explained = 0.0 if rounding is None else float(rounding.reshape(-1)[int(difference.argmax())])
+    return Difference(float(difference.max()), worst_relative, passed, rounding=explained)
+
+
+def _wrong(reason: str) -> Difference:
+    return Difference(float("inf"), float("inf"), False, reason)
+
+
+def ties(scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance) -> np.ndarray:
+    """[B, branches]: where the two best scores of a branch are too close for the argmax to be decided."""
+    columns = []
+    start = 0
+    for size in branches:
+        part = scores[:, start : start + size].astype(np.float64)
+        start += size
+        if size < 2:
+            columns.append(np.zeros(part.shape[0], bool))
+            continue
+        top = np.sort(part, axis=1)[:, -2:]
+        margin = 2 * (tolerance.atol + tolerance.rtol * np.abs(top[:, 1]))
+        with np.errstate(invalid="ignore"):
+            columns.append(~(top[:, 1] - top[:, 0] > margin))
+    return np.stack(columns, axis=1)

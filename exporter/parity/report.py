@@ -1,0 +1,97 @@
+"""What verification found, as data: the content of parity.json."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from exporter.parity.tolerances import Tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One output of one format in one runtime against the reference, over all inputs.
+
+    ``kind`` is ``numbers``, ``draws`` (goodness of fit; ``max_abs_diff`` is then the p-value's complement), ``rollout``
+    (the memory fed back; ``drift`` has the worst difference of each step) or ``failure`` (the runtime gave no answer).
+    ``rounding`` is not zero where the worst difference is above the tolerance, but within what float32 explains.
+    """
+
+    format: str
+    runtime: str
+    output: str
+    kind: str
+    max_abs_diff: float
+    max_rel_diff: float
+    tolerance: Tolerance
+    passed: bool
+    worst_input: str | None
+    reason: str = ""
+    drift: tuple[float, ...] = ()
+    rounding: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in parity.json."""
+        entry: dict[str, Any] = {
+            "format": self.format,
+            "runtime": self.runtime,
+            "output": self.output,
+            "kind": self.kind,
+            "max_abs_diff": _number(self.max_abs_diff),
+            "max_rel_diff": _number(self.max_rel_diff),
+            "atol": self.tolerance.atol,
+            "rtol": self.tolerance.rtol,
+            "passed": self.passed,
+            "worst_input": self.worst_input,
+        }
+        if self.tolerance.reason:
+            entry["tolerance_reason"] = self.tolerance.reason
+        if self.rounding:
+            entry["rounding"] = self.rounding
+        if self.reason:
+            entry["reason"] = self.reason
+        if self.drift:
+            entry["drift"] = [_number(d) for d in self.drift]
+        return entry
+
+
+def _number(value: float) -> float | str:
+    """JSON has no infinities: they are strings."""
+    return value if math.isfinite(value) else str(value)
+
+
+@dataclass(frozen=True, slots=True)
+class ParityReport:
+    """All comparisons of one policy. ``passed`` is None where no independent runtime ran."""
+
+    policy: str
+    passed: bool | None
+    seed: int
+    samples: int
+    reference: str
+    runtimes: Mapping[str, Mapping[str, str | None]]
+    comparisons: tuple[Comparison, ...]
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def failures(self) -> tuple[Comparison, ...]:
+        """The comparisons that did not pass."""
+        return tuple(c for c in self.comparisons if not c.passed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of parity.json."""
+        return {
+            "schema": 1,
+            "policy": self.policy,
+            "passed": self.passed,
+            "seed": self.seed,
+            "samples": self.samples,
+            "reference": self.reference,
+            "runtimes": {name: dict(entry) for name, entry in self.runtimes.items()},
+            "comparisons": [c.to_dict() for c in self.comparisons],
+            "sizes": dict(self.sizes),
+            "notes": list(self.notes),
+        }

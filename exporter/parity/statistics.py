@@ -1,0 +1,70 @@
+"""Goodness of fit of categorical draws, without scipy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+#: How often a right sampler is called wrong, per test.
+FALSE_ALARM = 1e-6
+#: Classes expected less often than this are pooled: the chi-square approximation needs it.
+_MIN_EXPECTED = 5.0
+
+
+def chi_square_survival(statistic: float, freedom: int) -> float:
+    """P(X ≥ statistic) for a chi-square variable: the regularised upper incomplete gamma function Q(k/2, x/2)."""
+    if freedom < 1 or statistic <= 0:
+        return 1.0
+    a, x = freedom / 2, statistic / 2
+    scale = math.exp(a * math.log(x) - x - math.lgamma(a))
+    if x < a + 1:
+        term = total = 1 / a
+        n = a
+        while term > total * 1e-15:
+            n += 1
+            term *= x / n
+            total += term
+        return max(0.0, 1 - scale * total)
+    b = x + 1 - a
+    c, d = 1e300, 1 / b
+    h = d
+    for i in range(1, 500):
+        an = -i * (i - a)
+        b += 2
+        d = 1 / (an * d + b)
+        c = b + an / c
+        h *= d * c
+        if abs(d * c - 1) < 1e-15:
+            break
+    return scale * h
+
+
+def fit(draws: np.ndarray, log_probs: np.ndarray) -> float:
+    """The p-value of ``draws`` (class numbers) under ``log_probs`` (one row); 0 for an impossible class.
+
+    A class is impossible below 1e-9: ML-Agents leaves masked actions about 1e-10.
+    """
+    probabilities = np.exp(log_probs.astype(np.float64))
+    probabilities /= probabilities.sum()
+    if draws.size == 0 or draws.min() < 0 or draws.max() >= probabilities.size:
+        return 0.0
+    counts = np.bincount(draws.reshape(-1).astype(int), minlength=probabilities.size)
+    if (counts[probabilities < 1e-9] > 0).any():
+        return 0.0
+    expected = probabilities * draws.size
+    order = np.argsort(-expected)
+    expected, counts = expected[order], counts[order]
+    large = expected >= _MIN_EXPECTED
+    if not large.all():
+        rest = slice(int(large.sum()), None)
+        pooled_expected, pooled_counts = expected[rest].sum(), counts[rest].sum()
+        expected, counts = expected[large], counts[large]
+        if pooled_expected >= _MIN_EXPECTED or not expected.size:
+            expected, counts = np.append(expected, pooled_expected), np.append(counts, pooled_counts)
+        else:  # the rest is too rare to stand alone: it joins the rarest class
+            expected[-1] += pooled_expected
+            counts[-1] += pooled_counts
+    if expected.size < 2:
+        return 1.0
+    return chi_square_survival(float(((counts - expected) ** 2 / expected).sum()), expected.size - 1)

@@ -1,0 +1,411 @@
+"""Run a policy's formats in their runtimes and compare each with the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from converters.graph.ops.chance import SAMPLERS
+from converters.runner.process import LoadedModel, RunFailed
+from exporter.parity.compare import Difference, compare, ties
+from exporter.parity.original import Original
+from exporter.parity.pool import INDEPENDENT, RUNTIMES_OF, RuntimePool
+from exporter.parity.report import Comparison, ParityReport
+from exporter.parity.statistics import FALSE_ALARM, fit
+from exporter.parity.tolerances import Tolerance, tolerance_for
+from exporter.runtimes import RuntimeInfo
+from signatures.graph import Graph
+from signatures.roles import Role
+from signatures.sampling import Case, draw_cases, draw_rollout
+from signatures.spec import PolicySignature, SourceMap
+
+#: A difference is rounding if it is at most this many times what one unit in the last place of the inputs makes: a
+#: backward stable computation gives the exact answer to inputs about that near. It counts at inputs of 1e3 only; at
+#: ordinary ones the default tolerance is larger.
+ROUNDING_FACTOR = 16
+#: Rows that a sampler is drawn for.
+DRAWS = 512
+Feeds = Mapping[str, np.ndarray]
+Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is verified: the artefacts of one policy, and where its source is."""
+
+    name: str
+    signature: PolicySignature
+    graph: Graph
+    #: format → path that a loader is given
+    artefacts: Mapping[str, Path]
+    sizes: Mapping[str, int]
+    #: a .bytes of the policy for the numpy reference (the artefact itself, or one made for this)
+    reference: Path
+    source: Path | None = None
+    source_map: SourceMap = field(default_factory=SourceMap)
+    #: signatures of the SavedModel: key → (inputs, outputs)
+    signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """How to verify."""
+
+    seed: int = 0
+    samples: int = 2
+    steps: int = 4
+    tolerance: Tolerance = field(default_factory=Tolerance)
+
+
+@dataclass
+class _Entrant:
+    """One format in one runtime: how to run it, what it can answer."""
+
+    format: str
+    runtime: str
+    run: Run
+    outputs: Sequence[str]
+
+
+def verify(
+    subject: Subject,
+    runtimes: Sequence[str],
+    known: Iterable[RuntimeInfo],
+    pool: RuntimePool,
+    options: VerifyOptions | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> ParityReport:
+    """The report on one policy. A runtime that fails is a failed comparison, not an exception."""
+    return _Verification(subject, tuple(runtimes), tuple(known), pool, options or VerifyOptions(), progress).report()
+
+
+class _Verification:
+    def __init__(
+        self,
+        subject: Subject,
+        runtimes: tuple[str, ...],
+        known: tuple[RuntimeInfo, ...],
+        pool: RuntimePool,
+        options: VerifyOptions,
+        progress: Callable[[str], None],
+    ) -> None:
+        self.subject, self.runtimes, self.known, self.pool = subject, runtimes, known, pool
+        self.options, self.progress = options, progress
+        self.signature = subject.signature
+        self.results: list[Comparison] = []
+        self.notes: list[str] = []
+        self.cases = draw_cases(self.signature, seed=options.seed, samples=options.samples)
+        self.steps = self._rollout_feeds()
+        self.random = random_outputs(subject.graph, [s.name for s in self.signature.outputs])
+        self.expected: list[dict[str, np.ndarray]] = []
+        self.unloads: list[LoadedModel] = []
+        self._floors: dict[str, dict[str, np.ndarray]] = {}
+
+    def report(self) -> ParityReport:
+        if not self.runtimes:
+            return self._finished("none")
+        reference, original = self._references()
+        try:
+            self.expected = [self._answers(reference, original, case.feeds) for case in self.cases]
+            self.expected_steps = self._roll(lambda feeds: self._answers(reference, original, feeds))
+        except RunFailed as error:
+            source = "source" if original is not None else "bytes"
+            self._failure(source, "tensorflow" if original is not None else "numpy", error)
+            return self._finished("source/tensorflow" if original is not None else "numpy")
+        for entrant in self._entrants(reference, original):
+            self.progress(f"{self.subject.name}: {entrant.format} in {entrant.runtime}")
+            self._examine(entrant)
+        for model in self.unloads:
+            model.unload()
+        return self._finished("source/tensorflow" if original is not None else "numpy")
+
+    # ---- who takes part
+
+    def _references(self) -> tuple[LoadedModel, Original | None]:
+        numpy_model = self.pool.process("numpy").load(str(self.subject.reference), seed=self.options.seed)
+        self.unloads.append(numpy_model)
+        self.numpy_model = numpy_model
+        original = None
+        if self.subject.source is not None and "tensorflow" in self.runtimes:
+            try:
+                model = self.pool.process("tensorflow").load(str(self.subject.source), kind="graph")
+            except RunFailed as error:
+                self._failure("source", "tensorflow", error)
+            else:
+                self.unloads.append(model)
+                original = Original(model, self.signature, self.subject.source_map)
+        return numpy_model, original
+
+    def _answers(self, reference: LoadedModel, original: Original | None, feeds: Feeds) -> dict[str, np.ndarray]:
+        """The reference's outputs; the numpy kernels answer for what the source cannot be asked."""
+        answers = {} if original is None else original.run(feeds)
+        rest = [s.name for s in self.signature.outputs if s.name not in answers and s.name not in self.random]
+        if rest:
+            answers.update(reference.run(feeds, rest))
+        return answers
+
+    def _entrants(self, reference: LoadedModel, original: Original | None) -> Iterable[_Entrant]:
+        outputs = [s.name for s in self.signature.outputs]
+        yield _Entrant("reference", "numpy", reference.run, outputs)
+        for kind, path in self.subject.artefacts.items():
+            for runtime in RUNTIMES_OF[kind]:
+                if runtime not in self.runtimes or runtime == "numpy":
+                    continue
+                loads = {"": list(outputs)}
+                if kind == "saved_model":
+                    loads = {key: list(names[1]) for key, names in self.subject.signatures.items()}
+                for key, names in loads.items():
+                    label = kind if key in ("", "serving_default") else f"{kind}:{key}"
+                    try:
+                        process = self.pool.process(runtime)
+                        shape = (
+                            {"kind": "saved_model", "signature": key} if kind == "saved_model" else {"kind": "graph"}
+                        )
+                        model = process.load(str(path), **shape)
+                    except RunFailed as error:
+                        self._failure(label, runtime, error)
+                        continue
+                    run = _limited(model.run, self.subject.signatures.get(key))
+                    if kind == "tfjs":
+                        run = _predicting(model, names)
+                    yield _Entrant(label, runtime, run, names)
+                    model.unload()
+
+    # ---- comparisons
+
+    def _examine(self, entrant: _Entrant) -> None:
+        try:
+            self._numbers(entrant)
+            self._rollout(entrant)
+            self._draws(entrant)
+        except RunFailed as error:
+            self._failure(entrant.format, entrant.runtime, error)
+
+    def _tolerance(self, output: str) -> Tolerance:
+        return tolerance_for(self.signature, output, self.options.tolerance)
+
+    def _numbers(self, entrant: _Entrant) -> None:
+        worst: dict[str, tuple[Difference, str]] = {}
+        for case, expected in zip(self.cases, self.expected, strict=True):
+            got = entrant.run(case.feeds, list(entrant.outputs))
+            for name in entrant.outputs:
+                if name in self.random:
+                    difference = self._plausible(name, got[name], case)
+                elif name in expected:
+                    difference = self._difference(name, expected, got[name], entrant)
+                    if not difference.passed and not difference.reason and got[name].dtype.kind == "f":
+                        rounding = self._rounding(case)[name]
+                        difference = self._difference(name, expected, got[name], entrant, rounding)
+                else:
+                    continue
+                if name not in worst or _rank(difference) > _rank(worst[name][0]):
+                    worst[name] = (difference, case.name)
+        for name, (difference, case_name) in worst.items():
+            self._add(entrant, name, "numbers" if name not in self.random else "shape", difference, case_name)
+
+    def _rounding(self, case: Case) -> dict[str, np.ndarray]:
+        """Per output, what rounding explains: how far the numpy reference moves when the inputs move by one ulp."""
+        if case.name not in self._floors:
+            names = [s.name for s in self.signature.outputs if s.name not in self.random and s.dtype == "float32"]
+            rng = np.random.default_rng(self.options.seed)
+            exact = self.numpy_model.run(case.feeds, names)
+            floors = {name: np.zeros(exact[name].shape) for name in names}
+            for _ in range(4):
+                nudged = {n: _nudged(a, rng) for n, a in case.feeds.items()}
+                for name, moved in self.numpy_model.run(nudged, names).items():
+                    step = np.abs(moved.astype(np.float64) - exact[name])
+                    row = step.max(axis=tuple(range(1, step.ndim)), keepdims=True)
+                    floors[name] = np.maximum(floors[name], np.where(np.isfinite(row), row, 0.0))
+            self._floors[case.name] = {name: ROUNDING_FACTOR * floor for name, floor in floors.items()}
+        return self._floors[case.name]
+
+    def _difference(
+        self, name: str, expected: Feeds, got: np.ndarray, entrant: _Entrant, rounding: np.ndarray | None = None
+    ) -> Difference:
+        return compare(
+            expected[name],
+            got,
+            self._tolerance(name),
+            free=self._ties(name, expected),
+            narrowed=entrant.format == "tfjs",
+            rounding=rounding,
+        )
+
+    def _ties(self, name: str, expected: Feeds) -> np.ndarray | None:
+        """Where an argmax is not decided, because the scores of the reference are too close."""
+        spec = self.signature.output(name)
+        if spec.role is not Role.DETERMINISTIC or not self.signature.branches:
+            return None
+        scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
+        if scores is None or scores not in expected:
+            return None
+        found = ties(expected[scores], self.signature.branches, self._tolerance(scores))
+        return found if found.shape == expected[name].shape else None
+
+    def _plausible(self, name: str, got: np.ndarray, case: Case) -> Difference:
+        """A drawn output: shape and range only; its distribution is tested by ``_draws``."""
+        spec = self.signature.output(name)
+        wanted = tuple(case.batch if n is None else n for n in spec.shape)
+        if got.shape != wanted:
+            return Difference(float("inf"), float("inf"), False, f"shape {list(got.shape)} instead of {list(wanted)}")
+        if spec.role is Role.SAMPLED and self.signature.branches:
+            sizes = np.array(self.signature.branches)
+            if (got < 0).any() or (got >= sizes).any():
+                return Difference(float("inf"), float("inf"), False, "a class outside of its branch was drawn")
+        return Difference(0.0, 0.0, True)
+
+    def _rollout_feeds(self) -> list[dict[str, np.ndarray]]:
+        memory = self.signature.memory
+        if memory is None or memory.input is None or memory.output is None:
+            return []
+        return draw_rollout(self.signature, seed=self.options.seed, steps=self.options.steps)
+
+    def _roll(self, run: Callable[[Feeds], dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
+        """Outputs of each step, the memory fed back."""
+        memory = self.signature.memory
+        answers: list[dict[str, np.ndarray]] = []
+        for feeds in self.steps:
+            assert memory is not None and memory.input is not None and memory.output is not None
+            if answers:
+                feeds = {**feeds, memory.input: answers[-1][memory.output]}
+            answers.append(run(feeds))
+        return answers
+
+    def _rollout(self, entrant: _Entrant) -> None:
+        memory = self.signature.memory
+        if not self.steps or memory is None or memory.output not in entrant.outputs:
+            return
+        got = self._roll(lambda feeds: entrant.run(feeds, list(entrant.outputs)))
+        for name in entrant.outputs:
+            if name in self.random or name not in self.expected_steps[0]:
+                continue
+            steps = [self._difference(name, e, g[name], entrant) for e, g in zip(self.expected_steps, got, strict=True)]
+            worst = max(steps, key=_rank)
+            drift = tuple(d.max_abs for d in steps)
+            self._add(entrant, name, "rollout", worst, f"step {steps.index(worst) + 1} of {len(steps)}", drift)
+
+    def _draws(self, entrant: _Entrant) -> None:
+        """Draw many times for one input and test the counts against the reference's log-probabilities."""
+        action = self.signature.outputs[0]
+        scores = next((s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS), None)
+        if action.role is not Role.SAMPLED or action.name not in entrant.outputs or scores is None:
+            return
+        case = next((c for c in self.cases if c.name.startswith("random masks")), self.cases[0])
+        expected = self.expected[self.cases.index(case)].get(scores)
+        if expected is None or action.name not in self.random:
+            return
+        row = {name: array[:1] for name, array in case.feeds.items()}
+        if entrant.runtime == "tfjs-cpu":
+            # Its Multinomial restarts its generator for every row of a batch: one row at a time.
+            drawn = np.concatenate([entrant.run(row, [action.name])[action.name] for _ in range(DRAWS)])
+        else:
+            drawn = entrant.run({n: np.repeat(a, DRAWS, axis=0) for n, a in row.items()}, [action.name])[action.name]
+        edges = np.cumsum(self.signature.branches)[:-1]
+        parts = np.split(expected[0], edges)
+        p_values = [fit(drawn[:, i], part) for i, part in enumerate(parts)]
+        lowest = min(p_values)
+        reason = (
+            "" if lowest >= FALSE_ALARM else f"the draws do not have the distribution they should (p = {lowest:.1e})"
+        )
+        self._add(
+            entrant, action.name, "draws", Difference(1 - lowest, 1 - lowest, lowest >= FALSE_ALARM, reason), case.name
+        )
+
+    # ---- results
+
+    def _add(
+        self,
+        entrant: _Entrant,
+        output: str,
+        kind: str,
+        difference: Difference,
+        where: str,
+        drift: tuple[float, ...] = (),
+    ) -> None:
+        self.results.append(
+            Comparison(
+                entrant.format,
+                entrant.runtime,
+                output,
+                kind,
+                difference.max_abs,
+                difference.max_rel,
+                self._tolerance(output),
+                difference.passed,
+                where,
+                difference.reason,
+                drift,
+                difference.rounding,
+            )
+        )
+
+    def _failure(self, kind: str, runtime: str, error: RunFailed) -> None:
+        text = error.what if error.why is None else f"{error.what}: {error.why}"
+        self.results.append(
+            Comparison(
+                kind, runtime, "*", "failure", float("inf"), float("inf"), Tolerance(), False, None, text.strip()
+            )
+        )
+
+    def _finished(self, reference: str) -> ParityReport:
+        versions = self.pool.versions()
+        states: dict[str, dict[str, str | None]] = {}
+        for info in self.known:
+            ran = info.name in self.runtimes and info.name in versions
+            reason = None if ran else "not asked for" if info.installed else f"not installed; {info.how}"
+            states[info.name] = {
+                "version": versions.get(info.name, info.version),
+                "status": "ran" if ran else "not run",
+                "reason": reason,
+            }
+        independent = any(c.runtime in INDEPENDENT for c in self.results)
+        passed = all(c.passed for c in self.results) if independent else None
+        if any(not c.passed for c in self.results):
+            passed = False
+        return ParityReport(
+            self.subject.name,
+            passed,
+            self.options.seed,
+            self.options.samples,
+            reference,
+            states,
+            tuple(self.results),
+            self.subject.sizes,
+            (*self.signature.notes, *self.notes),
+        )
+
+
+def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:
+    """The outputs that depend on a sampler inside the graph."""
+    samplers = {n.name for n in graph.nodes if n.op in SAMPLERS}
+    return frozenset(name for name in names if graph.ancestors([name]) & samplers)
+
+
+def _limited(run: Run, signature: tuple[Sequence[str], Sequence[str]] | None) -> Run:
+    """Feed only what a signature takes."""
+    if signature is None:
+        return run
+    inputs = frozenset(signature[0])
+    return lambda feeds, fetch: run({n: a for n, a in feeds.items() if n in inputs}, fetch)
+
+
+def _nudged(array: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Every float moved by one unit in its last place, up or down."""
+    if array.dtype.kind != "f":
+        return array
+    towards = np.where(rng.random(array.shape) < 0.5, -np.inf, np.inf).astype(array.dtype)
+    return np.where(array == 0, array, np.nextafter(array, towards))
+
+
+def _predicting(model: LoadedModel, outputs: Sequence[str]) -> Run:
+    """The call that people make in TensorFlow.js, ``predict``, wherever all outputs are asked for."""
+    return lambda feeds, fetch: (
+        model.predict(feeds, outputs) if list(fetch) == list(outputs) else model.run(feeds, fetch)
+    )
+
+
+def _rank(difference: Difference) -> tuple[bool, float]:
+    return not difference.passed, difference.max_abs

@@ -1,0 +1,232 @@
+"""The main job: sources in, verified bundles out."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from converters.artifact import Artifact, WriteOptions
+from converters.frozen_graph.reader import read_graph
+from converters.frozen_graph.writer import write as write_frozen
+from converters.graph.compile import CONTRACT_NODE, CompileOptions
+from converters.registry import TARGETS, writer
+from converters.saved_model.writer import signatures_of
+from exporter import bundle
+from exporter.parity.pool import RuntimePool, chosen_runtimes
+from exporter.parity.report import ParityReport
+from exporter.parity.verify import Subject, VerifyOptions, verify
+from exporter.sources import Source, read_source
+from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
+from signatures.graph import Graph
+from signatures.spec import Policy
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What ``export-model`` may be told; see the command line for the meaning of each."""
+
+    out: Path = Path("exported")
+    targets: Sequence[str] = TARGETS
+    name: str | None = None
+    compile: CompileOptions = field(default_factory=CompileOptions)
+    opset: int = 15
+    verify: str | Sequence[str] = "auto"
+    parity: VerifyOptions = field(default_factory=VerifyOptions)
+
+
+@dataclass(frozen=True, slots=True)
+class ExportResult:
+    """One policy, written: its bundle (``<policy>.failed`` where the formats disagree), contract and report."""
+
+    policy: Policy
+    folder: Path
+    contract: Mapping[str, Any]
+    sizes: Mapping[str, int]
+    report: ParityReport | None
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether the formats agree; None where no independent runtime ran."""
+        return None if self.report is None else self.report.passed
+
+
+def export(
+    paths: Sequence[Path | str],
+    options: ExportOptions,
+    progress: Progress = lambda text: None,
+    pool: RuntimePool | None = None,
+) -> Iterator[ExportResult]:
+    """Export every policy of every source, one after the other.
+
+    All sources are read and compiled before the first is written, so a bad one leaves nothing behind. Raises
+    ExportModelError; a disagreement is in the result, not an exception. A ``pool`` that is given stays open, for
+    callers that export many times.
+    """
+    if not paths:
+        raise UsageError("no source was given", fix="export-model FILE -o DIR")
+    writers = {target: writer(target) for target in dict.fromkeys(options.targets)}
+    if not writers:
+        raise UsageError("--to names no format", fix=f"the formats are {', '.join(TARGETS)}")
+    runtimes, known = chosen_runtimes(options.verify, list(writers))
+    jobs: list[tuple[Source, Policy]] = []
+    for path in paths:
+        source = read_source(path)
+        jobs.extend((source, policy) for policy in _named(source.policies(options.compile), options, len(paths)))
+    bundle.distinct_names([(p.name, f"{s.path} ({p.name})") for s, p in jobs])
+    for _, policy in jobs:
+        bundle.recover(options.out / policy.name)
+        bundle.check_replaceable(options.out / policy.name)
+    written = [(s, p, *_write(s, p, writers, options)) for s, p in jobs]
+    with nullcontext(pool) if pool is not None else RuntimePool() as pool:
+        for source, policy, content, artifacts in written:
+            with _staged(options.out, content, artifacts) as stage, tempfile.TemporaryDirectory() as scratch:
+                report = None
+                if runtimes:
+                    subject = _subject(policy, stage, artifacts, source.path, Path(scratch))
+                    report = verify(subject, runtimes, known, pool, options.parity, progress)
+                    (stage / bundle.PARITY).write_bytes(bundle.dumps(report.to_dict()))
+                failed = report is not None and report.passed is False
+                place = options.out / (f"{policy.name}.failed" if failed else policy.name)
+                bundle.put_in_place(stage, place)
+            yield ExportResult(policy, place, content, {a.format: a.size for a in artifacts}, report)
+
+
+def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list[Policy]:
+    if options.name is not None:
+        if len(policies) > 1 or sources > 1:
+            raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
+        policies = [replace(policies[0], name=options.name)]
+    return [replace(p, name=bundle.safe_name(p.name)) for p in policies]
+
+
+def _write(
+    source: Source, policy: Policy, writers: Mapping[str, Any], options: ExportOptions
+) -> tuple[dict[str, Any], list[Artifact]]:
+    content = bundle.contract(policy, {"path": source.path.name, "sha256": source.sha256})
+    how = WriteOptions(bundle.compact(content), options.opset)
+    return content, [write(policy, how) for write in writers.values()]
+
+
+@contextmanager
+def _staged(out: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]) -> Iterator[Path]:
+    """A staged bundle that is gone afterwards, unless it was put in its place."""
+    stage = bundle.write_staged(out, content, artifacts)
+    try:
+        yield stage
+    finally:
+        if stage.exists():
+            shutil.rmtree(stage, ignore_errors=True)
+
+
+def _subject(policy: Policy, stage: Path, artifacts: Sequence[Artifact], source: Path, scratch: Path) -> Subject:
+    paths = {a.format: stage / a.main for a in artifacts}
+    reference = paths.get("bytes")
+    if reference is None:
+        # The numpy reference reads a .bytes; one is made for it where none was asked for.
+        artifact = write_frozen(policy, WriteOptions("{}"))
+        reference = scratch / artifact.main
+        reference.write_bytes(artifact.files[artifact.main])
+    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
+    return Subject(
+        policy.name,
+        policy.signature,
+        policy.graph,
+        paths,
+        {a.format: a.size for a in artifacts},
+        reference,
+        source,
+        policy.source,
+        keys,
+    )
+
+
+def verify_folder(
+    folder: Path,
+    *,
+    source: Path | None = None,
+    runtimes: str | Sequence[str] = "auto",
+    options: VerifyOptions | None = None,
+    allow_unverified: bool = False,
+    progress: Progress = lambda text: None,
+) -> ParityReport:
+    """Verify a bundle again: hashes first, then every format in the runtimes.
+
+    Without ``source`` the reference is the bundle's own ``.bytes``. Raises BundleError, and RuntimeUnavailableError
+    when no independent runtime ran (unless ``allow_unverified``).
+    """
+    content = bundle.read_policy_json(folder)
+    bundle.check_hashes(folder, content)
+    signature, source_map = bundle.signature_of(content)
+    name = content["name"]
+    artefacts = _artefacts(folder, name)
+    graph_file = artefacts.get("bytes")
+    if graph_file is None:
+        raise BundleError(
+            "has no .bytes, which is the reference without a source",
+            where=str(folder),
+            fix="export the policy again with bytes among --to",
+        )
+    if source is not None:
+        _check_source(source, content)
+    graph = read_graph(graph_file.read_bytes())
+    policy = Policy(
+        name,
+        Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)),
+        signature,
+        {s.name: s.name for s in signature.inputs},
+        {s.name: s.name for s in signature.outputs},
+        source_map,
+    )
+    used, known = chosen_runtimes(runtimes, list(artefacts))
+    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
+    subject = Subject(name, signature, policy.graph, artefacts, _sizes(content), graph_file, source, source_map, keys)
+    with RuntimePool() as pool:
+        report = verify(subject, used or ("numpy",), known, pool, options, progress)
+    if source is None:
+        note = "the source was not given: the reference is the bundle's own .bytes"
+        report = replace(report, reference="bytes/numpy", notes=(*report.notes, note))
+    if report.passed is None and not allow_unverified:
+        raise RuntimeUnavailableError(
+            "no independent runtime is installed, so nothing was verified",
+            where=str(folder),
+            why="only the numpy reference ran",
+            fix="pip install export-model[onnxruntime] (or [tensorflow]), or --allow-unverified",
+        )
+    return report
+
+
+def _artefacts(folder: Path, name: str) -> dict[str, Path]:
+    places = {
+        "bytes": folder / f"{name}.bytes",
+        "saved_model": folder / "saved_model",
+        "tfjs": folder / "tfjs",
+        "onnx": folder / f"{name}.onnx",
+    }
+    return {kind: path for kind, path in places.items() if path.exists()}
+
+
+def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
+    sizes: dict[str, int] = {}
+    for path, entry in content["files"].items():
+        head = path.split("/")[0]
+        kind = head if head in ("saved_model", "tfjs") else path.rsplit(".", 1)[-1]
+        sizes[kind] = sizes.get(kind, 0) + int(entry["bytes"])
+    return sizes
+
+
+def _check_source(source: Path, content: Mapping[str, Any]) -> None:
+    found = read_source(source)
+    if found.sha256 != content["source"]["sha256"]:
+        raise BundleError(
+            "is not the source of this bundle",
+            where=str(source),
+            why=f"its sha256 differs from that of {content['source']['path']} in {bundle.POLICY}",
+            fix="give the file it was exported from, or export it again",
+        )

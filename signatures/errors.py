@@ -1,0 +1,130 @@
+"""The exception tree. Every error the package raises on purpose is one of these.
+
+::
+
+    ExportModelError            what happened, where, why, what to do; ``exit_status`` of the command line
+    ├── UsageError              2  the command line or the call is wrong
+    ├── SourceError             2  the source cannot be read
+    │   ├── NotAPolicyError     2  it is readable, but it is not a policy (or not what the reader was asked for)
+    │   └── DamagedFileError    2  it is cut off, empty, or breaks its own format
+    ├── GraphError              2  a node of the graph is wrong or cannot be converted
+    │   └── UnsupportedOpError  2  an op that the op table does not hold
+    ├── SignatureError          2  inputs and outputs cannot be given their roles
+    ├── BundleError             2  a bundle is missing, incomplete or has been changed
+    ├── ParityError             1  two runtimes disagree
+    └── RuntimeUnavailableError 3  a runtime that was asked for is not installed, or did not start
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+class ExportModelError(Exception):
+    """Base of all errors of this project.
+
+    ``what`` happened, ``where`` (file, node), ``why``, and what to do (``fix``); the message holds all four.
+    """
+
+    exit_status = 2
+
+    def __init__(self, what: str, *, where: str | None = None, why: str | None = None, fix: str | None = None) -> None:
+        self.what, self.where, self.why, self.fix = what, where, why, fix
+        super().__init__(self.message)
+
+    @property
+    def message(self) -> str:
+        """The parts that are known, a line each."""
+        lines = [self.what if self.where is None else f"{self.where}: {self.what}"]
+        if self.why:
+            lines.append(f"  why: {self.why}")
+        if self.fix:
+            lines.append(f"  fix: {self.fix}")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.message
+
+    def at(self, where: str) -> ExportModelError:
+        """The same error with a place in front of the one it names already; for callers that know the file."""
+        self.where = where if self.where is None else f"{where}: {self.where}"
+        self.args = (self.message,)
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``: the class's name and the four parts."""
+        return {
+            "error": type(self).__name__,
+            "what": self.what,
+            "where": self.where,
+            "why": self.why,
+            "fix": self.fix,
+            "exit_status": self.exit_status,
+        }
+
+
+class UsageError(ExportModelError):
+    """The command line or the call is wrong: an unknown target, a flag that contradicts another."""
+
+
+class SourceError(ExportModelError):
+    """The source cannot be read."""
+
+
+class NotAPolicyError(SourceError):
+    """The source is something else than a policy, or a policy in a form that is not read; the text says which."""
+
+
+class DamagedFileError(SourceError):
+    """The source is empty, cut off, or breaks the rules of its own format."""
+
+
+class GraphError(ExportModelError):
+    """A node is wrong (a dangling input, a dtype that does not fit) or cannot be converted."""
+
+
+class UnsupportedOpError(GraphError):
+    """Ops that no entry of the op table covers. ``issues`` names every node, not only the first."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        issues: Sequence[tuple[str, str]] = (),
+        where: str | None = None,
+        why: str | None = None,
+        fix: str | None = None,
+    ) -> None:
+        self.issues = tuple(issues)
+        super().__init__(what, where=where, why=why, fix=fix)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the base, with the list of (node, op)."""
+        return {**super().to_dict(), "issues": [{"node": n, "op": o} for n, o in self.issues]}
+
+
+class SignatureError(ExportModelError):
+    """Inputs and outputs cannot be given their roles; the text lists the candidates and the flags that decide."""
+
+
+class BundleError(ExportModelError):
+    """A bundle is missing, incomplete, or its files are not the ones its policy.json names."""
+
+
+class ParityError(ExportModelError):
+    """Runtimes disagree. ``report`` is the content of parity.json."""
+
+    exit_status = 1
+
+    def __init__(
+        self, what: str, *, report: Any = None, where: str | None = None, why: str | None = None, fix: str | None = None
+    ) -> None:
+        self.report = report
+        super().__init__(what, where=where, why=why, fix=fix)
+
+
+class RuntimeUnavailableError(ExportModelError):
+    """A runtime that was asked for is not installed, or its process did not start."""
+
+    exit_status = 3

@@ -1,0 +1,204 @@
+"""A graph in the TensorFlow vocabulary: nodes, references, topological order. Structure only, no op knowledge.
+
+A *reference* names a tensor: ``"node"`` is output 0, ``"node:2"`` is output 2 (TensorFlow's GraphDef form).
+Graphs are immutable by convention: passes make new ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from signatures.errors import GraphError
+
+#: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
+AttrValue = Any
+
+
+@dataclass(frozen=True, slots=True)
+class TensorShape:
+    """A ``shape`` attribute: ``dims`` is None for an unknown rank, an entry is None for a free axis."""
+
+    dims: tuple[int | None, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One operation.
+
+    ``attrs`` hold what changes the result (strides, axis, ``DstT``); dtypes that follow from the inputs (``T``) are
+    not kept, the writers derive them. ``value`` is the array of a ``Const``. ``origin`` is the tensor of the source
+    that output 0 stands for (``"dense/BiasAdd:0"``); it survives renaming, so reports can point at the source.
+    """
+
+    name: str
+    op: str
+    inputs: tuple[str, ...] = ()
+    attrs: Mapping[str, AttrValue] = field(default_factory=dict)
+    value: np.ndarray | None = None
+    origin: str | None = None
+
+    def with_inputs(self, inputs: Iterable[str]) -> Node:
+        """The same node fed from other tensors."""
+        return replace(self, inputs=tuple(inputs))
+
+
+def ref(name: str, index: int = 0) -> str:
+    """The reference to output ``index`` of node ``name``."""
+    return name if index == 0 else f"{name}:{index}"
+
+
+def split_ref(reference: str) -> tuple[str, int]:
+    """(node name, output index) of a reference; ``"a:0"`` and ``"a"`` are the same tensor."""
+    name, colon, index = reference.rpartition(":")
+    if colon and index.isdigit():
+        return name, int(index)
+    return reference, 0
+
+
+def node_of(reference: str) -> str:
+    """The name of the node that a reference points to."""
+    return split_ref(reference)[0]
+
+
+def normal_ref(reference: str) -> str:
+    """``"a:0"`` as ``"a"``; everything else unchanged."""
+    return ref(*split_ref(reference))
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Nodes in topological order (the back edges of while loops apart), looked up by name."""
+
+    nodes: tuple[Node, ...]
+    _index: dict[str, Node] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        index: dict[str, Node] = {}
+        for node in self.nodes:
+            if node.name in index:
+                raise GraphError(
+                    f"two nodes are called {node.name!r}",
+                    why="names must be unique in a graph",
+                    fix="export the graph again; this file breaks TensorFlow's own rules",
+                )
+            index[node.name] = node
+        object.__setattr__(self, "_index", index)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._index
+
+    def __getitem__(self, name: str) -> Node:
+        return self._index[name]
+
+    def get(self, name: str) -> Node | None:
+        """The node, or None."""
+        return self._index.get(name)
+
+    def producer(self, reference: str) -> Node:
+        """The node that makes the tensor ``reference``."""
+        return self._index[node_of(reference)]
+
+    def constant(self, reference: str) -> np.ndarray | None:
+        """The array behind ``reference`` if it is a Const, possibly through Identity; else None."""
+        node = self.producer(reference)
+        while node.op == "Identity":
+            node = self.producer(node.inputs[0])
+        return node.value if node.op == "Const" else None
+
+    def consumers(self) -> dict[str, list[Node]]:
+        """Node name → the nodes that read any of its outputs, in graph order."""
+        table: dict[str, list[Node]] = {node.name: [] for node in self.nodes}
+        for node in self.nodes:
+            for name in dict.fromkeys(node_of(r) for r in node.inputs):
+                table[name].append(node)
+        return table
+
+    def ancestors(self, references: Iterable[str], stop: frozenset[str] = frozenset()) -> set[str]:
+        """Names of all nodes upstream of ``references``, themselves included; does not look behind ``stop``."""
+        seen: set[str] = set()
+        stack = [node_of(r) for r in references]
+        while stack:
+            name = stack.pop()
+            if name in seen:
+                continue
+            seen.add(name)
+            if name not in stop:
+                stack.extend(node_of(r) for r in self._index[name].inputs)
+        return seen
+
+    def pruned(self, references: Iterable[str]) -> Graph:
+        """Only what is upstream of ``references``, in the same order."""
+        keep = self.ancestors(references)
+        return Graph(tuple(n for n in self.nodes if n.name in keep))
+
+
+def checked_inputs(nodes: Sequence[Node]) -> None:
+    """Raise GraphError when a node reads a tensor whose node does not exist."""
+    names = {node.name for node in nodes}
+    for node in nodes:
+        for reference in node.inputs:
+            if node_of(reference) not in names:
+                raise GraphError(
+                    f"node {node.name!r} ({node.op}) reads {reference!r}, which is not in the graph",
+                    why="the graph has a dangling input; it was cut or edited",
+                    fix="freeze the graph again from its checkpoint",
+                )
+
+
+def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
+    """``nodes`` ordered so that inputs come first, otherwise in the given order.
+
+    The edge NextIteration → Merge closes a while loop and does not count. Raises GraphError on any other cycle and
+    on dangling inputs.
+    """
+    checked_inputs(nodes)
+    index = {node.name: node for node in nodes}
+    state: dict[str, int] = {}  # 1 = being visited, 2 = done
+    ordered: list[Node] = []
+    for root in nodes:
+        if root.name in state:
+            continue
+        stack: list[tuple[str, int]] = [(root.name, 0)]
+        state[root.name] = 1
+        while stack:
+            name, position = stack.pop()
+            node = index[name]
+            sources = [node_of(r) for r in node.inputs]
+            if node.op == "Merge":
+                sources = [s for s in sources if index[s].op != "NextIteration"]
+            if position < len(sources):
+                stack.append((name, position + 1))
+                source = sources[position]
+                if source not in state:
+                    state[source] = 1
+                    stack.append((source, 0))
+                elif state[source] == 1:
+                    raise GraphError(
+                        f"node {source!r} depends on itself",
+                        why="the graph has a cycle that is not a while loop",
+                        fix="freeze the graph again; this file is damaged",
+                    )
+            else:
+                state[name] = 2
+                ordered.append(node)
+    return tuple(ordered)
+
+
+class NameScope:
+    """Hands out node names that are not taken yet, the same ones in every run."""
+
+    def __init__(self, taken: Iterable[str]) -> None:
+        self._taken = set(taken)
+
+    def fresh(self, wish: str) -> str:
+        """``wish``, or ``wish_1``, ``wish_2``… if it is taken."""
+        name, number = wish, 0
+        while name in self._taken:
+            number += 1
+            name = f"{wish}_{number}"
+        self._taken.add(name)
+        return name

@@ -1,0 +1,133 @@
+"""Roles of a policy's inputs and outputs, their canonical names, and what ML-Agents called them.
+
+Names by version: ML-Agents ``python/unitytrainers`` 0.1–0.5, ``mlagents/trainers`` 0.6–0.23 and its torch exporter
+(``model_serialization.py``) from 0.20 on.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """What a tensor is for. The value is what policy.json, ``--input`` and ``--output`` say."""
+
+    # inputs
+    VECTOR = "vector_observation"
+    VISUAL = "visual_observation"
+    ENTITIES = "variable_length_observation"
+    NOISE = "noise"
+    MASKS = "masks"
+    PREV_ACTION = "prev_action"
+    MEMORY_IN = "memory_in"
+    PARAMETER = "parameter"
+    # inputs that are removed on the way
+    SEQUENCE_LENGTH = "sequence_length"
+    BATCH_SIZE = "batch_size"
+    # what ``action`` can mean
+    CONTINUOUS = "continuous"
+    SAMPLED = "sampled"
+    LOG_PROBS = "log_probs"
+    PROBS = "probs"
+    DETERMINISTIC = "deterministic"
+    # other outputs
+    ACTION = "action"
+    ACTION_PROBS = "action_probs"
+    VALUE = "value_estimate"
+    MEMORY_OUT = "memory_out"
+    OTHER = "other"
+
+
+OBSERVATIONS = (Role.VECTOR, Role.VISUAL, Role.ENTITIES)
+INPUT_ROLES = (
+    *OBSERVATIONS,
+    Role.NOISE,
+    Role.MASKS,
+    Role.PREV_ACTION,
+    Role.MEMORY_IN,
+    Role.PARAMETER,
+    Role.SEQUENCE_LENGTH,
+    Role.BATCH_SIZE,
+)
+OUTPUT_ROLES = (Role.ACTION, Role.ACTION_PROBS, Role.VALUE, Role.MEMORY_OUT, Role.OTHER)
+
+#: Canonical names that are accepted in place of a role on the command line.
+ALIASES = {
+    "state": Role.VECTOR,
+    "observation": Role.VISUAL,
+    "entities": Role.ENTITIES,
+    "epsilon": Role.NOISE,
+    "action_masks": Role.MASKS,
+    "recurrent_in": Role.MEMORY_IN,
+    "recurrent_out": Role.MEMORY_OUT,
+}
+
+#: Name patterns of inputs (scope removed), with the ranks they may have; None: any.
+INPUT_PATTERNS: tuple[tuple[re.Pattern[str], Role, tuple[int, ...] | None], ...] = (
+    (re.compile(r"state(_\d+)?"), Role.VECTOR, (1, 2)),
+    (re.compile(r"vector_observation(_\d+)?"), Role.VECTOR, (1, 2)),
+    (re.compile(r"obs_\d+"), Role.VECTOR, (2,)),
+    (re.compile(r"(visual_)?observation(_?\d+)?"), Role.VISUAL, (4,)),
+    (re.compile(r"obs_\d+"), Role.VISUAL, (4,)),
+    (re.compile(r"obs_\d+|entities_\d+"), Role.ENTITIES, (3,)),
+    (re.compile(r"epsilon(_\d+)?"), Role.NOISE, None),
+    (re.compile(r"action_masks"), Role.MASKS, (2,)),
+    (re.compile(r"prev_action"), Role.PREV_ACTION, (1, 2)),
+    (re.compile(r"recurrent_in|memories"), Role.MEMORY_IN, (2, 3)),
+    # 0.10 and 0.14 SAC name the placeholder sequence_length_1.
+    (re.compile(r"sequence_length(_\d+)?"), Role.SEQUENCE_LENGTH, (0, 1)),
+    (re.compile(r"batch_size(_\d+)?"), Role.BATCH_SIZE, (0, 1)),
+)
+
+#: Output node names (scope removed) of the TensorFlow generations.
+OUTPUT_NAMES = {
+    "action": Role.ACTION,
+    "action_probs": Role.ACTION_PROBS,
+    "value_estimate": Role.VALUE,
+    "recurrent_out": Role.MEMORY_OUT,
+    # what this tool writes beside them, so that our own graphs are read back as what they were
+    "action_log_probs": Role.LOG_PROBS,
+    "deterministic_action": Role.DETERMINISTIC,
+}
+
+#: Constants that ML-Agents left in its graphs from 0.3 (memory_size) and 0.6 (the others) on.
+CONSTANT_NAMES = (
+    "version_number",
+    "is_continuous_control",
+    "memory_size",
+    "action_output_shape",
+    "trainer_major_version",
+    "trainer_minor_version",
+    "trainer_patch_version",
+)
+
+#: Canonical names; numbered ones get ``_0``, ``_1``… or a suffix from the second on.
+CANONICAL = {
+    Role.NOISE: "epsilon",
+    Role.MASKS: "action_masks",
+    Role.PREV_ACTION: "prev_action",
+    Role.MEMORY_IN: "recurrent_in",
+    Role.MEMORY_OUT: "recurrent_out",
+    Role.ACTION_PROBS: "action_probs",
+    Role.VALUE: "value_estimate",
+}
+
+
+def canonical_name(role: Role, number: int, own: str) -> str:
+    """The name of the ``number``-th (from 0) tensor of ``role``; ``own`` is the source's name, for parameters."""
+    if role is Role.VECTOR:
+        return "state" if number == 0 else f"state_{number}"
+    if role is Role.VISUAL:
+        return f"observation_{number}"
+    if role is Role.ENTITIES:
+        return f"entities_{number}"
+    name = CANONICAL.get(role, own)
+    return name if number == 0 or role in (Role.PARAMETER, Role.OTHER) else f"{name}_{number}"
+
+
+def parse_role(text: str) -> Role | None:
+    """The role that a word on the command line names, or None."""
+    if text in ALIASES:
+        return ALIASES[text]
+    return Role(text) if text in Role._value2member_map_ else None

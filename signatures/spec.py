@@ -1,0 +1,209 @@
+"""Tensor specs, the signature of a policy, and the policy itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from signatures.graph import Graph
+from signatures.roles import OBSERVATIONS, Role
+
+
+@dataclass(frozen=True, slots=True)
+class TensorSpec:
+    """One input or output.
+
+    ``shape`` has None for a free axis (the batch comes first). ``dtype`` is numpy's name. ``source`` is the tensor of
+    the source it stands for (``"vector_observation:0"``), a tuple of them where several were joined, None where it
+    was made here. ``distribution`` describes what an input looks like: ``{"kind": "normal", "mean": […], "std": […]}``.
+    """
+
+    name: str
+    role: Role
+    dtype: str
+    shape: tuple[int | None, ...]
+    source: str | tuple[str, ...] | None = None
+    distribution: Mapping[str, Any] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in policy.json."""
+        entry: dict[str, Any] = {
+            "name": self.name,
+            "role": self.role.value,
+            "dtype": self.dtype,
+            "shape": list(self.shape),
+            "source": list(self.source) if isinstance(self.source, tuple) else self.source,
+        }
+        if self.distribution is not None:
+            entry["distribution"] = dict(self.distribution)
+        return entry
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> TensorSpec:
+        """The inverse of ``to_dict``."""
+        source = entry.get("source")
+        return cls(
+            name=entry["name"],
+            role=Role(entry["role"]),
+            dtype=entry["dtype"],
+            shape=tuple(entry["shape"]),
+            source=tuple(source) if isinstance(source, list) else source,
+            distribution=entry.get("distribution"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output`` (None where the source
+    has lost it). ``layout`` names its parts in order, for example ``("c", "h")``, or is empty where it is unknown.
+    """
+
+    size: int
+    input: str | None
+    output: str | None
+    layout: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in policy.json."""
+        return {"size": self.size, "input": self.input, "output": self.output, "layout": list(self.layout)}
+
+
+@dataclass(frozen=True, slots=True)
+class PolicySignature:
+    """The contract of a policy, the same in every format it is written to."""
+
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+    family: str
+    action_space: str  # continuous | discrete | hybrid
+    branches: tuple[int, ...] = ()
+    #: The training algorithm where the graph tells it: PPO, SAC, BC, DQN.
+    algorithm: str | None = None
+    memory: Memory | None = None
+    preprocess: Mapping[str, Any] = field(default_factory=dict)
+    constants: Mapping[str, int | float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def input(self, name: str) -> TensorSpec:
+        """The input called ``name``; KeyError if there is none."""
+        return _named(self.inputs, name)
+
+    def has_input(self, name: str) -> bool:
+        """Whether an input is called ``name``."""
+        return any(s.name == name for s in self.inputs)
+
+    def output(self, name: str) -> TensorSpec:
+        """The output called ``name``; KeyError if there is none."""
+        return _named(self.outputs, name)
+
+    @property
+    def observations(self) -> tuple[TensorSpec, ...]:
+        """Inputs that are observations."""
+        return tuple(s for s in self.inputs if s.role in OBSERVATIONS)
+
+    @property
+    def noise(self) -> tuple[TensorSpec, ...]:
+        """Inputs that take N(0, 1) draws."""
+        return tuple(s for s in self.inputs if s.role is Role.NOISE)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The part of policy.json that describes the policy (not its files)."""
+        return {
+            "family": self.family,
+            "algorithm": self.algorithm,
+            "action_space": self.action_space,
+            "inputs": [s.to_dict() for s in self.inputs],
+            "outputs": [s.to_dict() for s in self.outputs],
+            "memory": None if self.memory is None else self.memory.to_dict(),
+            "branches": list(self.branches),
+            "preprocess": dict(self.preprocess),
+            "constants": dict(self.constants),
+            "notes": list(self.notes),
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> PolicySignature:
+        """The inverse of ``to_dict``; extra keys are ignored."""
+        memory = entry.get("memory")
+        return cls(
+            inputs=tuple(TensorSpec.from_dict(e) for e in entry["inputs"]),
+            outputs=tuple(TensorSpec.from_dict(e) for e in entry["outputs"]),
+            family=entry["family"],
+            action_space=entry["action_space"],
+            branches=tuple(entry.get("branches", ())),
+            algorithm=entry.get("algorithm"),
+            memory=Memory(memory["size"], memory["input"], memory["output"], tuple(memory["layout"]))
+            if memory
+            else None,
+            preprocess=entry.get("preprocess", {}),
+            constants=entry.get("constants", {}),
+            notes=tuple(entry.get("notes", ())),
+        )
+
+
+def _named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
+    for spec in specs:
+        if spec.name == name:
+            return spec
+    raise KeyError(name)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceMap:
+    """How to run the source itself: which of its tensors stand for the policy's inputs and outputs.
+
+    ``fixed`` are placeholders that the policy no longer has, with the value they take; ``batch_sizes`` are
+    placeholders that take the number of rows, with their rank (0, or 1 for a vector of one). ``noise`` are the tensors that carry N(0, 1) draws, with their shapes;
+    one that is not among ``feeds`` is fed zeros, or left to draw if ``noise_kept``. ``branches`` are the tensors that
+    the draws of a sampled action are made from, in branch order (None where the source cannot be asked for one).
+    """
+
+    feeds: Mapping[str, str] = field(default_factory=dict)
+    fetches: Mapping[str, str] = field(default_factory=dict)
+    fixed: Mapping[str, np.ndarray] = field(default_factory=dict)
+    batch_sizes: Mapping[str, int] = field(default_factory=dict)
+    noise: Mapping[str, tuple[int | None, ...]] = field(default_factory=dict)
+    noise_kept: bool = False
+    branches: tuple[str | None, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """What policy.json keeps of it: feeds and fetches are the ``source`` of its inputs and outputs."""
+        return {
+            "fixed": {name: {"dtype": value.dtype.name, "value": value.tolist()} for name, value in self.fixed.items()},
+            "batch_sizes": dict(self.batch_sizes),
+            "noise": {name: list(shape) for name, shape in self.noise.items()},
+            "noise_kept": self.noise_kept,
+            "branches": list(self.branches),
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any], signature: PolicySignature) -> SourceMap:
+        """The inverse, with the feeds and fetches of ``signature``."""
+        return cls(
+            feeds={s.name: s.source for s in signature.inputs if isinstance(s.source, str)},
+            fetches={s.name: s.source for s in signature.outputs if isinstance(s.source, str)},
+            fixed={n: np.array(v["value"], v["dtype"]) for n, v in entry.get("fixed", {}).items()},
+            batch_sizes=dict(entry.get("batch_sizes", {})),
+            noise={n: tuple(shape) for n, shape in entry.get("noise", {}).items()},
+            noise_kept=bool(entry.get("noise_kept", False)),
+            branches=tuple(entry.get("branches", ())),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """A graph with its signature: the hub between all readers and all writers.
+
+    ``feeds`` maps an input's canonical name to the Placeholder that takes it, ``fetches`` an output's canonical name
+    to the tensor that gives it. After the naming pass both map names to themselves.
+    """
+
+    name: str
+    graph: Graph
+    signature: PolicySignature
+    feeds: Mapping[str, str]
+    fetches: Mapping[str, str]
+    source: SourceMap = field(default_factory=SourceMap)
