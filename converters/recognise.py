@@ -179,7 +179,7 @@ def _text_key(data: bytes, head: bytes) -> str | None:
     if any(ord(c) < 9 or 13 < ord(c) < 27 for c in text):
         return None
     start = text.lstrip()
-    if start.startswith("node {") or start.startswith("node{"):
+    if start.startswith(("node {", "node{")):
         return "text_graph"
     if start.startswith(("model_checkpoint_path:", "all_model_checkpoint_paths:")):
         return "checkpoint"

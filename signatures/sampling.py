@@ -111,7 +111,7 @@ def _statistics(spec: TensorSpec) -> tuple[np.ndarray, np.ndarray]:
 
 def _typical(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     mean, std = _statistics(spec)
-    return mean + std * rng.standard_normal(shape)
+    return np.asarray(mean + std * rng.standard_normal(shape))
 
 
 def _zeros(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
@@ -120,16 +120,16 @@ def _zeros(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -
 
 def _clip_edges(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     mean, std = _statistics(spec)
-    return mean + 5 * std * rng.choice([-1.0, 1.0], shape)
+    return np.asarray(mean + 5 * std * rng.choice([-1.0, 1.0], shape))
 
 
 def _beyond(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     mean, std = _statistics(spec)
-    return mean + 8 * std * rng.choice([-1.0, 1.0], shape)
+    return np.asarray(mean + 8 * std * rng.choice([-1.0, 1.0], shape))
 
 
 def _large(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    return 1e3 * rng.choice([-1.0, 1.0], shape)
+    return np.asarray(1e3 * rng.choice([-1.0, 1.0], shape))
 
 
 def _all_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
@@ -143,4 +143,4 @@ def _one_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) 
 
 def _random_masks(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
     drawn = (rng.random((batch, sum(branches))) < 0.5).astype(float)
-    return np.maximum(drawn, _one_allowed(rng, batch, branches))
+    return np.asarray(np.maximum(drawn, _one_allowed(rng, batch, branches)))

@@ -155,10 +155,12 @@ def _named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
 class SourceMap:
     """How to run the source itself: which of its tensors stand for the policy's inputs and outputs.
 
-    ``fixed`` are placeholders that the policy no longer has, with the value they take; ``batch_sizes`` are
-    placeholders that take the number of rows, with their rank (0, or 1 for a vector of one). ``noise`` are the tensors that carry N(0, 1) draws, with their shapes;
-    one that is not among ``feeds`` is fed zeros, or left to draw if ``noise_kept``. ``branches`` are the tensors that
-    the draws of a sampled action are made from, in branch order (None where the source cannot be asked for one).
+    - ``fixed``: placeholders that the policy no longer has, with the value they take.
+    - ``batch_sizes``: placeholders that take the number of rows, with their rank (0, or 1 for a vector of one).
+    - ``noise``: tensors that carry N(0, 1) draws, with their shapes; one that is not among ``feeds`` is fed zeros, or
+      left to draw if ``noise_kept``.
+    - ``branches``: the tensors that the draws of a sampled action are made from, in branch order (None where the
+      source cannot be asked for one).
     """
 
     feeds: Mapping[str, str] = field(default_factory=dict)

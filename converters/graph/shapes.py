@@ -119,7 +119,7 @@ def _symbolic(
         a, b = np.broadcast_arrays(values[0].astype(object), values[1].astype(object))
         cells = np.empty(a.shape, object)
         for index in np.ndindex(a.shape):
-            cells[index] = product((a[index], b[index]), symbols)
+            cells[index] = product((a.item(*index), b.item(*index)), symbols)
         return [TensorType(args[0].dtype, shape, _plain(cells, args[0].dtype))]
     if node.op == "Prod" and results[0].shape in ((), (1,)):
         total = np.empty(() if results[0].shape == () else (1,), object)

@@ -32,9 +32,10 @@ def claim_stdout() -> BinaryIO:
     return stream
 
 
-def serve(runtime: str, version: str, load: Loader, faults: tuple[type[BaseException], ...], out: BinaryIO) -> None:
+def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception], ...], out: BinaryIO) -> None:
     """Answer requests until stdin ends. ``faults`` are what the runtime raises on bad models and inputs."""
     models: dict[str, Model] = {}
+    caught: tuple[type[Exception], ...] = (*faults, KeyError, ValueError, TypeError, OSError)
     source = sys.stdin.buffer
     while True:
         try:
@@ -55,5 +56,5 @@ def serve(runtime: str, version: str, load: Loader, faults: tuple[type[BaseExcep
                 write_frame(out, {"ok": True})
             else:
                 write_frame(out, {"ok": False, "error": f"unknown command {command!r}"})
-        except (*faults, KeyError, ValueError, TypeError, OSError) as error:
+        except caught as error:
             write_frame(out, {"ok": False, "error": f"{type(error).__name__}: {error}"})

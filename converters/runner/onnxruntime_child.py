@@ -21,8 +21,8 @@ class _Model:
 def main() -> None:
     """Entry of the child process."""
     out = claim_stdout()
-    import onnxruntime
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
+    import onnxruntime  # noqa: TID251  this is the child process
+    from onnxruntime.capi import onnxruntime_pybind11_state as state  # noqa: TID251
 
     def load(header: Mapping[str, Any]) -> _Model:
         options = onnxruntime.SessionOptions()

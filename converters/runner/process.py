@@ -18,7 +18,7 @@ from signatures.errors import ExportModelError, RuntimeUnavailableError
 TIMEOUT = 300.0
 
 
-class RunFailed(ExportModelError):
+class RunFailedError(ExportModelError):
     """A runtime refused a model or failed while running it. This is what verification reports, not a crash of it."""
 
     exit_status = 1
@@ -42,7 +42,7 @@ class RuntimeProcess:
         """
         if self._process is not None and self.version is not None:
             return self.version
-        self._errors = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
         try:
             self._process = subprocess.Popen(
                 self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
@@ -53,7 +53,7 @@ class RuntimeProcess:
             ) from error
         try:
             answer, _ = self.request({"cmd": "hello"})
-        except RunFailed as error:
+        except RunFailedError as error:
             raise RuntimeUnavailableError(
                 f"the runtime {self.name} did not start",
                 why=error.why or error.what,
@@ -63,7 +63,7 @@ class RuntimeProcess:
         return self.version
 
     def load(self, path: str, **options: Any) -> LoadedModel:
-        """Load a model; raises RunFailed with the runtime's own message."""
+        """Load a model; raises RunFailedError with the runtime's own message."""
         self.start()
         self._loaded += 1
         identity = f"m{self._loaded}"
@@ -73,10 +73,13 @@ class RuntimeProcess:
     def request(
         self, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None
     ) -> tuple[dict[str, Any], Tensors]:
-        """Send a frame and wait for the answer; raises RunFailed where it is an error, the process died, or hangs."""
+        """Send a frame and wait for the answer.
+
+        Raises RunFailedError where the answer is an error, the process died, or hangs.
+        """
         process = self._process
         if process is None or process.stdin is None or process.stdout is None:
-            raise RunFailed(f"{self.name} is not running")
+            raise RunFailedError(f"{self.name} is not running")
         watchdog = threading.Timer(TIMEOUT, process.kill)
         watchdog.start()
         try:
@@ -86,7 +89,7 @@ class RuntimeProcess:
             status = process.poll() if process.poll() is not None else process.wait(5)
             said = self._last_errors()
             self.close()
-            raise RunFailed(
+            raise RunFailedError(
                 f"{self.name} ended while it was working (status {status})",
                 why=said or "it printed nothing",
                 fix="a native runtime aborts on some malformed graphs; the model is not safe to use there",
@@ -96,7 +99,7 @@ class RuntimeProcess:
         if answer.get("broken"):  # a WebAssembly trap: the heap is not to be trusted any more
             self.close()
         if not answer.get("ok"):
-            raise RunFailed(f"{self.name} failed", why=str(answer.get("error", "no message")))
+            raise RunFailedError(f"{self.name} failed", why=str(answer.get("error", "no message")))
         return answer, results
 
     def _last_errors(self) -> str:
@@ -142,7 +145,7 @@ class LoadedModel:
         self._identity = identity
 
     def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
-        """The outputs in ``fetch`` by name; raises RunFailed."""
+        """The outputs in ``fetch`` by name; raises RunFailedError."""
         return self._run({"fetch": list(fetch)}, feeds, fetch)
 
     def predict(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str]) -> Tensors:
@@ -153,7 +156,7 @@ class LoadedModel:
         _, results = self._process.request({"cmd": "run", "id": self._identity, **header}, dict(feeds))
         missing = [name for name in fetch if name not in results]
         if missing:
-            raise RunFailed(f"{self._process.name} gave no output {missing[0]!r}")
+            raise RunFailedError(f"{self._process.name} gave no output {missing[0]!r}")
         return results
 
     def unload(self) -> None:

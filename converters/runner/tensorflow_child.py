@@ -19,7 +19,7 @@ def main() -> None:
     out = claim_stdout()
     # Before the import: no log lines, no oneDNN (it changes rounding), one thread, no search for a GPU.
     os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISIBLE_DEVICES="-1")
-    import tensorflow as tf
+    import tensorflow as tf  # noqa: TID251  this is the child process
 
     tf.config.threading.set_intra_op_parallelism_threads(1)
     tf.config.threading.set_inter_op_parallelism_threads(1)

@@ -1,6 +1,7 @@
 """What TensorFlow.js computes differently, put into ops that it computes right (measured on 4.22, cpu and wasm).
 
-- OneHot: only the last axis, no depth of 1, and on wasm only int32 values (float ones come out as bit patterns): int32, then Cast.
+- OneHot: only the last axis, no depth of 1, and on wasm only int32 values (float ones come out as bit patterns): int32,
+  then Cast.
 - Select (TF 1) with a vector condition: broadcasts over the last axis instead of the first. SelectV2 of a reshaped
   condition.
 - A seed other than 0 on a sampler makes *every* run draw the same numbers.

@@ -99,4 +99,4 @@ class Original:
 def _log_softmax(logits: np.ndarray) -> np.ndarray:
     wide = logits.astype(np.float64)
     shifted = wide - wide.max(axis=-1, keepdims=True)
-    return (shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))).astype(np.float32)
+    return np.asarray(shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))).astype(np.float32)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.graph.ops.chance import SAMPLERS
-from converters.runner.process import LoadedModel, RunFailed
+from converters.runner.process import LoadedModel, RunFailedError
 from exporter.parity.compare import Difference, compare, ties
 from exporter.parity.original import Original
 from exporter.parity.pool import INDEPENDENT, RUNTIMES_OF, RuntimePool
@@ -111,7 +111,7 @@ class _Verification:
         try:
             self.expected = [self._answers(reference, original, case.feeds) for case in self.cases]
             self.expected_steps = self._roll(lambda feeds: self._answers(reference, original, feeds))
-        except RunFailed as error:
+        except RunFailedError as error:
             source = "source" if original is not None else "bytes"
             self._failure(source, "tensorflow" if original is not None else "numpy", error)
             return self._finished("source/tensorflow" if original is not None else "numpy")
@@ -132,7 +132,7 @@ class _Verification:
         if self.subject.source is not None and "tensorflow" in self.runtimes:
             try:
                 model = self.pool.process("tensorflow").load(str(self.subject.source), kind="graph")
-            except RunFailed as error:
+            except RunFailedError as error:
                 self._failure("source", "tensorflow", error)
             else:
                 self.unloads.append(model)
@@ -165,7 +165,7 @@ class _Verification:
                             {"kind": "saved_model", "signature": key} if kind == "saved_model" else {"kind": "graph"}
                         )
                         model = process.load(str(path), **shape)
-                    except RunFailed as error:
+                    except RunFailedError as error:
                         self._failure(label, runtime, error)
                         continue
                     run = _limited(model.run, self.subject.signatures.get(key))
@@ -181,7 +181,7 @@ class _Verification:
             self._numbers(entrant)
             self._rollout(entrant)
             self._draws(entrant)
-        except RunFailed as error:
+        except RunFailedError as error:
             self._failure(entrant.format, entrant.runtime, error)
 
     def _tolerance(self, output: str) -> Tolerance:
@@ -342,7 +342,7 @@ class _Verification:
             )
         )
 
-    def _failure(self, kind: str, runtime: str, error: RunFailed) -> None:
+    def _failure(self, kind: str, runtime: str, error: RunFailedError) -> None:
         text = error.what if error.why is None else f"{error.what}: {error.why}"
         self.results.append(
             Comparison(

@@ -118,9 +118,12 @@ def _infer_reshape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
     source = args[0].shape
     if -1 in target:
         target[target.index(-1)] = _open_length(node, args, source, target, symbols)
-    elif source is not None and all(isinstance(d, int) for d in (*source, *target)):
-        if product(source, symbols) != product(target, symbols):
-            raise shape_error(node, args, f"{list(source)} does not reshape to {target}")
+    elif (
+        source is not None
+        and all(isinstance(d, int) for d in (*source, *target))
+        and product(source, symbols) != product(target, symbols)
+    ):
+        raise shape_error(node, args, f"{list(source)} does not reshape to {target}")
     value = args[0].value
     if value is not None and all(isinstance(d, int) for d in target):
         value = value.reshape([int(d) for d in target])
@@ -568,7 +571,7 @@ def _lower_tile(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _range(node: Node, start: np.ndarray, limit: np.ndarray, delta: np.ndarray) -> np.ndarray:
-    return np.arange(start.item(), limit.item(), delta.item(), start.dtype)
+    return np.asarray(np.arange(start.item(), limit.item(), delta.item())).astype(start.dtype)
 
 
 def _infer_range(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:

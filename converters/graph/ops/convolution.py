@@ -17,6 +17,7 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
+from converters.graph.ops.linear import activation
 from converters.graph.types import Dim, Symbols, TensorType
 from signatures.graph import Node
 
@@ -65,9 +66,7 @@ def _conv2d(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def _fused_conv2d(node: Node, x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    from converters.graph.ops.linear import activation
-
-    result = _conv2d(node, x, kernel) + bias
+    result = np.asarray(_conv2d(node, x, kernel) + bias)
     for name in node.attrs["fused_ops"][1:]:
         result = activation(name, result)
     return result
@@ -77,7 +76,7 @@ def _depthwise(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     patches = _patches(node, x, kernel.shape[:2], 0.0).astype(np.float64)
     with np.errstate(all="ignore"):
         result = np.einsum("bhwijc,ijcm->bhwcm", patches, kernel.astype(np.float64))
-    return result.reshape(*result.shape[:3], -1).astype(x.dtype)
+    return np.asarray(result.reshape(*result.shape[:3], -1)).astype(x.dtype)
 
 
 def _window_of(node: Node, args: Sequence[TensorType]) -> tuple[tuple[Dim, ...], tuple[int, int], Dim]:

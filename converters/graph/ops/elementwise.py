@@ -52,7 +52,12 @@ def _plain(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return np.where(x >= 0, 1 / (1 + np.exp(-np.abs(x))), np.exp(-np.abs(x)) / (1 + np.exp(-np.abs(x))))
+    small = np.exp(-np.abs(x))
+    return np.asarray(np.where(x >= 0, 1.0, small) / (1 + small))
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
 
 
 _SELU_ALPHA, _SELU_SCALE = 1.6732632423543772, 1.0507009873554805
@@ -134,7 +139,7 @@ def _leaky_relu(node: Node, x: np.ndarray) -> np.ndarray:
 
 def _cast(node: Node, x: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
-        return x.astype(node.attrs["DstT"])
+        return np.asarray(x.astype(node.attrs["DstT"]))
 
 
 def _infer_cast(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
@@ -212,7 +217,7 @@ UNARY = (
     _unary("Log", _wide(np.log), "Log"),
     _unary("Log1p", _wide(np.log1p), _chain(("Add", 1.0), ("Log", None))),
     _unary("Sqrt", _wide(np.sqrt), "Sqrt"),
-    _unary("Rsqrt", _wide(lambda x: 1 / np.sqrt(x)), _chain(("Sqrt", None), ("Reciprocal", None))),
+    _unary("Rsqrt", _wide(lambda x: np.asarray(1 / np.sqrt(x))), _chain(("Sqrt", None), ("Reciprocal", None))),
     _unary("Sin", _wide(np.sin), "Sin"),
     _unary("Cos", _wide(np.cos), "Cos"),
     _unary("Tan", _wide(np.tan), "Tan"),
@@ -221,7 +226,7 @@ UNARY = (
     _unary("Tanh", _wide(np.tanh), "Tanh"),
     _unary("Relu", _plain(lambda x: np.maximum(x, x.dtype.type(0))), "Relu"),
     _unary("Relu6", _plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))), _chain(("Max", 0.0), ("Min", 6.0))),
-    _unary("Elu", _wide(lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0)))), "Elu"),
+    _unary("Elu", _wide(_elu), "Elu"),
     _unary(
         "Selu",
         _wide(lambda x: _SELU_SCALE * np.where(x > 0, x, _SELU_ALPHA * np.expm1(np.minimum(x, 0)))),

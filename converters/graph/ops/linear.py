@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.ops import elementwise
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -81,9 +82,7 @@ def _lower_bias_add(node: Node, builder: OnnxBuilder) -> Any:
 
 def activation(name: str, x: np.ndarray) -> np.ndarray:
     """The activations that fused ops may carry."""
-    from converters.graph.ops.elementwise import OPS as elementwise
-
-    kernel = next(op.kernel for op in elementwise if op.name == name)
+    kernel = next(op.kernel for op in elementwise.OPS if op.name == name)
     assert kernel is not None
     return np.asarray(kernel(Node(name, name), x))
 

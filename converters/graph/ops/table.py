@@ -12,12 +12,21 @@ from signatures.graph import Node
 
 #: While loops, conditionals and tensor arrays: the straighten pass removes them, so they have no entry.
 CONTROL_FLOW = frozenset(
-    ["Enter", "Exit", "Merge", "Switch", "LoopCond", "NextIteration", "TensorArrayV3", "TensorArrayScatterV3", "TensorArrayGatherV3", "TensorArrayReadV3", "TensorArrayWriteV3", "TensorArraySizeV3", "RefEnter", "RefExit", "RefMerge", "RefSwitch", "RefNextIteration"]
+    (
+        *("Enter", "Exit", "Merge", "Switch", "LoopCond", "NextIteration"),
+        *("RefEnter", "RefExit", "RefMerge", "RefSwitch", "RefNextIteration"),
+        *("TensorArrayV3", "TensorArrayScatterV3", "TensorArrayGatherV3"),
+        *("TensorArrayReadV3", "TensorArrayWriteV3", "TensorArraySizeV3"),
+    )
 )
 
 #: Ops that reach outside the graph. A model file is untrusted input: these are refused by name.
 FORBIDDEN = frozenset(
-    ["ReadFile", "WriteFile", "MatchingFiles", "PyFunc", "PyFuncStateless", "EagerPyFunc", "ReaderReadV2", "WholeFileReaderV2", "TextLineReaderV2", "SaveV2", "RestoreV2", "Save", "Restore", "LoadLibrary", "Print", "PrintV2", "Assert", "DebugIdentity", "RemoteCall", "SymbolicGradient"]
+    (
+        *("ReadFile", "WriteFile", "MatchingFiles", "SaveV2", "RestoreV2", "Save", "Restore", "LoadLibrary"),
+        *("PyFunc", "PyFuncStateless", "EagerPyFunc", "RemoteCall", "SymbolicGradient"),
+        *("ReaderReadV2", "WholeFileReaderV2", "TextLineReaderV2", "Print", "PrintV2", "Assert", "DebugIdentity"),
+    )
 )
 
 

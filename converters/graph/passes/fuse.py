@@ -30,15 +30,15 @@ def fuse(graph: Graph, roots: Iterable[str], activations: Iterable[str]) -> Grap
         bias = consumers[node.name][0]
         if bias.op != "BiasAdd" or node_of(bias.inputs[0]) != node.name or graph.constant(bias.inputs[1]) is None:
             continue
-        last, names = bias, ("BiasAdd",)
+        last, names = bias, ["BiasAdd"]
         readers = consumers[bias.name]
         if bias.name not in outputs and len(readers) == 1 and readers[0].op in allowed:
-            last, names = readers[0], ("BiasAdd", readers[0].op)
+            last, names = readers[0], ["BiasAdd", readers[0].op]
         replaced[last.name] = Node(
             last.name,
             _FUSED[node.op],
             (*node.inputs, bias.inputs[1]),
-            {**node.attrs, "num_args": 1, "fused_ops": names, "epsilon": 0.0001},
+            {**node.attrs, "num_args": 1, "fused_ops": tuple(names), "epsilon": 0.0001},
             origin=last.origin,
         )
         swallowed |= {node.name, bias.name} - {last.name}

@@ -12,6 +12,7 @@ UnsupportedOpError where a predicate is not constant or a loop runs for more tha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class _Flow:
         return dict(self.items)[index]
 
 
-class _Dead(Exception):
+class _DeadError(Exception):
     """A tensor on the branch that is not taken."""
 
 
@@ -64,7 +65,7 @@ class _Unroller:
                 continue  # loop bodies are made on demand, once per turn
             try:
                 self.tensor(node.name, None)
-            except _Dead:
+            except _DeadError:
                 continue
         return self.editor.graph()
 
@@ -98,7 +99,7 @@ class _Unroller:
     def _copy(self, node: Node, turn: int | None) -> str | None:
         try:
             inputs = tuple(self.plain(r, turn) for r in node.inputs)
-        except _Dead:
+        except _DeadError:
             return None
         name = node.name if not turn else self.editor.add_name(f"{node.name}/turn_{turn}")
         copy = Node(name, node.op, inputs, node.attrs, node.value, node.origin)
@@ -109,7 +110,7 @@ class _Unroller:
     def _control(self, node: Node, index: int, turn: int | None) -> str | _Flow | None:
         try:
             return getattr(self, "_" + _METHODS[node.op])(node, index, turn)  # type: ignore[no-any-return]
-        except _Dead:
+        except _DeadError:
             return None
 
     # ---- loops and branches
@@ -126,9 +127,9 @@ class _Unroller:
         for reference in node.inputs:
             try:
                 return self.tensor(reference, turn)
-            except _Dead:
+            except _DeadError:
                 continue
-        raise _Dead
+        raise _DeadError
 
     def _switch(self, node: Node, index: int, turn: int | None) -> str | _Flow:
         if self.graph.producer(node.inputs[1]).op == "LoopCond":
@@ -137,7 +138,7 @@ class _Unroller:
         if predicate is None:
             raise _undecided(node, "the condition of a branch")
         if bool(predicate) != bool(index):
-            raise _Dead
+            raise _DeadError
         return self.tensor(node.inputs[0], turn)
 
     def _exit(self, node: Node, index: int, turn: int | None) -> str | _Flow:
@@ -220,7 +221,7 @@ class _Unroller:
 
     # ---- new nodes
 
-    def _add(self, op: str, inputs: list[str], name: str, **attrs: object) -> str:
+    def _add(self, op: str, inputs: list[str], name: str, **attrs: Any) -> str:
         made = self.editor.add(op, inputs, name, **attrs)
         self.made[made] = self.editor.nodes[-1]
         return made
@@ -264,7 +265,7 @@ _METHODS = {
 
 def _alive(value: str | _Flow | None) -> str | _Flow:
     if value is None:
-        raise _Dead
+        raise _DeadError
     return value
 
 
