@@ -1,0 +1,57 @@
+"""Every public and genuine frozen graph: four formats, four runtimes beside numpy, all agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from exporter.parity.pool import RuntimePool
+from exporter.pipeline import ExportOptions, export
+from exporter.summary import failure_lines
+from signatures.errors import NotAPolicyError
+from tests.corpus.conftest import NEEDED, SHARED, frozen_corpus, genuine_cases
+
+pytestmark = [pytest.mark.corpus, pytest.mark.slow]
+
+SOURCES = [
+    *(pytest.param(p, id=f"corpus-{p.name[:70]}") for p in frozen_corpus()),
+    *(pytest.param(f / c["frozen"]["file"], id=f"genuine-{f.name}") for f, c in genuine_cases()),
+] or [pytest.param(Path("absent"), id="shared-is-absent")]
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_exports_to_four_formats_that_agree(source: Path, tmp_path: Path, pool: RuntimePool) -> None:
+    results = list(export([source], ExportOptions(tmp_path), pool=pool))
+    assert results
+    for result in results:
+        assert result.report is not None
+        assert result.report.passed is True, "\n".join(failure_lines(result.report))
+        assert result.report.reference == "source/tensorflow"
+        ran = {c.runtime for c in result.report.comparisons}
+        assert ran == {"numpy", *NEEDED}
+        formats = {c.format for c in result.report.comparisons}
+        assert formats >= {"bytes", "saved_model", "tfjs", "onnx"}
+        assert {p.name for p in result.folder.iterdir()} == {
+            f"{result.policy.name}.bytes",
+            f"{result.policy.name}.onnx",
+            "saved_model",
+            "tfjs",
+            "policy.json",
+            "parity.json",
+        }
+
+
+def test_a_nn_in_a_bytes_file_is_named_for_what_it_is(tmp_path: Path) -> None:
+    source = SHARED / "corpus/bytes/zeroblitz36+ml-agents__3DBallLearning.bytes"
+    if not source.is_file():
+        pytest.skip("that file is not in ../shared")
+    with pytest.raises(NotAPolicyError, match=r"Barracuda \.nn"):
+        list(export([source], ExportOptions(tmp_path, verify="none")))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_corpus_is_whole() -> None:
+    """38 public and 87 genuine frozen graphs, so that nothing falls out of the tests unseen."""
+    assert len(frozen_corpus()) == 38
+    assert len(genuine_cases()) == 87
