@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import json
+import stat
 import struct
 import zipfile
 from dataclasses import dataclass
@@ -11,6 +13,8 @@ from pathlib import Path
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 _HEAD = 4096
+#: Protobuf's own limit; no policy comes near it.
+MAX_BYTES = (2 << 30) - 1
 _TABLE_MAGIC = struct.pack("<Q", 0xDB4775248B80FB57)
 
 
@@ -88,11 +92,20 @@ KINDS = {
 
 def read_bytes(path: Path) -> bytes:
     """The file's bytes; SourceError when it is missing, a folder or unreadable, DamagedFileError when empty."""
-    if path.is_dir():
-        raise SourceError(
-            "is a folder", where=str(path), why="a single model file is expected", fix=_folder_advice(path)
-        )
     try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise SourceError(
+                "is a folder", where=str(path), why="a single model file is expected", fix=_folder_advice(path)
+            )
+        if not stat.S_ISREG(status.st_mode):
+            raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
+        if status.st_size > MAX_BYTES:
+            raise SourceError(
+                f"has {status.st_size} bytes, and no model of 2 GiB or more is read",
+                where=str(path),
+                fix="give the frozen graph of the policy; it has some hundred kilobytes",
+            )
         data = path.read_bytes()
     except FileNotFoundError as error:
         raise SourceError("no such file", where=str(path), fix=_neighbours(path)) from error
@@ -100,6 +113,8 @@ def read_bytes(path: Path) -> bytes:
         raise SourceError(
             "cannot be read", where=str(path), why=error.strerror, fix="check the path and its permissions"
         ) from error
+    except ValueError as error:  # a null character in the path
+        raise SourceError("is no path", where=repr(str(path)), why=str(error), fix="check the path") from error
     if not data:
         raise DamagedFileError("the file is empty", where=str(path), fix="copy or download it again")
     return data
@@ -116,12 +131,12 @@ def _folder_advice(path: Path) -> str:
 def _neighbours(path: Path) -> str:
     import difflib
 
-    if path.parent.is_dir():
-        names = [p.name for p in sorted(path.parent.iterdir())]
-        close = difflib.get_close_matches(path.name, names, n=1)
-        if close:
-            return f"did you mean {path.parent / close[0]}?"
-    return "check the path"
+    try:
+        names = sorted(p.name for p in path.parent.iterdir())
+    except OSError:  # there is no such folder, or it may not be listed
+        names = []
+    close = difflib.get_close_matches(path.name, names, n=1)
+    return f"did you mean {path.parent / close[0]}?" if close else "check the path"
 
 
 def recognise(data: bytes, name: str = "") -> FileKind:
@@ -162,7 +177,7 @@ def _zip_key(data: bytes) -> str:
 
     try:
         names = zipfile.ZipFile(io.BytesIO(data)).namelist()
-    except zipfile.BadZipFile:
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, struct.error):  # a damaged one
         return "zip"
     if any(n.endswith("data.pkl") for n in names):
         return "torch"
@@ -173,7 +188,7 @@ def _zip_key(data: bytes) -> str:
 
 def _text_key(data: bytes, head: bytes) -> str | None:
     try:
-        text = head.decode("utf-8")
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)  # the head may end inside a character
     except UnicodeDecodeError:
         return None
     if any(ord(c) < 9 or 13 < ord(c) < 27 for c in text):
@@ -188,7 +203,7 @@ def _text_key(data: bytes, head: bytes) -> str | None:
     if start.startswith("{"):
         try:
             return "tfjs" if "modelTopology" in json.loads(data) else "json"
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, RecursionError):
             return "text"
     return "text"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from converters.graph.compile import CompileOptions
+from converters.graph.options import CompileOptions
 from converters.graph.passes.noise import NoiseMode
 from converters.registry import TARGETS
 from exporter.inspection import Inspection, inspect_source

@@ -14,7 +14,7 @@ from exporter.version import __version__
 from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
-    from converters.graph.compile import CompileOptions
+    from converters.graph.options import CompileOptions
     from exporter.parity.report import ParityReport
     from exporter.parity.verify import VerifyOptions
     from exporter.pipeline import ExportResult

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.artifact import WriteOptions
-from converters.graph.compile import CompileOptions
+from converters.graph.options import CompileOptions
 from converters.registry import TARGETS, writer
 from exporter.bundle import safe_name
 from exporter.sources import read_source

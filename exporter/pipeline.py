@@ -13,7 +13,8 @@ from typing import Any
 from converters.artifact import Artifact, WriteOptions
 from converters.frozen_graph.reader import read_graph
 from converters.frozen_graph.writer import write as write_frozen
-from converters.graph.compile import CONTRACT_NODE, CompileOptions
+from converters.graph.compile import CONTRACT_NODE
+from converters.graph.options import CompileOptions
 from converters.registry import TARGETS, writer
 from converters.saved_model.writer import signatures_of
 from exporter import bundle

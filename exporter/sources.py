@@ -3,15 +3,41 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from converters.frozen_graph.reader import read_graph
-from converters.graph.compile import CompileOptions, compile_graph
+from converters.graph.compile import compile_graph
+from converters.graph.options import CompileOptions
 from converters.recognise import FROZEN_GRAPH, FileKind, not_readable, read_bytes, recognise
-from signatures.errors import ExportModelError
+from signatures.errors import ExportModelError, GraphError
 from signatures.graph import Graph
 from signatures.spec import Policy
+
+
+#: What Python and numpy raise where a damaged graph breaks something that a pass takes for granted.
+_BROKEN = (
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError),
+    *(MemoryError, RecursionError),
+)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors inside name the file. A model file is untrusted: an error that nobody foresaw is one of them, too."""
+    try:
+        yield
+    except ExportModelError as error:
+        raise error.at(str(path)) from error.__cause__
+    except _BROKEN as error:
+        raise GraphError(
+            "the graph cannot be understood",
+            where=str(path),
+            why=f"a step failed on something it did not expect ({type(error).__name__}: {error})",
+            fix="if TensorFlow loads this file, please open an issue with it; else freeze the graph again",
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -33,10 +59,8 @@ class Source:
 
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
         """The policies in it; raises ExportModelError that names the file."""
-        try:
+        with naming(self.path):
             return compile_graph(self.graph, self.stem, options)
-        except ExportModelError as error:
-            raise error.at(str(self.path)) from error
 
 
 def read_source(path: Path | str) -> Source:
@@ -46,8 +70,6 @@ def read_source(path: Path | str) -> Source:
     kind = recognise(data, path.name)
     if kind.key != FROZEN_GRAPH.key:
         raise not_readable(kind, path)
-    try:
+    with naming(path):
         graph = read_graph(data)
-    except ExportModelError as error:
-        raise error.at(str(path)) from error
     return Source(path, kind, hashlib.sha256(data).hexdigest(), len(data), graph)

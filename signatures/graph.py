@@ -31,7 +31,8 @@ class Node:
 
     ``attrs`` hold what changes the result (strides, axis, ``DstT``); dtypes that follow from the inputs (``T``) are
     not kept, the writers derive them. ``value`` is the array of a ``Const``. ``origin`` is the tensor of the source
-    that output 0 stands for (``"dense/BiasAdd:0"``); it survives renaming, so reports can point at the source.
+    that output 0 stands for (``"dense/BiasAdd:0"``, a tuple where several were joined); it survives renaming, so that
+    reports can point at the source.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Node:
     inputs: tuple[str, ...] = ()
     attrs: Mapping[str, AttrValue] = field(default_factory=dict)
     value: np.ndarray | None = None
-    origin: str | None = None
+    origin: str | tuple[str, ...] | None = None
 
     def with_inputs(self, inputs: Iterable[str]) -> Node:
         """The same node fed from other tensors."""
@@ -54,7 +55,7 @@ def ref(name: str, index: int = 0) -> str:
 def split_ref(reference: str) -> tuple[str, int]:
     """(node name, output index) of a reference; ``"a:0"`` and ``"a"`` are the same tensor."""
     name, colon, index = reference.rpartition(":")
-    if colon and index.isdigit():
+    if colon and index.isascii() and index.isdigit() and len(index) < 10:
         return name, int(index)
     return reference, 0
 
@@ -77,16 +78,7 @@ class Graph:
     _index: dict[str, Node] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        index: dict[str, Node] = {}
-        for node in self.nodes:
-            if node.name in index:
-                raise GraphError(
-                    f"two nodes are called {node.name!r}",
-                    why="names must be unique in a graph",
-                    fix="export the graph again; this file breaks TensorFlow's own rules",
-                )
-            index[node.name] = node
-        object.__setattr__(self, "_index", index)
+        object.__setattr__(self, "_index", by_name(self.nodes))
 
     def __contains__(self, name: str) -> bool:
         return name in self._index
@@ -105,7 +97,7 @@ class Graph:
     def constant(self, reference: str) -> np.ndarray | None:
         """The array behind ``reference`` if it is a Const, possibly through Identity; else None."""
         node = self.producer(reference)
-        while node.op == "Identity":
+        while node.op == "Identity" and node.inputs:
             node = self.producer(node.inputs[0])
         return node.value if node.op == "Const" else None
 
@@ -136,6 +128,20 @@ class Graph:
         return Graph(tuple(n for n in self.nodes if n.name in keep))
 
 
+def by_name(nodes: Iterable[Node]) -> dict[str, Node]:
+    """Name → node; raises GraphError when two nodes have the same name."""
+    index: dict[str, Node] = {}
+    for node in nodes:
+        if node.name in index:
+            raise GraphError(
+                f"two nodes are called {node.name!r}",
+                why="names must be unique in a graph",
+                fix="export the graph again; this file breaks TensorFlow's own rules",
+            )
+        index[node.name] = node
+    return index
+
+
 def checked_inputs(nodes: Sequence[Node]) -> None:
     """Raise GraphError when a node reads a tensor whose node does not exist."""
     names = {node.name for node in nodes}
@@ -152,11 +158,11 @@ def checked_inputs(nodes: Sequence[Node]) -> None:
 def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
     """``nodes`` ordered so that inputs come first, otherwise in the given order.
 
-    The edge NextIteration → Merge closes a while loop and does not count. Raises GraphError on any other cycle and
-    on dangling inputs.
+    The edge NextIteration → Merge closes a while loop and does not count. Raises GraphError on any other cycle, on
+    dangling inputs and on a name that stands twice.
     """
     checked_inputs(nodes)
-    index = {node.name: node for node in nodes}
+    index = by_name(nodes)
     state: dict[str, int] = {}  # 1 = being visited, 2 = done
     ordered: list[Node] = []
     for root in nodes:

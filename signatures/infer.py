@@ -15,6 +15,7 @@ import numpy as np
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.graph import Graph, Node, TensorShape, node_of, normal_ref, split_ref
 from signatures.roles import (
+    ACTION_NAMES,
     CONSTANT_NAMES,
     INPUT_PATTERNS,
     INPUT_ROLES,
@@ -25,10 +26,45 @@ from signatures.roles import (
 )
 
 _PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
+_MAX_LEAVES = 1024
 #: Ops that pass a value on without changing its numbers.
 TRANSPARENT = frozenset(
     ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics", "Reshape", "Squeeze", "ExpandDims")
 )
+
+
+@dataclass(frozen=True)
+class SourceFacts:
+    """What a reader knows of a source beside its graph.
+
+    - ``roles``: placeholders whose role the format says (it goes before names and structure).
+    - ``family``, ``algorithm``: where the format tells; else the graph is asked.
+    - ``image_layout``: NHWC, or NCHW for torch exports.
+    - ``memory_layout``: the memory's parts in order; empty: found from the graph.
+    - ``constants``: the ones that are no nodes of the graph.
+    - ``notes``: what the user should know of this source.
+    """
+
+    roles: Mapping[str, Role] = field(default_factory=dict)
+    family: str | None = None
+    algorithm: str | None = None
+    image_layout: str = "NHWC"
+    memory_layout: tuple[str, ...] = ()
+    constants: Mapping[str, int | float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """One action of a policy: its name in the source, and its canonical name (hybrid policies have two)."""
+
+    base: str
+    name: str
+
+    @property
+    def deterministic(self) -> str:
+        """The name of the same action without chance."""
+        return f"deterministic_{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +80,30 @@ class Brain:
     def label(self) -> str:
         """The scope without its slash."""
         return self.scope.rstrip("/")
+
+    @property
+    def heads(self) -> tuple[Head, ...]:
+        """The actions. Beside ``action``, outputs called by kind are duplicates; two kinds without it are a hybrid."""
+        bases = [base for base, role, _ in self.outputs if role is Role.ACTION]
+        if "action" in bases:
+            return (Head("action", "action"),)
+        if {"continuous_actions", "discrete_actions"} <= set(bases):
+            return (Head("continuous_actions", "continuous_actions"), Head("discrete_actions", "discrete_actions"))
+        return (Head(bases[0], "action"),)
+
+    @property
+    def canonical(self) -> dict[str, str]:
+        """Output's name in the source → canonical name; duplicates of the action are left out."""
+        heads = self.heads
+        names = {h.base: h.name for h in heads}
+        for base, role, _ in self.outputs:
+            if role is Role.DETERMINISTIC:
+                own = next((h for h in heads if base == f"deterministic_{h.base}"), None)
+                if own is not None or base == "deterministic_action":
+                    names[base] = heads[0].deterministic if own is None else own.deterministic
+            elif role is not Role.ACTION:
+                names[base] = base
+        return names
 
     @property
     def roots(self) -> tuple[str, ...]:
@@ -66,7 +126,7 @@ def find_brains(graph: Graph, wanted: Mapping[str, Role] | None = None) -> tuple
     scopes: dict[str, int] = {}
     for node in graph.nodes:
         scope, _, base = node.name.rpartition("/")
-        if base == "action" and node.name in fed:
+        if base in ACTION_NAMES and node.name in fed:
             scopes[f"{scope}/" if scope else ""] = node.name.count("/")
     if scopes:
         depth = min(scopes.values())
@@ -79,7 +139,7 @@ def _constants(graph: Graph, scope: str) -> dict[str, int | float]:
     for name in CONSTANT_NAMES:
         node = graph.get(scope + name)
         value = graph.constant(node.name) if node is not None else None
-        if value is not None and value.size == 1 and value.dtype.kind in "iuf":
+        if value is not None and value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all():
             number = value.reshape(()).item()
             found[name] = int(number) if float(number).is_integer() else float(number)
     return found
@@ -156,11 +216,13 @@ def _unnamed(graph: Graph, fed: set[str]) -> Brain:
 # ------------------------------------------------------------------ inputs
 
 
-def classify_inputs(graph: Graph, brain: Brain, wanted: Mapping[str, Role] | None = None) -> dict[str, Role]:
+def classify_inputs(
+    graph: Graph, brain: Brain, wanted: Mapping[str, Role] | None = None, known: Mapping[str, Role] | None = None
+) -> dict[str, Role]:
     """Placeholder name → role, in graph order, for everything upstream of the brain's outputs.
 
-    ``wanted`` comes from ``--input``. A PlaceholderWithDefault that is neither named there nor by ML-Agents is left
-    out: its default is used. Raises SignatureError when no observation can be told.
+    ``wanted`` comes from ``--input``, ``known`` from the reader. A PlaceholderWithDefault that is neither named there
+    nor by ML-Agents is left out: its default is used. Raises SignatureError when no observation can be told.
     """
     upstream = graph.ancestors(brain.roots)
     found = [n for n in graph.nodes if n.op in _PLACEHOLDERS and n.name in upstream]
@@ -169,7 +231,7 @@ def classify_inputs(graph: Graph, brain: Brain, wanted: Mapping[str, Role] | Non
     for node in found:
         base = node.name[len(brain.scope) :] if node.name.startswith(brain.scope) else node.name
         override = next((wanted.pop(k) for k in (node.name, f"{node.name}:0", base) if k in wanted), None)
-        role = override or role_by_name(base, node)
+        role = override or (known or {}).get(node.name) or role_by_name(base, node)
         if role is None and node.op == "PlaceholderWithDefault":
             continue
         roles[node.name] = role or Role.PARAMETER
@@ -331,14 +393,33 @@ def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: boo
 
 
 def _leaves(graph: Graph, reference: str) -> list[str]:
-    """The tensors that are joined along the last axis to make ``reference``, in order."""
-    node = graph.producer(reference)
+    """The tensors that are joined along the last axis to make ``reference``, in order.
+
+    A join of a join of itself doubles with every step; what is made of more than ``_MAX_LEAVES`` is no action with
+    branches, and stands for itself.
+    """
+    leaves: list[str] = []
+    stack = [reference]
+    while stack:
+        if len(leaves) + len(stack) > _MAX_LEAVES:
+            return [reference]
+        tensor = stack.pop()
+        parts = _parts(graph, graph.producer(tensor))
+        if parts:
+            stack.extend(reversed(parts))
+        else:
+            leaves.append(tensor)
+    return leaves
+
+
+def _parts(graph: Graph, node: Node) -> Sequence[str]:
+    """What a node passes on or joins along the last axis; empty where it computes."""
     if node.op in TRANSPARENT or node.op == "Cast":
-        return _leaves(graph, node.inputs[0])
+        return node.inputs[:1]
     if node.op == "ConcatV2":
         axis = graph.constant(node.inputs[-1])
         if axis is not None and int(axis) in (1, -1):
-            return [leaf for part in node.inputs[:-1] for leaf in _leaves(graph, part)]
+            return node.inputs[:-1]
     if node.op == "Pack" and node.attrs.get("axis", 0) in (1, -1):
-        return [leaf for part in node.inputs for leaf in _leaves(graph, part)]
-    return [reference]
+        return node.inputs
+    return ()

@@ -80,16 +80,23 @@ INPUT_PATTERNS: tuple[tuple[re.Pattern[str], Role, tuple[int, ...] | None], ...]
     (re.compile(r"batch_size(_\d+)?"), Role.BATCH_SIZE, (0, 1)),
 )
 
-#: Output node names (scope removed) of the TensorFlow generations.
+#: Output names (scope removed) of the TensorFlow and torch generations.
 OUTPUT_NAMES = {
     "action": Role.ACTION,
+    "continuous_actions": Role.ACTION,
+    "discrete_actions": Role.ACTION,
     "action_probs": Role.ACTION_PROBS,
     "value_estimate": Role.VALUE,
     "recurrent_out": Role.MEMORY_OUT,
     # what this tool writes beside them, so that our own graphs are read back as what they were
     "action_log_probs": Role.LOG_PROBS,
     "deterministic_action": Role.DETERMINISTIC,
+    "deterministic_continuous_actions": Role.DETERMINISTIC,
+    "deterministic_discrete_actions": Role.DETERMINISTIC,
 }
+
+#: What the action is called: alone, or (hybrid policies, torch exports) by its kind.
+ACTION_NAMES = tuple(name for name, role in OUTPUT_NAMES.items() if role is Role.ACTION)
 
 #: Constants that ML-Agents left in its graphs from 0.3 (memory_size) and 0.6 (the others) on.
 CONSTANT_NAMES = (
@@ -100,6 +107,9 @@ CONSTANT_NAMES = (
     "trainer_major_version",
     "trainer_minor_version",
     "trainer_patch_version",
+    # torch, 0.23 on
+    "continuous_action_output_shape",
+    "discrete_action_output_shape",
 )
 
 #: Canonical names; numbered ones get ``_0``, ``_1``… or a suffix from the second on.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.frozen_graph.tensors import to_array
+from converters.frozen_graph.tensors import Allowance, to_array
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.graph import Graph, Node, TensorShape, normal_ref, topological
 
@@ -33,7 +33,8 @@ def from_graph_def(graph_def: Any) -> Graph:
     if not graph_def.node:
         raise NotAPolicyError("the graph has no nodes", fix="give the frozen graph that training wrote")
     calls = {f.signature.name for f in graph_def.library.function}
-    nodes = [_node(n, graph_def.versions.producer) for n in graph_def.node]
+    allowance = Allowance()
+    nodes = [_node(n, graph_def.versions.producer, allowance) for n in graph_def.node]
     for node in nodes:
         if node.op in calls or node.op in ("PartitionedCall", "StatefulPartitionedCall"):
             raise NotAPolicyError(
@@ -44,7 +45,7 @@ def from_graph_def(graph_def: Any) -> Graph:
     return Graph(topological(nodes))
 
 
-def _node(proto: Any, producer: int) -> Node:
+def _node(proto: Any, producer: int, allowance: Allowance) -> Node:
     if not proto.name or not proto.op:
         raise DamagedFileError(
             "a node has no name or no op",
@@ -56,20 +57,36 @@ def _node(proto: Any, producer: int) -> Node:
     for key in sorted(proto.attr):
         if key.startswith("_"):
             continue
-        if proto.op == "Const" and key == "value":
-            value = to_array(proto.attr[key].tensor, proto.name)
-        else:
-            attrs[key] = _attribute(proto.attr[key])
+        try:
+            if proto.op == "Const" and key == "value":
+                value = to_array(proto.attr[key].tensor, allowance)
+            else:
+                attrs[key] = _attribute(proto.attr[key], allowance)
+        except DamagedFileError as error:
+            raise error.at(f"node {proto.name!r}, attribute {key!r}") from error
     if proto.op == "Const":
         if value is None:
             raise DamagedFileError(
                 f"the constant {proto.name!r} has no value", fix="freeze the graph again; this file is damaged"
             )
         attrs = {}
+    if proto.op in ("Placeholder", "PlaceholderWithDefault"):
+        _check_placeholder(proto.name, attrs)
     if proto.op == "Placeholder" and attrs.get("shape") == TensorShape(()) and producer < SCALAR_SHAPE_PRODUCER:
         attrs["shape"] = TensorShape(None)
     inputs = tuple(normal_ref(i) for i in proto.input if not i.startswith("^"))
     return Node(proto.name, proto.op, inputs, attrs, value, origin=f"{proto.name}:0")
+
+
+def _check_placeholder(name: str, attrs: dict[str, Any]) -> None:
+    """Raise DamagedFileError where a placeholder does not say its dtype, or says a shape that is none."""
+    for key, kind in (("dtype", np.dtype), ("shape", TensorShape)):
+        if not isinstance(attrs.get(key, TensorShape(None) if key == "shape" else None), kind):
+            raise DamagedFileError(
+                f"the placeholder {name!r} has {key} {attrs.get(key)!r}",
+                why=f"that is no {key}, so what it takes cannot be known",
+                fix="freeze the graph again; this file is damaged",
+            )
 
 
 def _shape(proto: Any) -> TensorShape:
@@ -78,7 +95,7 @@ def _shape(proto: Any) -> TensorShape:
     return TensorShape(tuple(None if d.size < 0 else int(d.size) for d in proto.dim))
 
 
-def _attribute(proto: Any) -> Any:
+def _attribute(proto: Any, allowance: Allowance) -> Any:
     kind = proto.WhichOneof("value")
     if kind == "s":
         return _text(proto.s)
@@ -89,7 +106,7 @@ def _attribute(proto: Any) -> Any:
     if kind == "shape":
         return _shape(proto.shape)
     if kind == "tensor":
-        return to_array(proto.tensor, "attribute")
+        return to_array(proto.tensor, allowance)
     if kind == "func":
         return proto.func.name
     if kind == "list":

@@ -10,8 +10,12 @@ import numpy as np
 from converters.schema import TensorProto, dtype_number, dtype_of
 from signatures.errors import DamagedFileError
 
-#: A constant that is written as one repeated value may not unfold to more elements than this.
-MAX_ELEMENTS = 1 << 27
+#: Constants that are written as one repeated value may not unfold to more elements than this, in all of a graph: a
+#: file of a few bytes could claim the whole memory otherwise. (A dense layer of ML-Agents has 1 << 18.)
+MAX_UNFOLDED = 1 << 24
+_MAX_AXES = 32
+_MAX_ELEMENTS = 1 << 31
+_MAX_STRING_BYTES = 1 << 26
 
 _VALUE_FIELDS = {
     "float32": "float_val",
@@ -28,40 +32,70 @@ _VALUE_FIELDS = {
 }
 
 
-def to_array(proto: Any, where: str) -> np.ndarray:
-    """The array of a TensorProto; ``where`` names the node in errors."""
+class Allowance:
+    """How many elements the constants of one graph may still unfold to."""
+
+    def __init__(self, elements: int = MAX_UNFOLDED) -> None:
+        self._left = elements
+
+    def take(self, elements: int) -> None:
+        """Count ``elements``; raises DamagedFileError when that is too much."""
+        self._left -= elements
+        if self._left < 0:
+            raise _damaged(f"it claims {elements} elements that the file does not hold")
+
+
+def to_array(proto: Any, allowance: Allowance | None = None) -> np.ndarray:
+    """The array of a TensorProto; raises DamagedFileError."""
     dtype = dtype_of(proto.dtype)
     shape = tuple(int(d.size) for d in proto.tensor_shape.dim)
     if proto.tensor_shape.unknown_rank or any(n < 0 for n in shape):
-        raise _damaged(where, "its shape is not fully known")
+        raise _damaged("its shape is not fully known")
+    if len(shape) > _MAX_AXES or math.prod(n or 1 for n in shape) > _MAX_ELEMENTS:
+        raise _damaged(f"it claims the shape {_shown(shape)}")
     count = math.prod(shape)
-    if count > MAX_ELEMENTS:
-        raise _damaged(where, f"it claims {count} elements")
     if dtype.kind == "S":
-        return np.array(list(proto.string_val) or [b""], np.bytes_).reshape(shape if count == 1 else -1)
+        return _strings(list(proto.string_val) or [b""], shape, count)
     if dtype.kind == "O":
-        raise _damaged(where, "resources cannot be constants")
+        raise _damaged("it is a resource, which has no value outside of a session")
     if proto.tensor_content:
         if len(proto.tensor_content) != count * dtype.itemsize:
-            raise _damaged(where, f"it holds {len(proto.tensor_content)} bytes for {count} elements of {dtype}")
+            raise _damaged(f"it holds {len(proto.tensor_content)} bytes for {count} elements of {dtype}")
         return np.frombuffer(proto.tensor_content, dtype.newbyteorder("<")).astype(dtype, copy=False).reshape(shape)
-    if dtype == np.float16:
-        values = np.array(list(proto.half_val), np.uint16).view(np.float16)
-    else:
-        values = np.array(getattr(proto, _VALUE_FIELDS[dtype.name]), dtype)
+    values = _values(proto, dtype)
     if values.size > count:
-        raise _damaged(where, f"it holds {values.size} values for {count} elements")
+        raise _damaged(f"it holds {values.size} values for {count} elements")
     if values.size < count:
         # TensorFlow's short form: the last value stands for all that are missing, zero if there is none.
+        (allowance or Allowance()).take(count - values.size)
         last = values[-1] if values.size else dtype.type(0)
         values = np.concatenate([values, np.full(count - values.size, last, dtype)])
     return values.reshape(shape)
 
 
-def _damaged(where: str, why: str) -> DamagedFileError:
-    return DamagedFileError(
-        f"the constant {where!r} cannot be read", why=why, fix="freeze the graph again; this file is damaged"
-    )
+def _values(proto: Any, dtype: np.dtype) -> np.ndarray:
+    try:
+        if dtype == np.float16:
+            return np.array(list(proto.half_val), np.uint16).view(np.float16)
+        return np.array(getattr(proto, _VALUE_FIELDS[dtype.name]), dtype)
+    except OverflowError as error:
+        raise _damaged(f"it holds a value that {dtype} does not have") from error
+
+
+def _strings(values: list[bytes], shape: tuple[int, ...], count: int) -> np.ndarray:
+    """Strings, each as wide as the longest; a list of them where there are not as many as the shape says."""
+    if len(values) * max(len(v) for v in values) > _MAX_STRING_BYTES:
+        raise _damaged(f"its {len(values)} strings are too long")
+    array = np.array(values, np.bytes_)
+    return array.reshape(shape) if count == array.size else array
+
+
+def _shown(shape: tuple[int, ...]) -> str:
+    return f"[{', '.join(map(str, shape[:8]))}{', …' if len(shape) > 8 else ''}]"
+
+
+def _damaged(why: str) -> DamagedFileError:
+    return DamagedFileError("the tensor cannot be read", why=why, fix="freeze the graph again; this file is damaged")
 
 
 def from_array(array: np.ndarray) -> Any:

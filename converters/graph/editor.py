@@ -36,7 +36,9 @@ class Editor:
         """Take a node over, its inputs redirected."""
         self.nodes.append(node.with_inputs(self.resolve(r) for r in node.inputs))
 
-    def add(self, op: str, inputs: Iterable[str], name: str, origin: str | None = None, **attrs: Any) -> str:
+    def add(
+        self, op: str, inputs: Iterable[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
+    ) -> str:
         """A new node with the op's default attributes under a fresh name like ``name``; returns its output 0."""
         defaults = {a.name: a.default for a in TABLE[op].attrs if a.derive is None and a.default is not REQUIRED}
         fresh = self._names.fresh(name)
@@ -53,7 +55,7 @@ class Editor:
         self.nodes.append(Node(fresh, "Const", value=array))
         return fresh
 
-    def replace_const(self, name: str, array: np.ndarray, origin: str | None) -> str:
+    def replace_const(self, name: str, array: np.ndarray, origin: str | tuple[str, ...] | None) -> str:
         """A Const under the name of the node of the old graph that it stands for."""
         self.nodes.append(Node(name, "Const", value=array, origin=origin))
         return name

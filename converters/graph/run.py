@@ -11,12 +11,46 @@ from converters.graph.shapes import run_kernel
 from signatures.errors import GraphError
 from signatures.graph import Graph, normal_ref, ref, split_ref
 
+#: Ops that round nothing, beside the structural ones.
+_EXACT = frozenset(
+    (
+        "Reshape",
+        "Transpose",
+        "Unpack",
+        "Split",
+        "SplitV",
+        "Fill",
+        "Tile",
+        "OneHot",
+        "Cast",
+        "Maximum",
+        "Minimum",
+        "Relu",
+    )
+)
 
-def run_graph(graph: Graph, feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> dict[str, np.ndarray]:
+
+def _moved(array: np.ndarray, jitter: np.random.Generator) -> np.ndarray:
+    if array.dtype.kind != "f":
+        return array
+    towards = np.where(jitter.random(array.shape) < 0.5, -np.inf, np.inf).astype(array.dtype)
+    with np.errstate(all="ignore"):
+        return np.asarray(np.where(array == 0, array, np.nextafter(array, towards)))
+
+
+def run_graph(
+    graph: Graph,
+    feeds: Mapping[str, np.ndarray],
+    fetch: Sequence[str],
+    jitter: np.random.Generator | None = None,
+) -> dict[str, np.ndarray]:
     """Values of the tensors in ``fetch``, by the names they were asked under.
 
     ``feeds`` may name any tensor, not only placeholders: a recorded draw can stand for a sampler's output. Raises
     GraphError when a placeholder is not fed or a kernel fails.
+
+    With ``jitter`` every float that an op computes is moved by one unit in its last place, up or down at random (Monte
+    Carlo arithmetic): how far the outputs then move is what rounding explains.
     """
     values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
     needed = graph.ancestors(fetch, stop=frozenset(split_ref(name)[0] for name in values))
@@ -31,7 +65,10 @@ def run_graph(graph: Graph, feeds: Mapping[str, np.ndarray], fetch: Sequence[str
             assert node.value is not None
             values[node.name] = node.value
             continue
-        results = run_kernel(op_of(node), node, [values[r] for r in node.inputs])
+        entry = op_of(node)
+        results = run_kernel(entry, node, [values[r] for r in node.inputs])
+        if jitter is not None and not entry.structural and node.op not in _EXACT:
+            results = tuple(_moved(r, jitter) for r in results)
         for index, result in enumerate(results):
             values.setdefault(ref(node.name, index), result)
     return {name: values[normal_ref(name)] for name in fetch}

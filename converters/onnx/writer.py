@@ -99,7 +99,7 @@ class _Builder:
             if made is not None and reference not in self._taken:
                 self._rename(before, value, reference)
                 value = reference
-                if node.origin is not None and index == 0:
+                if isinstance(node.origin, str) and index == 0:
                     self.sources[value] = node.origin
             self.bind(reference, value)
 

@@ -17,8 +17,8 @@ from converters.runner.wire import Tensors, read_frame, write_frame
 class Model(Protocol):
     """A loaded model."""
 
-    def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
-        """Outputs by name."""
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        """Outputs by name; ``request`` is the whole header, for what one runtime alone can do."""
         ...
 
 
@@ -50,7 +50,7 @@ def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception
                 models[header["id"]] = load(header)
                 write_frame(out, {"ok": True})
             elif command == "run":
-                write_frame(out, {"ok": True}, models[header["id"]].run(tensors, header["fetch"]))
+                write_frame(out, {"ok": True}, models[header["id"]].run(tensors, header["fetch"], header))
             elif command == "unload":
                 models.pop(header["id"], None)
                 write_frame(out, {"ok": True})

@@ -25,8 +25,9 @@ class _Model:
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
 
-    def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
-        return run_graph(self.graph, feeds, fetch)
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        jitter = request.get("jitter")
+        return run_graph(self.graph, feeds, fetch, None if jitter is None else np.random.default_rng(jitter))
 
 
 def _load(header: Mapping[str, Any]) -> _Model:

@@ -13,7 +13,7 @@ class _Model:
     def __init__(self, session: Any) -> None:
         self.session = session
 
-    def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
         values = self.session.run(list(fetch), feeds)
         return dict(zip(fetch, values, strict=True))
 

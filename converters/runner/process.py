@@ -144,9 +144,9 @@ class LoadedModel:
         self._process = process
         self._identity = identity
 
-    def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
-        """The outputs in ``fetch`` by name; raises RunFailedError."""
-        return self._run({"fetch": list(fetch)}, feeds, fetch)
+    def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str], **request: Any) -> Tensors:
+        """The outputs in ``fetch`` by name; raises RunFailedError. ``request`` is for what one runtime alone can do."""
+        return self._run({"fetch": list(fetch), **request}, feeds, fetch)
 
     def predict(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str]) -> Tensors:
         """All outputs, by the call that users of the runtime make (TensorFlow.js: ``model.predict``)."""

@@ -34,7 +34,7 @@ def main() -> None:
                 tf.import_graph_def(definition, name="")
             self.session = tf.compat.v1.Session(graph=graph)
 
-        def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+        def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
             values = self.session.run(
                 [_tensor(n) for n in fetch], {_tensor(name): array for name, array in feeds.items()}
             )
@@ -47,7 +47,7 @@ def main() -> None:
             self.keep = tf.saved_model.load(path)
             self.function = self.keep.signatures[signature]
 
-        def run(self, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+        def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
             results = self.function(**{name: tf.constant(array) for name, array in feeds.items()})
             return {name: results[name].numpy() for name in fetch}
 

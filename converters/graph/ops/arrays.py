@@ -160,7 +160,7 @@ def _open_length(
 
 
 def _lower_reshape(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Reshape", [builder.value(node.inputs[0]), as_int64(node, builder, 1)], allowzero=0)
+    return builder.emit("Reshape", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
 
 
 def _squeeze_axes(node: Node, shape: Sequence[Dim]) -> tuple[int, ...]:
@@ -209,7 +209,7 @@ def _lower_expand_dims(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _transpose(node: Node, x: np.ndarray, permutation: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(x.transpose([int(p) for p in permutation]))
+    return np.asarray(x.transpose([int(p) for p in permutation]), order="C")
 
 
 def _infer_transpose(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
@@ -312,8 +312,9 @@ def _lower_unpack(node: Node, builder: OnnxBuilder) -> Any:
 def _split_sizes(node: Node, length: Dim, args: Sequence[TensorType]) -> list[Dim]:
     if node.op == "SplitV":
         sizes: list[Dim] = [int(s) for s in require_constant(node, args, 1, "sizes").tolist()]
-        if -1 in sizes and isinstance(length, int):
-            sizes[sizes.index(-1)] = length - sum(int(s) for s in sizes if s != -1)
+        if -1 in sizes:
+            others = sum(int(s) for s in sizes if s != -1)
+            sizes[sizes.index(-1)] = length - others if isinstance(length, int) else f"{length}-{others}"
         return sizes
     count = node.attrs["num_split"]
     if isinstance(length, int) and length % count:
@@ -542,7 +543,7 @@ def _lower_fill(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(np.broadcast_to(x, [int(d) for d in dims]))
+    return np.asarray(np.broadcast_to(x, [int(d) for d in dims]), order="C")
 
 
 def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:

@@ -17,7 +17,7 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.linear import activation
+from converters.graph.ops.linear import activation, lower_activation
 from converters.graph.types import Dim, Symbols, TensorType
 from signatures.graph import Node
 
@@ -139,7 +139,7 @@ def _lower_conv2d(node: Node, builder: OnnxBuilder) -> Any:
     inputs = [weights] + [builder.value(r) for r in node.inputs[2:]]
     value = _lower_window(node, builder, "Conv", inputs, kernel_shape=list(kernel.shape[:2]))
     for name in node.attrs.get("fused_ops", ())[1:]:
-        value = builder.emit(name, [value])
+        value = lower_activation(name, value, builder)
     return value
 
 

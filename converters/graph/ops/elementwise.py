@@ -108,6 +108,11 @@ def _lower_clip(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Max", [builder.emit("Min", [builder.value(node.inputs[0]), high]), low])
 
 
+def _floor_div(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """TensorFlow rounds the quotient down; numpy's floor_divide takes the remainder off first (1 // 0.1 is 9 there)."""
+    return np.asarray(np.floor(a / b) if a.dtype.kind == "f" else np.floor_divide(a, b))
+
+
 def _lower_floor_div(node: Node, builder: OnnxBuilder) -> Any:
     a, b = (builder.value(r) for r in node.inputs)
     if builder.type_of(node.inputs[0]).dtype.kind == "f":
@@ -262,7 +267,7 @@ BINARY = (
     _binary("Sub", np.subtract, "Sub"),
     _binary("Mul", np.multiply, "Mul"),
     _binary("RealDiv", np.divide, "Div"),
-    _binary("FloorDiv", np.floor_divide, _lower_floor_div),
+    _binary("FloorDiv", _floor_div, _lower_floor_div),
     _binary("FloorMod", np.mod, _lower_floor_mod),
     _binary("Maximum", np.maximum, "Max"),
     _binary("Minimum", np.minimum, "Min"),

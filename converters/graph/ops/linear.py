@@ -87,6 +87,14 @@ def activation(name: str, x: np.ndarray) -> np.ndarray:
     return np.asarray(kernel(Node(name, name), x))
 
 
+def lower_activation(name: str, value: str, builder: OnnxBuilder) -> str:
+    """``activation`` in ONNX, which calls all of them as TensorFlow does but has no Relu6."""
+    if name != "Relu6":
+        return str(builder.emit(name, [value]))
+    low, high = (builder.const(np.array(bound, np.float32), "bound") for bound in (0, 6))
+    return str(builder.emit("Min", [builder.emit("Max", [value, low]), high]))
+
+
 def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) -> np.ndarray:
     x = _bias_add(node, _matmul(node, a, b), bias)
     for name in node.attrs["fused_ops"][1:]:
@@ -102,7 +110,7 @@ def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
         transB=int(bool(node.attrs.get("transpose_b"))),
     )
     for name in node.attrs["fused_ops"][1:]:
-        value = builder.emit(name, [value])
+        value = lower_activation(name, value, builder)
     return value
 
 

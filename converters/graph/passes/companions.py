@@ -16,20 +16,27 @@ from converters.graph.passes.noise import without_noise
 from converters.graph.shapes import infer_types
 from converters.graph.types import INT32, INT64
 from signatures.graph import Graph
-from signatures.infer import ActionMeaning
+from signatures.infer import ActionMeaning, Head
 from signatures.roles import Role
 
-DETERMINISTIC, LOG_PROBS = "deterministic_action", "action_log_probs"
+LOG_PROBS = "action_log_probs"
 
 
 def add_companions(
-    graph: Graph, fetches: Mapping[str, str], meaning: ActionMeaning, noise: Mapping[str, tuple[int | None, ...]]
+    graph: Graph,
+    fetches: Mapping[str, str],
+    head: Head,
+    meaning: ActionMeaning,
+    noise: Mapping[str, tuple[int | None, ...]],
 ) -> tuple[Graph, dict[str, str]]:
-    """The graph with the companions, and the fetches with their tensors added."""
-    added = dict(fetches)
+    """The graph with an action's companions, and the fetches with their tensors added.
+
+    A companion that the source has itself is left as it is.
+    """
+    added, name = dict(fetches), head.deterministic
     if meaning.role is Role.CONTINUOUS:
-        if DETERMINISTIC not in fetches:
-            graph, added[DETERMINISTIC] = without_noise(graph, fetches["action"], noise, DETERMINISTIC)
+        if name not in fetches:
+            graph, added[name] = without_noise(graph, fetches[head.name], noise, name)
         return graph, added
     editor = Editor(graph)
     for node in graph.nodes:
@@ -37,11 +44,11 @@ def add_companions(
     if meaning.role is Role.SAMPLED and LOG_PROBS not in fetches:
         parts = [editor.add("LogSoftmax", [b], f"{LOG_PROBS}/branch_{i}") for i, b in enumerate(meaning.branches)]
         added[LOG_PROBS] = _joined(editor, parts, LOG_PROBS)
-    if DETERMINISTIC not in fetches:
+    if name not in fetches:
         if meaning.branches:
-            added[DETERMINISTIC] = _argmax(editor, meaning.branches)
+            added[name] = _argmax(editor, meaning.branches, name)
         else:
-            added[DETERMINISTIC] = _as_columns(editor, graph, fetches["action"])
+            added[name] = _as_columns(editor, graph, fetches[head.name], name)
     return editor.graph(), added
 
 
@@ -52,24 +59,24 @@ def _joined(editor: Editor, parts: Sequence[str], name: str) -> str:
     return editor.add("ConcatV2", [*parts, axis], f"{name}/concat")
 
 
-def _argmax(editor: Editor, branches: Sequence[str]) -> str:
+def _argmax(editor: Editor, branches: Sequence[str], name: str) -> str:
     columns = []
     for i, branch in enumerate(branches):
-        prefix = f"{DETERMINISTIC}/branch_{i}"
+        prefix = f"{name}/branch_{i}"
         axis = editor.const(np.array(1, INT32), f"{prefix}/axis")
         best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
         columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))
-    return _joined(editor, columns, DETERMINISTIC)
+    return _joined(editor, columns, name)
 
 
-def _as_columns(editor: Editor, graph: Graph, action: str) -> str:
+def _as_columns(editor: Editor, graph: Graph, action: str, name: str) -> str:
     """An integer action whose scores are not in the graph: itself, as int64 [B, n]."""
     kind = infer_types(graph)[action]
     value = action
     if kind.dtype != INT64:
-        value = editor.add("Cast", [value], f"{DETERMINISTIC}/int64", DstT=INT64)
+        value = editor.add("Cast", [value], f"{name}/int64", DstT=INT64)
     if kind.rank == 1:
-        value = editor.add("Reshape", [value, _column_shape(editor, DETERMINISTIC)], f"{DETERMINISTIC}/column")
+        value = editor.add("Reshape", [value, _column_shape(editor, name)], f"{name}/column")
     return value
 
 

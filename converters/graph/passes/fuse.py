@@ -17,7 +17,8 @@ _FUSED = {"MatMul": "_FusedMatMul", "Conv2D": "_FusedConv2D"}
 def fuse(graph: Graph, roots: Iterable[str], activations: Iterable[str]) -> Graph:
     """The graph with the pairs (and triples, for ``activations``) joined; the last node's name is kept.
 
-    A product that something else reads too, or that is an output, stays as it is.
+    A product that something else reads too, or that is an output, stays as it is; so does a transposed one:
+    TensorFlow.js's wasm backend adds the bias wrongly there (4.22).
     """
     consumers = graph.consumers()
     outputs = {node_of(r) for r in roots}
@@ -26,6 +27,8 @@ def fuse(graph: Graph, roots: Iterable[str], activations: Iterable[str]) -> Grap
     swallowed: set[str] = set()
     for node in graph.nodes:
         if node.op not in _FUSED or node.name in outputs or len(consumers[node.name]) != 1:
+            continue
+        if node.attrs.get("transpose_a") or node.attrs.get("transpose_b"):
             continue
         bias = consumers[node.name][0]
         if bias.op != "BiasAdd" or node_of(bias.inputs[0]) != node.name or graph.constant(bias.inputs[1]) is None:

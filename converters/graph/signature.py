@@ -1,0 +1,259 @@
+"""The signature of a compiled graph: names, roles, shapes and facts, in the contract's order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from converters.graph.options import CompileOptions
+from converters.graph.passes.companions import LOG_PROBS
+from converters.graph.passes.stats import memory_layout, normaliser
+from converters.graph.shapes import Types, infer_types
+from converters.graph.types import static_shape
+from signatures.eras import generation
+from signatures.errors import SignatureError
+from signatures.graph import Graph, Node, TensorShape
+from signatures.infer import ActionMeaning, Brain, Head, SourceFacts
+from signatures.roles import OBSERVATIONS, Role, canonical_name
+from signatures.spec import Memory, PolicySignature, TensorSpec
+
+_INPUT_ORDER = (*OBSERVATIONS, Role.MASKS, Role.PREV_ACTION, Role.MEMORY_IN, Role.NOISE, Role.PARAMETER)
+_HEAD_NAMES = ("action", "continuous_actions", "discrete_actions")
+_OUTPUT_ORDER = (
+    *_HEAD_NAMES,
+    *(f"deterministic_{name}" for name in _HEAD_NAMES),
+    LOG_PROBS,
+    "action_probs",
+    "value_estimate",
+    "recurrent_out",
+)
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """What the passes leave behind: the graph before naming, and what was found on the way."""
+
+    graph: Graph
+    #: canonical output → tensor
+    fetches: Mapping[str, str]
+    #: canonical output → its name in the source
+    sources: Mapping[str, str | tuple[str, ...] | None]
+    brain: Brain
+    options: CompileOptions
+    facts: SourceFacts
+    roles: Mapping[str, Role]
+    meanings: Mapping[str, ActionMeaning]
+    #: samplers of normals that the source drew from
+    draws: Mapping[str, tuple[int | None, ...]]
+    #: op types of the source
+    ops: set[str]
+
+
+def build_signature(compiled: Compiled) -> tuple[PolicySignature, dict[str, str], dict[str, str]]:
+    """(signature, name → placeholder, name → tensor). Raises SignatureError."""
+    types = infer_types(compiled.graph)
+    notes = list(compiled.facts.notes)
+    feeds, inputs = _inputs(compiled, types, notes)
+    outputs, named = _outputs(compiled, types)
+    meanings = compiled.meanings.values()
+    kinds = {m.role is Role.CONTINUOUS for m in meanings}
+    brain, facts = compiled.brain, compiled.facts
+    bare = [n.removeprefix(brain.scope) for n in compiled.roles]
+    constants = {**facts.constants, **brain.constants}
+    signature = PolicySignature(
+        inputs=tuple(inputs),
+        outputs=tuple(outputs),
+        family=facts.family or generation(constants, bare, compiled.ops),
+        action_space="hybrid" if len(kinds) > 1 else "continuous" if True in kinds else "discrete",
+        branches=_branch_sizes(types, [b for m in meanings for b in m.branches]),
+        algorithm=facts.algorithm or _algorithm(compiled, [s.role for s in inputs]),
+        memory=_memory(compiled, inputs, outputs, feeds, notes),
+        preprocess={
+            s.name: {"layout": facts.image_layout, "range": [0, 1], "from_bytes": "divide by 255"}
+            for s in inputs
+            if s.role is Role.VISUAL
+        },
+        constants=constants,
+        notes=tuple(notes),
+    )
+    return signature, feeds, named
+
+
+# ------------------------------------------------------------------ outputs
+
+
+def _outputs(compiled: Compiled, types: Types) -> tuple[list[TensorSpec], dict[str, str]]:
+    roles = _output_roles(compiled)
+    fetches = compiled.fetches
+    order = sorted(fetches, key=lambda n: _OUTPUT_ORDER.index(n) if n in _OUTPUT_ORDER else len(_OUTPUT_ORDER))
+    specs = []
+    for name in order:
+        kind = types[fetches[name]]
+        _check_batch(name, kind.shape, compiled.sources.get(name))
+        specs.append(
+            TensorSpec(
+                _output_name(compiled, name),
+                roles[name],
+                kind.dtype.name,
+                static_shape(kind.shape) or (None,),
+                compiled.sources.get(name),
+            )
+        )
+    return specs, {spec.name: fetches[name] for spec, name in zip(specs, order, strict=True)}
+
+
+def _output_roles(compiled: Compiled) -> dict[str, Role]:
+    canonical = compiled.brain.canonical
+    roles = {canonical[base]: role for base, role, _ in compiled.brain.outputs if base in canonical}
+    for head in compiled.brain.heads:
+        roles[head.name] = compiled.meanings[head.name].role
+        roles[head.deterministic] = Role.DETERMINISTIC
+    roles[LOG_PROBS] = Role.LOG_PROBS
+    return roles
+
+
+def _output_name(compiled: Compiled, name: str) -> str:
+    """The output's name in the artefacts: canonical, or what the trainer called it."""
+    if compiled.options.names == "canonical":
+        return name
+    own = {canonical: base for base, canonical in compiled.brain.canonical.items()}
+    return compiled.brain.scope + own[name] if name in own else name
+
+
+def _check_batch(name: str, shape: tuple[int | str, ...] | None, source: object) -> None:
+    if shape is None or (shape and isinstance(shape[0], str)):
+        return
+    raise SignatureError(
+        f"output {name!r} ({source}) has shape {list(shape)}, without the batch axis",
+        why="every output of a policy has one row per agent (TF Serving asks for it)",
+        fix=f"export the outputs that do: --output NAME=ROLE leaves {name!r} out",
+    )
+
+
+def _branch_sizes(types: Types, branches: list[str]) -> tuple[int, ...]:
+    sizes = [(types[b].shape or (None,))[-1] for b in branches if b in types]
+    known = tuple(s for s in sizes if isinstance(s, int))
+    return known if len(known) == len(branches) else ()
+
+
+# ------------------------------------------------------------------ inputs
+
+
+def _inputs(compiled: Compiled, types: Types, notes: list[str]) -> tuple[dict[str, str], list[TensorSpec]]:
+    """(name → placeholder, specs) of what is left to feed, in the contract's order."""
+    graph, roles, scope = compiled.graph, compiled.roles, compiled.brain.scope
+    needed = graph.ancestors([compiled.fetches[head.name] for head in compiled.brain.heads])
+    ranked = sorted(
+        (n for n in graph.nodes if n.op == "Placeholder"),
+        key=lambda n: (
+            _INPUT_ORDER.index(roles.get(n.name, Role.NOISE)),
+            # draws behind the action come first, so that it is the action's noise that is called epsilon
+            roles.get(n.name, Role.NOISE) is Role.NOISE and n.name not in needed,
+            _trailing_number(n.name),
+        ),
+    )
+    feeds: dict[str, str] = {}
+    specs: list[TensorSpec] = []
+    counts: dict[Role, int] = {}
+    for node in ranked:
+        role = roles.get(node.name, Role.NOISE)
+        number = counts.get(role, 0)
+        counts[role] = number + 1
+        name = canonical_name(role, number, node.name.removeprefix(scope))
+        if compiled.options.names == "source" and node.name not in compiled.draws:
+            name = node.name
+        if name in feeds:
+            raise SignatureError(
+                f"two inputs would be called {name!r}: {feeds[name]} and {node.name}",
+                fix="give one of them another role: --input NAME=ROLE",
+            )
+        feeds[name] = node.name
+        distribution = _distribution(graph, types, node, role)
+        specs.append(TensorSpec(name, role, node.attrs["dtype"].name, _known_shape(node), node.origin, distribution))
+        if node.name in compiled.draws:
+            notes.append(f"the noise drawn inside the graph ({node.origin}) is now the input {name}; feed N(0, 1)")
+        if role is Role.PARAMETER:
+            notes.append(f"{name} is an input whose meaning is not known; it must be fed, or fixed with --set")
+    return feeds, specs
+
+
+def _known_shape(node: Node) -> tuple[int | None, ...]:
+    shape: TensorShape = node.attrs["shape"]
+    if shape.dims is None:
+        raise SignatureError(
+            f"the shape of input {node.name!r} is not known",
+            why="the file does not say it, and nothing that reads it tells",
+            fix=f"if it has one value for all runs, give it: --set {node.name}=VALUE",
+        )
+    return shape.dims
+
+
+def _trailing_number(name: str) -> int:
+    digits = name[len(name.rstrip("0123456789")) :]
+    return int(digits) if digits else -1
+
+
+def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[str, object] | None:
+    if role is Role.NOISE:
+        return {"kind": "normal", "mean": 0.0, "std": 1.0}
+    if role is Role.MASKS:
+        return {"kind": "mask", "allowed": 1, "forbidden": 0}
+    if role is Role.VISUAL:
+        return {"kind": "uniform", "low": 0.0, "high": 1.0}
+    if role is Role.VECTOR and node.attrs["dtype"].kind in "iu":
+        depth = _one_hot_depth(graph, types, node)
+        return None if depth is None else {"kind": "integer", "low": 0, "high": depth - 1}
+    if role is Role.VECTOR:
+        return normaliser(graph, node.name)
+    return None
+
+
+def _one_hot_depth(graph: Graph, types: Types, node: Node) -> int | None:
+    for reader in graph.nodes:
+        if reader.op == "OneHot" and node.name in graph.ancestors([reader.inputs[0]]):
+            depth = types[reader.inputs[1]].constant
+            return None if depth is None else int(depth)
+    return None
+
+
+# ------------------------------------------------------------------ facts
+
+
+def _algorithm(compiled: Compiled, roles: list[Role]) -> str | None:
+    """The trainer that writes such a graph, where only one does.
+
+    SAC squashes its sample with tanh and has no critic in the export; PPO clips it (0.4 on) or not (0.1-0.3); cloned
+    behaviour has no noise. Discrete graphs of PPO and SAC do not differ.
+    """
+    head: Head = compiled.brain.heads[0]
+    meaning = compiled.meanings[head.name]
+    if meaning.role is Role.DETERMINISTIC and not compiled.options.deterministic:
+        return "DQN" if meaning.branches else None
+    if meaning.role is not Role.CONTINUOUS:
+        return None
+    if not compiled.draws and Role.NOISE not in roles:
+        return "BC" if head.base == "action" and compiled.facts.family is None else None
+    return "SAC" if compiled.graph.producer(compiled.fetches[head.name]).op == "Tanh" else "PPO"
+
+
+def _memory(
+    compiled: Compiled,
+    inputs: list[TensorSpec],
+    outputs: list[TensorSpec],
+    feeds: Mapping[str, str],
+    notes: list[str],
+) -> Memory | None:
+    taken = next((s for s in inputs if s.role is Role.MEMORY_IN), None)
+    given = next((s for s in outputs if s.role is Role.MEMORY_OUT), None)
+    if taken is None:
+        if given is not None:
+            notes.append(f"{given.name} is computed without a memory input")
+            return Memory(int(given.shape[-1] or 0), None, given.name)
+        return None
+    if given is None:
+        notes.append(
+            f"the source takes a memory ({taken.name}) but does not give it back: its recurrent_out was lost in the "
+            "export, so every step starts from the memory that is fed"
+        )
+    layout = compiled.facts.memory_layout or memory_layout(compiled.graph, feeds[taken.name])
+    return Memory(int(taken.shape[-1] or 0), taken.name, None if given is None else given.name, layout)
