@@ -139,6 +139,11 @@ def _neighbours(path: Path) -> str:
     return f"did you mean {path.parent / close[0]}?" if close else "check the path"
 
 
+def recognise_path(path: Path) -> FileKind:
+    """The kind of a file (by content) or folder (by what lies in it). Raises SourceError, DamagedFileError."""
+    return recognise(read_bytes(path), path.name)
+
+
 def recognise(data: bytes, name: str = "") -> FileKind:
     """The kind of file that ``data`` is; ``name`` only decides where the bytes cannot (Sentis)."""
     return KINDS[_key(data, name)]

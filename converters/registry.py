@@ -6,6 +6,7 @@ import importlib
 from types import MappingProxyType
 
 from converters.artifact import Writer
+from converters.source import Reader
 from signatures.errors import UsageError
 
 #: Target on the command line → module whose ``write`` makes it.
@@ -18,6 +19,21 @@ WRITERS = MappingProxyType(
     }
 )
 TARGETS = tuple(WRITERS)
+
+#: Kind of file or folder (converters/recognise.py) → module whose ``read`` takes it.
+READERS = MappingProxyType(
+    {
+        "frozen_graph": "converters.frozen_graph.source",
+    }
+)
+
+
+def reader(kind: str) -> Reader | None:
+    """The reader of a kind of file, None where there is none; its module is imported here."""
+    if kind not in READERS:
+        return None
+    read: Reader = importlib.import_module(READERS[kind]).read
+    return read
 
 
 def writer(target: str) -> Writer:

@@ -8,6 +8,7 @@ from pathlib import Path
 from converters.graph.options import CompileOptions
 from converters.graph.passes.noise import NoiseMode
 from converters.registry import TARGETS
+from converters.source import ReadOptions
 from exporter.inspection import Inspection, inspect_source
 from exporter.parity.report import ParityReport
 from exporter.parity.verify import VerifyOptions
@@ -65,6 +66,7 @@ def export_model(
     inputs: Mapping[str, str | Role] | None = None,
     outputs: Mapping[str, str | Role] | None = None,
     values: Mapping[str, float] | None = None,
+    step: int | None = None,
     opset: int = 15,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
@@ -80,6 +82,7 @@ def export_model(
         tuple(to),
         name,
         _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
+        ReadOptions(step),
         opset,
         verify,
         parity or VerifyOptions(),

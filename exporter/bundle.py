@@ -14,7 +14,8 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,40 +69,46 @@ def compact(content: Mapping[str, Any]) -> str:
     return json.dumps(content, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
+@contextmanager
+def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
+    """What the system refuses inside is a BundleError about ``place``."""
+    try:
+        yield
+    except OSError as error:
+        raise BundleError(
+            what, where=str(place), why=error.strerror, fix="make room or rights there, or choose another -o"
+        ) from error
+
+
 def write_staged(parent: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]) -> Path:
     """Write a bundle into a new hidden folder in ``parent``; returns that folder."""
     files = {path: data for artifact in artifacts for path, data in artifact.files.items()}
     hashes = {p: {"sha256": hashlib.sha256(d).hexdigest(), "bytes": len(d)} for p, d in sorted(files.items())}
     tool = content["tool"]
     body = {**{k: v for k, v in content.items() if k != "tool"}, "files": hashes, "tool": tool}
-    try:
+    with writing(parent, "the output folder cannot be written"):
         parent.mkdir(parents=True, exist_ok=True)
         stage = Path(tempfile.mkdtemp(prefix=f".{content['name']}.", dir=parent))
-    except OSError as error:
-        raise BundleError(
-            "the output folder cannot be written", where=str(parent), why=error.strerror, fix="choose another with -o"
-        ) from error
-    try:
-        for relative, data in files.items():
-            target = stage / relative
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(data)
-        (stage / POLICY).write_bytes(dumps(body))
-        stage.chmod(0o755)
-    except OSError as error:
-        shutil.rmtree(stage, ignore_errors=True)
-        raise BundleError(
-            "the bundle cannot be written", where=str(parent), why=error.strerror, fix="make room, or choose another -o"
-        ) from error
+        try:
+            for relative, data in files.items():
+                target = stage / relative
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(data)
+            (stage / POLICY).write_bytes(dumps(body))
+            stage.chmod(0o755)
+        except BaseException:
+            shutil.rmtree(stage, ignore_errors=True)
+            raise
     return stage
 
 
 def check_replaceable(place: Path) -> None:
     """Raise BundleError when ``place`` exists and is not a bundle of ours."""
-    if not place.exists() and not place.is_symlink():
-        return
-    if place.is_dir() and not place.is_symlink() and (not any(place.iterdir()) or (place / POLICY).is_file()):
-        return
+    with writing(place, "cannot be looked at"):
+        if not place.exists() and not place.is_symlink():
+            return
+        if place.is_dir() and not place.is_symlink() and (not any(place.iterdir()) or (place / POLICY).is_file()):
+            return
     raise BundleError(
         "is in the way and is not a bundle",
         where=str(place),
@@ -113,27 +120,39 @@ def check_replaceable(place: Path) -> None:
 def put_in_place(stage: Path, place: Path) -> None:
     """Exchange a staged bundle with what is at ``place``, and remove the old one."""
     check_replaceable(place)
-    if not place.exists():
-        stage.rename(place)
-        return
-    if _exchange(stage, place):
-        shutil.rmtree(stage)
-        return
-    # No exchange on this system: two renames. If the process dies between them, the next run finds the old bundle
-    # under its hidden name and puts it back (recover).
-    old = place.with_name(f".{place.name}.old")
+    with writing(place):
+        if not place.exists():
+            stage.rename(place)
+        elif _exchange(stage, place):
+            shutil.rmtree(stage)
+        else:
+            _two_renames(stage, place)
+
+
+def _two_renames(stage: Path, place: Path) -> None:
+    """Where a system has no exchange. If the process dies in between, the next run puts the old bundle back (recover)."""
+    old = _aside(place)
     if old.exists():
         shutil.rmtree(old)
     place.rename(old)
-    stage.rename(place)
+    try:
+        stage.rename(place)
+    except OSError:
+        old.rename(place)
+        raise
     shutil.rmtree(old)
+
+
+def _aside(place: Path) -> Path:
+    return place.with_name(f".{place.name}.old")
 
 
 def recover(place: Path) -> None:
     """Put back a bundle that a killed run had moved aside."""
-    old = place.with_name(f".{place.name}.old")
-    if old.is_dir() and not place.exists():
-        old.rename(place)
+    old = _aside(place)
+    with writing(place, "cannot be looked at"):
+        if old.is_dir() and not place.exists():
+            old.rename(place)
 
 
 def _exchange(a: Path, b: Path) -> bool:
@@ -160,26 +179,75 @@ def read_policy_json(folder: Path) -> dict[str, Any]:
         raise BundleError(
             "is no bundle", where=str(folder), why=f"it has no {POLICY}", fix="give the folder that export-model wrote"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BundleError("cannot be read", where=str(path), why=str(error), fix="export the policy again") from error
-    if content.get("schema") != SCHEMA:
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema != SCHEMA:
         raise BundleError(
-            f"has schema {content.get('schema')!r}, this version reads {SCHEMA}",
+            f"has schema {schema!r}, this version reads {SCHEMA}",
             where=str(path),
             fix="export the policy again, or use the version of export-model that wrote it",
         )
+    fault = _fault(content)
+    if fault:
+        raise BundleError("is not complete", where=str(path), why=fault, fix="export the policy again")
     return content
+
+
+def _fault(content: Mapping[str, Any]) -> str | None:
+    """What is wrong with the parts of policy.json that say where to look, None if nothing is."""
+    name, files, source = (content.get(key) for key in ("name", "files", "source"))
+    if not isinstance(name, str) or name != safe_name(name):
+        return f"{name!r} is not the name of a policy"
+    if not isinstance(source, dict) or not all(isinstance(source.get(key), str) for key in ("path", "sha256")):
+        return "it does not say which source it was made from"
+    if not isinstance(files, dict) or not files:
+        return "it names no files"
+    for path, entry in files.items():
+        if not isinstance(entry, dict) or not isinstance(entry.get("sha256"), str):
+            return f"it has no sha256 of {path!r}"
+        if not isinstance(entry.get("bytes"), int):
+            return f"it has no size of {path!r}"
+    return None
+
+
+def check_contract(folder: Path, content: Mapping[str, Any], embedded: str) -> None:
+    """Raise BundleError unless policy.json is the contract that an artefact embeds (with the hashes of the files)."""
+    try:
+        same = json.loads(embedded) == {key: value for key, value in content.items() if key != "files"}
+    except (ValueError, RecursionError):
+        same = False
+    if not same:
+        raise BundleError(
+            "has been changed since it was exported",
+            where=str(folder / POLICY),
+            why="it is not the contract that the bundle's own graph embeds",
+            fix="export the policy again",
+        )
 
 
 def check_hashes(folder: Path, content: Mapping[str, Any]) -> None:
     """Raise BundleError that names the first file which is missing or not the one that was written."""
     for relative, entry in content["files"].items():
         path = folder / relative
-        if not path.resolve().is_relative_to(folder.resolve()):
-            raise BundleError(f"names a file outside of the bundle: {relative}", where=str(folder / POLICY))
-        if not path.is_file():
-            raise BundleError("is missing", where=str(path), why=f"{POLICY} names it", fix="export the policy again")
-        if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
+        if not _is_inside(path, folder):
+            raise BundleError(
+                f"names a file outside of the bundle: {relative}",
+                where=str(folder / POLICY),
+                why="a bundle's files lie in its folder",
+                fix="do not use this bundle; export the policy again",
+            )
+        try:
+            found = hashlib.sha256(path.read_bytes()).hexdigest()
+        except FileNotFoundError as error:
+            raise BundleError(
+                "is missing", where=str(path), why=f"{POLICY} names it", fix="export the policy again"
+            ) from error
+        except OSError as error:
+            raise BundleError(
+                "cannot be read", where=str(path), why=error.strerror, fix="export the policy again"
+            ) from error
+        if found != entry["sha256"]:
             raise BundleError(
                 "has been changed since it was exported",
                 where=str(path),
@@ -188,12 +256,19 @@ def check_hashes(folder: Path, content: Mapping[str, Any]) -> None:
             )
 
 
+def _is_inside(path: Path, folder: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character
+        return False
+
+
 def signature_of(content: Mapping[str, Any]) -> tuple[PolicySignature, SourceMap]:
     """The signature and source map that a policy.json holds."""
     try:
         signature = PolicySignature.from_dict(content)
         return signature, SourceMap.from_dict(content["source"], signature)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise BundleError(
             f"{POLICY} is not complete", why=f"{type(error).__name__}: {error}", fix="export the policy again"
         ) from error

@@ -146,6 +146,7 @@ def _compile_options(
     help="Noise drawn in the graph: an input, kept, or removed.",
 )
 @click.option("--deterministic", is_flag=True, help="Make 'action' the one without chance.")
+@click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--opset", type=int, default=15, show_default=True, help="ONNX opset.")
 @click.option(
     "--verify",
@@ -169,6 +170,7 @@ def export_command(
     opset: int,
     runtimes: str,
     as_json: bool,
+    step: int | None,
     brain: str | None,
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
@@ -180,6 +182,7 @@ def export_command(
     rtol: float,
 ) -> None:
     """Export policies (the command that is meant where none is named)."""
+    from converters.source import ReadOptions
     from exporter.pipeline import ExportOptions, export
 
     options = ExportOptions(
@@ -187,6 +190,7 @@ def export_command(
         [t for t in targets.split(",") if t],
         name,
         _compile_options(brain, inputs, outputs, values, names=names, noise=noise, deterministic=deterministic),
+        ReadOptions(step),
         opset,
         runtimes,
         _verify_options(seed, samples, steps, atol, rtol),

@@ -91,7 +91,14 @@ def inspect_source(path: Path | str, options: CompileOptions | None = None) -> I
     for policy in source.policies(options):
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
         found.append(PolicyInspection(policy, ops, {t: _refusal(policy, t) for t in TARGETS}))
-    return Inspection(source.path, source.kind.label, source.sha256, source.size, len(source.graph.nodes), found)
+    return Inspection(
+        source.path,
+        source.kind.label,
+        source.sha256,
+        source.size,
+        sum(len(m.graph.nodes) for m in source.models),
+        found,
+    )
 
 
 def _refusal(policy: Policy, target: str) -> str | None:

@@ -17,6 +17,7 @@ from converters.graph.compile import CONTRACT_NODE
 from converters.graph.options import CompileOptions
 from converters.registry import TARGETS, writer
 from converters.saved_model.writer import signatures_of
+from converters.source import OriginalRun, ReadOptions, SourceModel
 from exporter import bundle
 from exporter.parity.pool import RuntimePool, chosen_runtimes
 from exporter.parity.report import ParityReport
@@ -37,6 +38,7 @@ class ExportOptions:
     targets: Sequence[str] = TARGETS
     name: str | None = None
     compile: CompileOptions = field(default_factory=CompileOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
     opset: int = 15
     verify: str | Sequence[str] = "auto"
     parity: VerifyOptions = field(default_factory=VerifyOptions)
@@ -58,6 +60,15 @@ class ExportResult:
         return None if self.report is None else self.report.passed
 
 
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """One policy to write, and where it comes from."""
+
+    source: Source
+    model: SourceModel
+    policy: Policy
+
+
 def export(
     paths: Sequence[Path | str],
     options: ExportOptions,
@@ -76,21 +87,24 @@ def export(
     if not writers:
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(TARGETS)}")
     runtimes, known = chosen_runtimes(options.verify, list(writers))
-    jobs: list[tuple[Source, Policy]] = []
+    jobs: list[_Job] = []
     for path in paths:
-        source = read_source(path)
-        jobs.extend((source, policy) for policy in _named(source.policies(options.compile), options, len(paths)))
-    bundle.distinct_names([(p.name, f"{s.path} ({p.name})") for s, p in jobs])
-    for _, policy in jobs:
+        source = read_source(path, options.read)
+        compiled = list(source.compiled(options.compile))
+        named = _named([policy for _, policy in compiled], options, len(paths))
+        jobs.extend(_Job(source, model, p) for (model, _), p in zip(compiled, named, strict=True))
+    bundle.distinct_names([(j.policy.name, f"{j.source.path} ({j.policy.name})") for j in jobs])
+    for policy in (j.policy for j in jobs):
         bundle.recover(options.out / policy.name)
         bundle.check_replaceable(options.out / policy.name)
-    written = [(s, p, *_write(s, p, writers, options)) for s, p in jobs]
+    written = [(j, *_write(j, writers, options)) for j in jobs]
     with nullcontext(pool) if pool is not None else RuntimePool() as pool:
-        for source, policy, content, artifacts in written:
+        for job, content, artifacts in written:
+            policy = job.policy
             with _staged(options.out, content, artifacts) as stage, tempfile.TemporaryDirectory() as scratch:
                 report = None
                 if runtimes:
-                    subject = _subject(policy, stage, artifacts, source.path, Path(scratch))
+                    subject = _subject(job, stage, artifacts, Path(scratch))
                     report = verify(subject, runtimes, known, pool, options.parity, progress)
                     (stage / bundle.PARITY).write_bytes(bundle.dumps(report.to_dict()))
                 failed = report is not None and report.passed is False
@@ -107,12 +121,13 @@ def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list
     return [replace(p, name=bundle.safe_name(p.name)) for p in policies]
 
 
-def _write(
-    source: Source, policy: Policy, writers: Mapping[str, Any], options: ExportOptions
-) -> tuple[dict[str, Any], list[Artifact]]:
-    content = bundle.contract(policy, {"path": source.path.name, "sha256": source.sha256})
+def _write(job: _Job, writers: Mapping[str, Any], options: ExportOptions) -> tuple[dict[str, Any], list[Artifact]]:
+    origin = {"path": job.source.path.name, "sha256": job.source.sha256}
+    if job.model.name is not None:
+        origin["model"] = job.model.name
+    content = bundle.contract(job.policy, origin)
     how = WriteOptions(bundle.compact(content), options.opset)
-    return content, [write(policy, how) for write in writers.values()]
+    return content, [write(job.policy, how) for write in writers.values()]
 
 
 @contextmanager
@@ -126,7 +141,8 @@ def _staged(out: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]
             shutil.rmtree(stage, ignore_errors=True)
 
 
-def _subject(policy: Policy, stage: Path, artifacts: Sequence[Artifact], source: Path, scratch: Path) -> Subject:
+def _subject(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> Subject:
+    policy = job.policy
     paths = {a.format: stage / a.main for a in artifacts}
     reference = paths.get("bytes")
     if reference is None:
@@ -142,7 +158,7 @@ def _subject(policy: Policy, stage: Path, artifacts: Sequence[Artifact], source:
         paths,
         {a.format: a.size for a in artifacts},
         reference,
-        source,
+        job.model.original,
         policy.source,
         keys,
     )
@@ -174,8 +190,7 @@ def verify_folder(
             where=str(folder),
             fix="export the policy again with bytes among --to",
         )
-    if source is not None:
-        _check_source(source, content)
+    original = None if source is None else _original_of(source, content)
     graph = read_graph(graph_file.read_bytes())
     policy = Policy(
         name,
@@ -187,7 +202,7 @@ def verify_folder(
     )
     used, known = chosen_runtimes(runtimes, list(artefacts))
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    subject = Subject(name, signature, policy.graph, artefacts, _sizes(content), graph_file, source, source_map, keys)
+    subject = Subject(name, signature, policy.graph, artefacts, _sizes(content), graph_file, original, source_map, keys)
     with RuntimePool() as pool:
         report = verify(subject, used or ("numpy",), known, pool, options, progress)
     if source is None:
@@ -222,7 +237,8 @@ def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
     return sizes
 
 
-def _check_source(source: Path, content: Mapping[str, Any]) -> None:
+def _original_of(source: Path, content: Mapping[str, Any]) -> OriginalRun | None:
+    """How to run the source of a bundle; raises BundleError where ``source`` is another file."""
     found = read_source(source)
     if found.sha256 != content["source"]["sha256"]:
         raise BundleError(
@@ -231,3 +247,5 @@ def _check_source(source: Path, content: Mapping[str, Any]) -> None:
             why=f"its sha256 differs from that of {content['source']['path']} in {bundle.POLICY}",
             fix="give the file it was exported from, or export it again",
         )
+    named = [m for m in found.models if m.name == content["source"].get("model")]
+    return (named or list(found.models))[0].original

@@ -3,73 +3,71 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from converters.frozen_graph.reader import read_graph
 from converters.graph.compile import compile_graph
 from converters.graph.options import CompileOptions
-from converters.recognise import FROZEN_GRAPH, FileKind, not_readable, read_bytes, recognise
-from signatures.errors import ExportModelError, GraphError
-from signatures.graph import Graph
+from converters.recognise import FileKind, not_readable, recognise_path
+from converters.registry import reader
+from converters.source import ReadOptions, SourceModel
+from signatures.errors import ExportModelError
 from signatures.spec import Policy
 
-
-#: What Python and numpy raise where a damaged graph breaks something that a pass takes for granted.
-_BROKEN = (
-    *(ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError),
-    *(MemoryError, RecursionError),
-)
-
-
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Errors inside name the file. A model file is untrusted: an error that nobody foresaw is one of them, too."""
-    try:
-        yield
-    except ExportModelError as error:
-        raise error.at(str(path)) from error.__cause__
-    except _BROKEN as error:
-        raise GraphError(
-            "the graph cannot be understood",
-            where=str(path),
-            why=f"a step failed on something it did not expect ({type(error).__name__}: {error})",
-            fix="if TensorFlow loads this file, please open an issue with it; else freeze the graph again",
-        ) from error
+#: File names that say nothing of the policy: the folder's name, its behavior, does.
+_NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A model file that was read: its graph, and where it came from."""
+    """A file or folder that was read: its models, and where they came from."""
 
     path: Path
     kind: FileKind
     sha256: str
     size: int
-    graph: Graph
+    models: Sequence[SourceModel] = field(default_factory=tuple)
 
-    @property
-    def stem(self) -> str:
-        """What its policy is called. ``frozen_graph_def.pb`` says nothing: the folder's name, its behaviour, does."""
-        if self.path.name in ("frozen_graph_def.pb", "saved_model.pb"):
-            return self.path.resolve().parent.name or self.path.stem
+    def stem(self, model: SourceModel) -> str:
+        """What a model's policy is called."""
+        if model.name is not None:
+            return model.name
+        if self.path.name in _NAMELESS or self.path.is_dir():
+            folder = self.path if self.path.is_dir() else self.path.resolve().parent
+            return folder.resolve().name or self.path.stem
         return self.path.stem
 
+    def compiled(self, options: CompileOptions | None = None) -> Iterator[tuple[SourceModel, Policy]]:
+        """Each model's policies; raises ExportModelError that names the file."""
+        for model in self.models:
+            try:
+                for policy in compile_graph(model.graph, self.stem(model), options, model.facts):
+                    yield model, policy
+            except ExportModelError as error:
+                raise error.at(str(self.path)) from error
+
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
-        """The policies in it; raises ExportModelError that names the file."""
-        with naming(self.path):
-            return compile_graph(self.graph, self.stem, options)
+        """All policies in it."""
+        return [policy for _, policy in self.compiled(options)]
 
 
-def read_source(path: Path | str) -> Source:
+def read_source(path: Path | str, options: ReadOptions | None = None) -> Source:
     """Read a source. Raises SourceError, NotAPolicyError, DamagedFileError or GraphError, each naming the file."""
     path = Path(path)
-    data = read_bytes(path)
-    kind = recognise(data, path.name)
-    if kind.key != FROZEN_GRAPH.key:
+    kind = recognise_path(path)
+    read = reader(kind.key)
+    if read is None:
         raise not_readable(kind, path)
-    with naming(path):
-        graph = read_graph(data)
-    return Source(path, kind, hashlib.sha256(data).hexdigest(), len(data), graph)
+    try:
+        models = read(path, options or ReadOptions())
+    except ExportModelError as error:
+        raise error.at(str(path)) from error
+    files = sorted({f for model in models for f in model.files})
+    return Source(path, kind, _digest(files), sum(f.stat().st_size for f in files), models)
+
+
+def _digest(files: Sequence[Path]) -> str:
+    """The sha256 of a single file, or of the hashes of several in the order of their names."""
+    hashes = [hashlib.sha256(f.read_bytes()).hexdigest() for f in files]
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256("\n".join(hashes).encode()).hexdigest()

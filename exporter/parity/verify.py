@@ -10,6 +10,7 @@ import numpy as np
 
 from converters.graph.ops.chance import SAMPLERS
 from converters.runner.process import LoadedModel, RunFailedError
+from converters.source import OriginalRun
 from exporter.parity.compare import Difference, compare, ties
 from exporter.parity.original import Original
 from exporter.parity.pool import INDEPENDENT, RUNTIMES_OF, RuntimePool
@@ -45,7 +46,7 @@ class Subject:
     sizes: Mapping[str, int]
     #: a .bytes of the policy for the numpy reference (the artefact itself, or one made for this)
     reference: Path
-    source: Path | None = None
+    source: OriginalRun | None = None
     source_map: SourceMap = field(default_factory=SourceMap)
     #: signatures of the SavedModel: key → (inputs, outputs)
     signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
@@ -103,6 +104,7 @@ class _Verification:
         self.random = random_outputs(subject.graph, [s.name for s in self.signature.outputs])
         self.expected: list[dict[str, np.ndarray]] = []
         self.unloads: list[LoadedModel] = []
+        self._reference = "numpy"
         self._floors: dict[str, dict[str, np.ndarray]] = {}
 
     def report(self) -> ParityReport:
@@ -113,15 +115,14 @@ class _Verification:
             self.expected = [self._answers(reference, original, case.feeds) for case in self.cases]
             self.expected_steps = self._roll(lambda feeds: self._answers(reference, original, feeds))
         except RunFailedError as error:
-            source = "source" if original is not None else "bytes"
-            self._failure(source, "tensorflow" if original is not None else "numpy", error)
-            return self._finished("source/tensorflow" if original is not None else "numpy")
+            self._failure("reference" if original is None else "source", self._reference.split("/")[-1], error)
+            return self._finished(self._reference)
         for entrant in self._entrants(reference, original):
             self.progress(f"{self.subject.name}: {entrant.format} in {entrant.runtime}")
             self._examine(entrant)
         for model in self.unloads:
             model.unload()
-        return self._finished("source/tensorflow" if original is not None else "numpy")
+        return self._finished(self._reference)
 
     # ---- who takes part
 
@@ -130,14 +131,16 @@ class _Verification:
         self.unloads.append(numpy_model)
         self.numpy_model = numpy_model
         original = None
-        if self.subject.source is not None and "tensorflow" in self.runtimes:
+        source = self.subject.source
+        if source is not None and source.runtime in self.runtimes:
             try:
-                model = self.pool.process("tensorflow").load(str(self.subject.source), kind="graph")
+                model = self.pool.process(source.runtime).load(str(source.path), **source.options)
             except RunFailedError as error:
-                self._failure("source", "tensorflow", error)
+                self._failure("source", source.runtime, error)
             else:
                 self.unloads.append(model)
                 original = Original(model, self.signature, self.subject.source_map)
+                self._reference = f"source/{source.runtime}"
         return numpy_model, original
 
     def _answers(self, reference: LoadedModel, original: Original | None, feeds: Feeds) -> dict[str, np.ndarray]:
