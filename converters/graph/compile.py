@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -95,13 +96,14 @@ class _Compiler:
         origins = {n.name: n.origin for n in samplers(work)}
         deterministic = self.options.deterministic
         kept = self.options.noise == "keep" and not deterministic
-        work = lift_noise(work, "keep" if kept else "zero" if deterministic else self.options.noise)
-        noise = {**draws, **{n: _dims(types, n) for n, r in roles.items() if r is Role.NOISE and n in work}}
+        fed = {n: _dims(types, n) for n, r in roles.items() if r is Role.NOISE and n in work}
+        work = lift_noise(work, "keep" if kept else "zero" if deterministic else self.options.noise, fed)
+        noise = {**draws, **fed}
         branches = self._branch_origins(work, pinned)
         for head in self.brain.heads:
             work, fetches = add_companions(work, fetches, head, self.meanings[head.name], noise)
         if deterministic:
-            work, fetches = self._without_chance(work, fetches)
+            fetches = self._without_chance(fetches, sources)
         work, fetches = drop_identities(fold(work).pruned(fetches.values()), fetches)
         compiled = Compiled(
             work, fetches, sources, self.brain, self.options, self.facts, roles, self.meanings, draws,
@@ -128,14 +130,16 @@ class _Compiler:
                 found.append(origin if isinstance(origin, str) and node_of(origin) in pinned else None)
         return tuple(found)
 
-    def _without_chance(self, work: Graph, fetches: dict[str, str]) -> tuple[Graph, dict[str, str]]:
-        """``--deterministic``: the actions are the ones without chance."""
+    def _without_chance(self, fetches: dict[str, str], sources: dict[str, Any]) -> dict[str, str]:
+        """``--deterministic``: the actions are the ones without chance. A discrete one is then made here."""
         for head in self.brain.heads:
             meaning = self.meanings[head.name]
             fetches = {**fetches, head.name: fetches[head.deterministic]}
             role = Role.CONTINUOUS if meaning.role is Role.CONTINUOUS else Role.DETERMINISTIC
             self.meanings[head.name] = ActionMeaning(role, meaning.branches)
-        return work, {n: r for n, r in fetches.items() if n != LOG_PROBS}
+            if role is Role.DETERMINISTIC and meaning.role is not role:
+                sources[head.name] = None
+        return {n: r for n, r in fetches.items() if n != LOG_PROBS}
 
     def _named(self, name: str, policy: Policy) -> Policy:
         """Inputs and outputs under the signature's names; with ``--names source`` the trainer's constants too."""

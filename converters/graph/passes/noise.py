@@ -6,7 +6,7 @@ repeated in any runtime by feeding the same draws.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Literal
 
 import numpy as np
@@ -26,14 +26,18 @@ def samplers(graph: Graph) -> list[Node]:
     return [n for n in graph.nodes if n.op in NORMAL_SAMPLERS]
 
 
-def lift_noise(graph: Graph, mode: NoiseMode) -> Graph:
-    """Placeholders (``lift``) or zeros (``zero``) in place of the samplers, under their names; ``keep`` leaves them."""
-    if mode == "keep" or not samplers(graph):
+def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> Graph:
+    """Placeholders (``lift``) or zeros (``zero``) in place of the samplers, under their names; ``keep`` leaves them.
+
+    ``inputs`` are placeholders that take noise already (0.1-0.2, 0.6-0.14): ``zero`` removes them too.
+    """
+    fed = frozenset(inputs) if mode == "zero" else frozenset()
+    if mode == "keep" or not (samplers(graph) or any(n.name in fed for n in graph.nodes)):
         return graph
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
-        if node.op not in NORMAL_SAMPLERS:
+        if node.op not in NORMAL_SAMPLERS and node.name not in fed:
             editor.keep(node)
             continue
         shape = types[node.name].shape
