@@ -1,0 +1,1 @@
+"""Speed, memory and size beside what a user would run instead: ``python -m tests.bench``."""

@@ -1,0 +1,197 @@
+"""What ``pip install export-model`` gives, without extras: a fresh environment with the wheel and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from converters.registry import TARGETS
+from exporter.pipeline import ExportOptions, export
+from exporter.version import __version__
+from fixtures import path
+
+# One group: the environment is made once, whatever the number of test processes.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
+
+ROOT = Path(__file__).resolve().parents[2]
+#: What the packages of a base install may take together, in 10^6 bytes.
+LARGEST = 150
+#: Python's own, in every environment that has pip.
+NOT_OURS = {"pip", "setuptools"}
+
+
+@dataclass(frozen=True)
+class Installed:
+    """A virtual environment with the base install."""
+
+    home: Path
+    packages: Path
+    scratch: Path
+
+    @property
+    def scripts(self) -> Path:
+        return self.home / ("Scripts" if sys.platform == "win32" else "bin")
+
+    def run(self, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run a program of the environment, away from the checkout and with an empty cache."""
+        hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "EXPORT_MODEL_JS", "COVERAGE_PROCESS_START")
+        own = {k: v for k, v in os.environ.items() if k not in hidden}
+        # Runtimes that this user has in the cache would be found otherwise.
+        cache = {k: str(self.scratch / "cache") for k in ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA", "USERPROFILE")}
+        return subprocess.run(
+            [str(self.scripts / program), *arguments],
+            cwd=self.scratch,
+            env={**own, **cache},
+            capture_output=True,
+            encoding="utf-8",
+        )
+
+    def export(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return self.run("export-model", str(path("continuous")), "-o", "out", *arguments)
+
+
+def succeeded(command: Sequence[str]) -> str:
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
+    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built as pip builds it: with the build backend in an environment of its own."""
+    folder = tmp_path_factory.mktemp("wheel")
+    succeeded([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)])
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installed]:
+    home, scratch = tmp_path_factory.mktemp("base") / "venv", tmp_path_factory.mktemp("scratch")
+    succeeded([getattr(sys, "_base_executable", sys.executable), "-m", "venv", str(home)])
+    python = str(Installed(home, home, scratch).scripts / "python")
+    packages = succeeded([python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"])
+    succeeded([python, "-m", "pip", "install", "--quiet", str(wheel)])
+    yield Installed(home, Path(packages.strip()), scratch)
+
+
+# ------------------------------------------------------------------ the wheel
+
+
+def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        metadata = archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))).decode()
+    assert {n.split("/")[0] for n in names} == {
+        "exporter",
+        "converters",
+        "signatures",
+        f"export_model-{__version__}.dist-info",
+    }
+    for name in ("runner.mjs", "package.json", "package-lock.json"):
+        assert f"converters/tfjs/js/{name}" in names
+    strays = [n for n in names if "node_modules" in n or "__pycache__" in n or "/test" in n or n.endswith(".bytes")]
+    assert not strays
+    code = {str(p.relative_to(ROOT).as_posix()) for t in ("exporter", "converters", "signatures") for p in modules(t)}
+    assert {n for n in names if n.endswith(".py")} == code
+    required = [line for line in metadata.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
+    names_required = sorted(re.split(r"[<>=!~;]", line.split()[1])[0] for line in required)
+    assert names_required == ["click", "numpy", "onnx", "protobuf"]
+    assert any(n.endswith("/licenses/LICENSE") for n in names)
+
+
+def modules(package: str) -> Iterator[Path]:
+    return (p for p in (ROOT / package).rglob("*.py") if "node_modules" not in p.parts)
+
+
+# ------------------------------------------------------------------ the environment
+
+
+def on_disk(file: Path) -> int:
+    """What ``du`` counts: whole blocks, where the system tells them."""
+    status = file.stat()
+    return int(getattr(status, "st_blocks", 0)) * 512 or status.st_size
+
+
+def test_it_is_small(installed: Installed) -> None:
+    sizes: dict[str, int] = {}
+    for file in installed.packages.rglob("*"):
+        if file.is_file() and not file.is_symlink():
+            top = file.relative_to(installed.packages).parts[0]
+            sizes[top] = sizes.get(top, 0) + on_disk(file)
+    total = sum(sizes.values()) / 1e6
+    without = sum(size for top, size in sizes.items() if top.split("-")[0] not in NOT_OURS) / 1e6
+    largest = ", ".join(f"{top} {size / 1e6:.1f}" for top, size in sorted(sizes.items(), key=lambda e: -e[1])[:6])
+    print(f"\nbase install: {total:.1f} MB in site-packages, {without:.1f} MB without pip ({largest})")
+    assert total < LARGEST
+
+
+def test_its_requirements_fit_together(installed: Installed) -> None:
+    done = installed.run("python", "-m", "pip", "check")
+    assert done.returncode == 0, done.stdout
+
+
+def test_four_formats_are_written(installed: Installed) -> None:
+    done = installed.export("--verify", "none", "--json")
+    assert done.returncode == 0, done.stderr
+    (result,) = json.loads(done.stdout)["policies"]
+    assert set(result["sizes"]) == set(TARGETS)
+    folder = installed.scratch / "out" / "continuous"
+    for file in ("continuous.bytes", "continuous.onnx", "saved_model/saved_model.pb", "tfjs/model.json"):
+        assert (folder / file).stat().st_size
+
+
+def test_it_writes_the_same_bytes_as_this_checkout(installed: Installed, tmp_path: Path) -> None:
+    tell = "import importlib.metadata as m; print(*map(m.version, ['numpy', 'onnx', 'protobuf']))"
+    there, here = installed.run("python", "-c", tell).stdout, succeeded([sys.executable, "-c", tell])
+    if there != here:
+        pytest.skip(f"numpy, onnx and protobuf are {there.strip()} there and {here.strip()} here")
+    assert installed.export("--verify", "none").returncode == 0
+    (ours,) = export([path("continuous")], ExportOptions(tmp_path, verify="none"))
+    theirs = installed.scratch / "out" / "continuous"
+    for file in (p for p in ours.folder.rglob("*") if p.is_file()):
+        name = file.relative_to(ours.folder)
+        assert (theirs / name).read_bytes() == file.read_bytes(), name
+
+
+def test_the_runtimes_are_listed_with_what_installs_them(installed: Installed) -> None:
+    done = installed.run("export-model", "runtimes", "--json")
+    assert done.returncode == 0, done.stderr
+    found = {r["name"]: r for r in json.loads(done.stdout)["runtimes"]}
+    assert [name for name, r in found.items() if r["installed"]] == ["numpy"]
+    assert "export-model[tensorflow]" in found["tensorflow"]["install"]
+    assert "export-model[onnxruntime]" in found["onnxruntime"]["install"]
+    assert "export-model runtimes install tfjs" in found["tfjs-cpu"]["install"]
+    table = installed.run("export-model", "runtimes")
+    assert table.returncode == 0
+    assert "pip install 'export-model[tensorflow]'" in table.stdout
+
+
+def test_full_verification_is_refused(installed: Installed) -> None:
+    before = sorted(installed.scratch.rglob("*"))
+    done = installed.run("export-model", str(path("discrete")), "-o", "out", "--verify", "full")
+    assert done.returncode == 3
+    assert "is not installed" in done.stderr
+    assert "pip install" in done.stderr
+    assert sorted(installed.scratch.rglob("*")) == before
+
+
+def test_what_can_be_verified_alone_is_called_not_verified(installed: Installed) -> None:
+    done = installed.export("--verify", "auto")
+    assert done.returncode == 0, done.stderr
+    assert "NOT VERIFIED" in done.stdout
+    assert "pip install" in done.stdout
+
+
+def test_a_module_starts_it_too(installed: Installed) -> None:
+    done = installed.run("python", "-m", "exporter", "--version")
+    assert (done.returncode, done.stdout.split()[-1]) == (0, __version__)

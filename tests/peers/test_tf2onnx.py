@@ -1,0 +1,52 @@
+"""``python -m tf2onnx.convert`` takes our ``.bytes``, and what it makes agrees with our own ONNX model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.runner.process import LoadedModel, RuntimeProcess
+from exporter.parity.pool import RuntimePool
+from exporter.pipeline import ExportResult
+from exporter.runtimes import available_runtimes
+from tests.peers.agreement import POLICIES, Run, disagreements
+from tests.peers.environment import Peers
+
+pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peers")]
+
+
+@pytest.fixture(scope="module")
+def onnxruntime() -> Iterator[RuntimeProcess]:
+    info = next(i for i in available_runtimes() if i.name == "onnxruntime")
+    if not info.installed:
+        pytest.skip(f"onnxruntime is not installed: {info.how}")
+    with RuntimePool() as pool:
+        yield pool.process("onnxruntime")
+
+
+def by_tensor(model: LoadedModel) -> Run:
+    """Run a model whose inputs and outputs are called "node:0", as tf2onnx leaves them."""
+
+    def run(feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        results = model.run({f"{n}:0": a for n, a in feeds.items()}, [f"{n}:0" for n in fetch])
+        return {n: results[f"{n}:0"] for n in fetch}
+
+    return run
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_its_model_agrees_with_ours(
+    name: str, tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], onnxruntime: RuntimeProcess
+) -> None:
+    bundle, made = bundles[name], str(tmp_path / "theirs.onnx")
+    inputs = ",".join(f"{s.name}:0" for s in bundle.policy.signature.inputs)
+    outputs = ",".join(f"{s.name}:0" for s in bundle.policy.signature.outputs)
+    source = str(bundle.folder / f"{name}.bytes")
+    peers.run([*peers.tf2onnx(), "--graphdef", source, "--inputs", inputs, "--outputs", outputs, "--output", made])
+    ours, theirs = onnxruntime.load(str(bundle.folder / f"{name}.onnx")), onnxruntime.load(made)
+    assert not disagreements(bundle.policy, ours.run, by_tensor(theirs))
+    ours.unload()
+    theirs.unload()
