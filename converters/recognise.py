@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import codecs
 import json
+import re
 import stat
 import struct
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from converters.checkpoint import listing
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 _HEAD = 4096
 #: Protobuf's own limit; no policy comes near it.
 MAX_BYTES = (2 << 30) - 1
 _TABLE_MAGIC = struct.pack("<Q", 0xDB4775248B80FB57)
+#: The op of a node (field 2 of NodeDef, with its length) that keeps its value in a checkpoint.
+_VARIABLE = re.compile(rb"\x12(\x0aVariableV2|\x0bVarHandleOp|\x08Variable|\x12AutoReloadVariable)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,21 +42,12 @@ KINDS = {
             "the frozen_graph_def.pb or .bytes from the same training run can be exported; look in models/ or results/",
         ),
         FileKind("onnx", "an ONNX model", "it is a target of this tool already; a TensorFlow source is needed"),
-        FileKind(
-            "saved_model",
-            "a SavedModel",
-            "freeze it first, or give the frozen_graph_def.pb or .bytes that training wrote beside it",
-        ),
-        FileKind(
-            "meta_graph",
-            "a MetaGraph of a checkpoint (.meta)",
-            "give the frozen graph (.bytes, frozen_graph_def.pb) that training wrote when it ended",
-        ),
-        FileKind(
-            "checkpoint",
-            "part of a TensorFlow checkpoint",
-            "give the frozen graph (.bytes, frozen_graph_def.pb) that training wrote when it ended",
-        ),
+        FileKind("saved_model", "a SavedModel"),
+        FileKind("meta_graph", "a checkpoint's graph (.meta)"),
+        FileKind("raw_graph", "a graph with variables, as training begins with (raw_graph_def.pb)"),
+        FileKind("checkpoint", "a TensorFlow checkpoint"),
+        FileKind("run_folder", "a folder that training left"),
+        FileKind("bundle", "a bundle of export-model"),
         FileKind(
             "lfs_pointer",
             "a Git LFS pointer, not the model itself",
@@ -63,8 +58,8 @@ KINDS = {
             "a PyTorch checkpoint (.pt)",
             "export ONNX from ML-Agents: mlagents-learn <config> --resume --run-id <id>, stop at once with Ctrl-C",
         ),
-        FileKind("keras", "a Keras model", "save it as a frozen graph: convert_variables_to_constants_v2 of its call"),
-        FileKind("hdf5", "an HDF5 file (perhaps a Keras .h5)", "freeze the model to a GraphDef first"),
+        FileKind("keras", "a Keras model"),
+        FileKind("hdf5", "a Keras model in HDF5 (.h5)"),
         FileKind("tflite", "a TensorFlow Lite model", "give the graph it was converted from"),
         FileKind(
             "sentis",
@@ -76,7 +71,7 @@ KINDS = {
             "a Unity asset, which only refers to a model or wraps it",
             "give the .nn, .onnx or .bytes file itself, as it lies in the project's Assets folder",
         ),
-        FileKind("tfjs", "a TensorFlow.js model", "it is a target of this tool; give what it was made from"),
+        FileKind("tfjs", "a TensorFlow.js model"),
         FileKind(
             "text_graph", "a graph in text form (.pbtxt)", "save it in binary: tf.io.write_graph(..., as_text=False)"
         ),
@@ -96,7 +91,7 @@ def read_bytes(path: Path) -> bytes:
         status = path.stat()
         if stat.S_ISDIR(status.st_mode):
             raise SourceError(
-                "is a folder", where=str(path), why="a single model file is expected", fix=_folder_advice(path)
+                "is a folder", where=str(path), why="a single model file is expected", fix="give a file in it"
             )
         if not stat.S_ISREG(status.st_mode):
             raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
@@ -120,14 +115,6 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
-def _folder_advice(path: Path) -> str:
-    for pattern in ("frozen_graph_def.pb", "*.bytes", "*/frozen_graph_def.pb"):
-        found = sorted(path.glob(pattern))
-        if found:
-            return f"give the model in it: {found[0]}"
-    return "give a .bytes or frozen_graph_def.pb file"
-
-
 def _neighbours(path: Path) -> str:
     import difflib
 
@@ -140,8 +127,41 @@ def _neighbours(path: Path) -> str:
 
 
 def recognise_path(path: Path) -> FileKind:
-    """The kind of a file (by content) or folder (by what lies in it). Raises SourceError, DamagedFileError."""
+    """The kind of a file (by content) or folder (by what lies in it). Raises SourceError, DamagedFileError.
+
+    A checkpoint's prefix (``model-1000.cptk``) is no file; it is recognised by its index.
+    """
+    try:
+        if path.is_dir():
+            return KINDS[_folder_key(path)]
+        if path.name and not path.exists() and path.with_name(path.name + ".index").is_file():
+            return KINDS["checkpoint"]
+    except OSError as error:
+        raise SourceError(
+            "cannot be read", where=str(path), why=error.strerror, fix="check the path and its permissions"
+        ) from error
     return recognise(read_bytes(path), path.name)
+
+
+def _folder_key(folder: Path) -> str:
+    for file, key in (("policy.json", "bundle"), ("saved_model.pb", "saved_model"), ("model.json", "tfjs")):
+        if (folder / file).is_file():
+            return key
+    if listing.behaviors(folder):
+        return "run_folder"
+    inside = sorted(p.name + ("/" if p.is_dir() else "") for p in folder.iterdir())
+    shown = ", ".join(inside[:10]) + (f" and {len(inside) - 10} more" if len(inside) > 10 else "")
+    nested = listing.runs(folder)
+    if nested:
+        fix = f"give one of the folders in it: {', '.join(map(str, nested[:5]))}" + (", …" if nested[5:] else "")
+    else:
+        fix = "give a run's folder (models/<run>, results/<run>), a SavedModel, a TensorFlow.js model, or a model file"
+    raise SourceError(
+        "there is no model in this folder",
+        where=str(folder),
+        why=f"it holds {shown}" if inside else "it is empty",
+        fix=fix,
+    )
 
 
 def recognise(data: bytes, name: str = "") -> FileKind:
@@ -262,7 +282,7 @@ def _protobuf_key(data: bytes) -> str | None:
     if fields[0][:2] == (1, 2):
         first = _fields(fields[0][2], 3)
         if [(n, w) for n, w, _ in first[:2]] == [(1, 2), (2, 2)] and _is_op_name(first[1][2]):
-            return "frozen_graph"
+            return "raw_graph" if _VARIABLE.search(data) else "frozen_graph"
         return "meta_graph" if (2, 2) in numbers else None
     return None
 

@@ -24,6 +24,17 @@ TARGETS = tuple(WRITERS)
 READERS = MappingProxyType(
     {
         "frozen_graph": "converters.frozen_graph.source",
+        "nn": "converters.barracuda.source",
+        "onnx": "converters.onnx.source",
+        "raw_graph": "converters.checkpoint.source",
+        "meta_graph": "converters.checkpoint.source",
+        "checkpoint": "converters.checkpoint.source",
+        "run_folder": "converters.checkpoint.run_folder",
+        "saved_model": "converters.saved_model.source",
+        "keras": "converters.saved_model.keras",
+        "hdf5": "converters.saved_model.keras",
+        "tfjs": "converters.tfjs.source",
+        "bundle": "converters.bundle_source",
     }
 )
 

@@ -1,9 +1,10 @@
 """The TensorFlow messages this project reads and writes, in a descriptor pool of their own.
 
 Only the fields that are needed, by the numbers of TensorFlow's public .proto files (graph.proto, node_def.proto,
-attr_value.proto, tensor.proto, tensor_shape.proto, versions.proto, saved_model.proto, meta_graph.proto). Fields that
-are not listed survive as unknown fields. A private pool, so that a real ``tensorflow`` in the same process does not
-clash, and so that no generated code has to match the installed protobuf.
+attr_value.proto, tensor.proto, tensor_shape.proto, versions.proto, saved_model.proto, meta_graph.proto,
+tensor_bundle.proto, tensor_slice.proto). Fields that are not listed survive as unknown fields. A private pool, so that
+a real ``tensorflow`` in the same process does not clash, and so that no generated code has to match the installed
+protobuf.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _SCALARS = {
     "float": 2,
     "double": 1,
     "bool": 8,
+    "fixed32": 7,
 }
 _MESSAGE_KIND, _OPTIONAL, _REPEATED = 11, 1, 3
 
@@ -57,6 +59,14 @@ _MESSAGES = {
     "MetaInfoDef": "1 meta_graph_version string, 4 tags string*, 5 tensorflow_version string",
     "MetaGraphDef": "1 meta_info_def MetaInfoDef, 2 graph_def GraphDef, 5 signature_def <SignatureDef",
     "SavedModel": "1 saved_model_schema_version int64, 2 meta_graphs MetaGraphDef*",
+    # tensor_bundle.proto, tensor_slice.proto
+    "Extent": "1 start int64, 2 length int64",
+    "TensorSliceProto": "1 extent Extent*",
+    "BundleHeaderProto": "1 num_shards int32, 2 endianness int32, 3 version VersionDef",
+    "BundleEntryProto": (
+        "1 dtype int32, 2 shape TensorShapeProto, 3 shard_id int32, 4 offset int64, 5 size int64, 6 crc32c fixed32, "
+        "7 slices TensorSliceProto*"
+    ),
 }
 #: Fields of AttrValue and TensorInfo that are members of a oneof: presence must be visible even at the default value.
 _ONEOFS = {"AttrValue": "value"}
@@ -105,6 +115,8 @@ AttrValue = _CLASSES["AttrValue"]
 TensorProto = _CLASSES["TensorProto"]
 MetaGraphDef = _CLASSES["MetaGraphDef"]
 SavedModel = _CLASSES["SavedModel"]
+BundleHeaderProto = _CLASSES["BundleHeaderProto"]
+BundleEntryProto = _CLASSES["BundleEntryProto"]
 
 
 def parse(message_class: Any, data: bytes, what: str) -> Any:

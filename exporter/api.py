@@ -57,7 +57,7 @@ def export_model(
     source: Path | str | Sequence[Path | str],
     out: Path | str = "exported",
     *,
-    to: Sequence[str] = TARGETS,
+    to: str | Sequence[str] = TARGETS,
     name: str | None = None,
     brain: str | None = None,
     names: str = "canonical",
@@ -79,7 +79,7 @@ def export_model(
     """
     options = ExportOptions(
         Path(out),
-        tuple(to),
+        tuple(t for t in to.split(",") if t) if isinstance(to, str) else tuple(to),
         name,
         _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
         ReadOptions(step),

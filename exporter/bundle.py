@@ -7,7 +7,6 @@ Only a folder that holds a policy.json of ours is ever replaced.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import json
 import os
 import re
@@ -21,6 +20,7 @@ from typing import Any
 
 from converters.artifact import Artifact
 from exporter.version import __version__
+from signatures.digest import sha256_hex
 from signatures.errors import BundleError, UsageError
 from signatures.spec import Policy, PolicySignature, SourceMap
 
@@ -83,7 +83,7 @@ def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
 def write_staged(parent: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]) -> Path:
     """Write a bundle into a new hidden folder in ``parent``; returns that folder."""
     files = {path: data for artifact in artifacts for path, data in artifact.files.items()}
-    hashes = {p: {"sha256": hashlib.sha256(d).hexdigest(), "bytes": len(d)} for p, d in sorted(files.items())}
+    hashes = {p: {"sha256": sha256_hex(d), "bytes": len(d)} for p, d in sorted(files.items())}
     tool = content["tool"]
     body = {**{k: v for k, v in content.items() if k != "tool"}, "files": hashes, "tool": tool}
     with writing(parent, "the output folder cannot be written"):
@@ -130,7 +130,7 @@ def put_in_place(stage: Path, place: Path) -> None:
 
 
 def _two_renames(stage: Path, place: Path) -> None:
-    """Where a system has no exchange. If the process dies in between, the next run puts the old bundle back (recover)."""
+    """For systems without an exchange. If the process dies in between, the next run puts the old one back (recover)."""
     old = _aside(place)
     if old.exists():
         shutil.rmtree(old)
@@ -238,7 +238,7 @@ def check_hashes(folder: Path, content: Mapping[str, Any]) -> None:
                 fix="do not use this bundle; export the policy again",
             )
         try:
-            found = hashlib.sha256(path.read_bytes()).hexdigest()
+            found = sha256_hex(path.read_bytes())
         except FileNotFoundError as error:
             raise BundleError(
                 "is missing", where=str(path), why=f"{POLICY} names it", fix="export the policy again"

@@ -33,7 +33,8 @@ class _DefaultGroup(click.Group):
         return super().parse_args(ctx, args)
 
     def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        formatter.write_usage(ctx.command_path, "SOURCE... [-o DIR] [OPTIONS]\n       export-model COMMAND ...")
+        formatter.write_usage(ctx.command_path, "SOURCE... [-o DIR] [OPTIONS]")
+        formatter.write_usage(ctx.command_path, "COMMAND ...", prefix="       ")
 
 
 @click.group(
@@ -286,7 +287,11 @@ def inspect_command(
     from exporter.inspection import inspect_source, inspection_text
 
     found = inspect_source(source, _compile_options(brain, inputs, outputs, values))
-    click.echo(json.dumps(found.to_dict(), indent=1) if as_json else inspection_text(found))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=1))
+        return
+    click.echo(inspection_text(found))
+    click.echo(f"next: export-model {source} -o exported")
 
 
 @app.command("verify")
@@ -382,6 +387,8 @@ def main(args: Sequence[str] | None = None) -> None:
         click.echo("stopped", err=True)
         sys.exit(130)
     except click.ClickException as error:
+        if wants_json:
+            click.echo(json.dumps(UsageError(error.format_message(), fix="export-model --help").to_dict(), indent=1))
         error.show()
         sys.exit(2)
     except ExportModelError as error:

@@ -12,7 +12,7 @@ from converters.artifact import WriteOptions
 from converters.graph.options import CompileOptions
 from converters.registry import TARGETS, writer
 from exporter.bundle import safe_name
-from exporter.sources import read_source
+from exporter.sources import naming, read_source
 from exporter.tables import size_text, table
 from signatures.errors import ExportModelError
 from signatures.roles import Role
@@ -90,7 +90,7 @@ def inspect_source(path: Path | str, options: CompileOptions | None = None) -> I
     found = []
     for policy in source.policies(options):
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
-        found.append(PolicyInspection(policy, ops, {t: _refusal(policy, t) for t in TARGETS}))
+        found.append(PolicyInspection(policy, ops, {t: _refusal(source.path, policy, t) for t in TARGETS}))
     return Inspection(
         source.path,
         source.kind.label,
@@ -101,10 +101,11 @@ def inspect_source(path: Path | str, options: CompileOptions | None = None) -> I
     )
 
 
-def _refusal(policy: Policy, target: str) -> str | None:
+def _refusal(path: Path, policy: Policy, target: str) -> str | None:
     """Why a target cannot take the policy, None if it can: the writer is asked, nothing is kept."""
     try:
-        writer(target)(policy, WriteOptions("{}"))
+        with naming(path):
+            writer(target)(policy, WriteOptions("{}"))
     except ExportModelError as error:
         return error.what
     return None

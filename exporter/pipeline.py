@@ -22,7 +22,7 @@ from exporter import bundle
 from exporter.parity.pool import RuntimePool, chosen_runtimes
 from exporter.parity.report import ParityReport
 from exporter.parity.verify import Subject, VerifyOptions, verify
-from exporter.sources import Source, read_source
+from exporter.sources import Source, naming, read_source
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.graph import Graph
 from signatures.spec import Policy
@@ -88,12 +88,14 @@ def export(
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(TARGETS)}")
     runtimes, known = chosen_runtimes(options.verify, list(writers))
     jobs: list[_Job] = []
+    origins: list[tuple[str, str]] = []
     for path in paths:
         source = read_source(path, options.read)
         compiled = list(source.compiled(options.compile))
         named = _named([policy for _, policy in compiled], options, len(paths))
         jobs.extend(_Job(source, model, p) for (model, _), p in zip(compiled, named, strict=True))
-    bundle.distinct_names([(j.policy.name, f"{j.source.path} ({j.policy.name})") for j in jobs])
+        origins.extend((p.name, f"{path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
+    bundle.distinct_names(origins)
     for policy in (j.policy for j in jobs):
         bundle.recover(options.out / policy.name)
         bundle.check_replaceable(options.out / policy.name)
@@ -106,7 +108,8 @@ def export(
                 if runtimes:
                     subject = _subject(job, stage, artifacts, Path(scratch))
                     report = verify(subject, runtimes, known, pool, options.parity, progress)
-                    (stage / bundle.PARITY).write_bytes(bundle.dumps(report.to_dict()))
+                    with bundle.writing(options.out):
+                        (stage / bundle.PARITY).write_bytes(bundle.dumps(report.to_dict()))
                 failed = report is not None and report.passed is False
                 place = options.out / (f"{policy.name}.failed" if failed else policy.name)
                 bundle.put_in_place(stage, place)
@@ -126,8 +129,9 @@ def _write(job: _Job, writers: Mapping[str, Any], options: ExportOptions) -> tup
     if job.model.name is not None:
         origin["model"] = job.model.name
     content = bundle.contract(job.policy, origin)
-    how = WriteOptions(bundle.compact(content), options.opset)
-    return content, [write(job.policy, how) for write in writers.values()]
+    with naming(job.source.path):
+        how = WriteOptions(bundle.compact(content), options.opset)
+        return content, [write(job.policy, how) for write in writers.values()]
 
 
 @contextmanager
@@ -180,9 +184,8 @@ def verify_folder(
     """
     content = bundle.read_policy_json(folder)
     bundle.check_hashes(folder, content)
-    signature, source_map = bundle.signature_of(content)
     name = content["name"]
-    artefacts = _artefacts(folder, name)
+    artefacts = _artefacts(folder, content)
     graph_file = artefacts.get("bytes")
     if graph_file is None:
         raise BundleError(
@@ -191,10 +194,11 @@ def verify_folder(
             fix="export the policy again with bytes among --to",
         )
     original = None if source is None else _original_of(source, content)
-    graph = read_graph(graph_file.read_bytes())
+    graph = _checked_graph(folder, graph_file, content)
+    signature, source_map = bundle.signature_of(content)
     policy = Policy(
         name,
-        Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)),
+        graph,
         signature,
         {s.name: s.name for s in signature.inputs},
         {s.name: s.name for s in signature.outputs},
@@ -207,7 +211,7 @@ def verify_folder(
         report = verify(subject, used or ("numpy",), known, pool, options, progress)
     if source is None:
         note = "the source was not given: the reference is the bundle's own .bytes"
-        report = replace(report, reference="bytes/numpy", notes=(*report.notes, note))
+        report = replace(report, reference="bytes/numpy", notes=(*report.notes, note), self_consistent=False)
     if report.passed is None and not allow_unverified:
         raise RuntimeUnavailableError(
             "no independent runtime is installed, so nothing was verified",
@@ -218,14 +222,26 @@ def verify_folder(
     return report
 
 
-def _artefacts(folder: Path, name: str) -> dict[str, Path]:
-    places = {
-        "bytes": folder / f"{name}.bytes",
-        "saved_model": folder / "saved_model",
-        "tfjs": folder / "tfjs",
-        "onnx": folder / f"{name}.onnx",
+def _checked_graph(folder: Path, file: Path, content: Mapping[str, Any]) -> Graph:
+    """The graph of a bundle's .bytes; raises BundleError where it embeds another contract than policy.json."""
+    with naming(file):
+        graph = read_graph(file.read_bytes())
+    node = graph.get(CONTRACT_NODE)
+    embedded = b"" if node is None or node.value is None or node.value.ndim else node.value.item()
+    bundle.check_contract(folder, content, embedded.decode("utf-8", "replace") if isinstance(embedded, bytes) else "")
+    return Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE))
+
+
+def _artefacts(folder: Path, content: Mapping[str, Any]) -> dict[str, Path]:
+    """Format → what a loader is given, for the formats whose files policy.json names."""
+    name, files = content["name"], content["files"]
+    mains = {
+        "bytes": (f"{name}.bytes", f"{name}.bytes"),
+        "saved_model": ("saved_model/saved_model.pb", "saved_model"),
+        "tfjs": ("tfjs/model.json", "tfjs"),
+        "onnx": (f"{name}.onnx", f"{name}.onnx"),
     }
-    return {kind: path for kind, path in places.items() if path.exists()}
+    return {kind: folder / main for kind, (file, main) in mains.items() if file in files}
 
 
 def _sizes(content: Mapping[str, Any]) -> dict[str, int]:

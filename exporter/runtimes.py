@@ -10,7 +10,6 @@ that a newer version of this program never runs the packages of an older one.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib.metadata
 import importlib.util
 import json
@@ -24,6 +23,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 
 JS_SOURCE = Path(__file__).resolve().parent.parent / "converters" / "tfjs" / "js"
@@ -244,7 +244,7 @@ def _module_origin(name: str) -> str | None:
 
 
 def _cached_js_home() -> Path:
-    digest = hashlib.sha256((JS_SOURCE / "package-lock.json").read_bytes()).hexdigest()
+    digest = sha256_hex((JS_SOURCE / "package-lock.json").read_bytes())
     return _cache_root() / "export-model" / f"js-{digest[:12]}"
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,11 +12,36 @@ from converters.graph.options import CompileOptions
 from converters.recognise import FileKind, not_readable, recognise_path
 from converters.registry import reader
 from converters.source import ReadOptions, SourceModel
-from signatures.errors import ExportModelError
+from signatures.digest import sha256_hex
+from signatures.errors import ExportModelError, GraphError, SourceError
 from signatures.spec import Policy
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
+
+#: What Python and numpy raise where a damaged graph breaks something that a step takes for granted.
+_BROKEN = (
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError),
+    *(MemoryError, RecursionError),
+)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors inside name the source. It is untrusted input: what nobody foresaw is an error of the source, too."""
+    try:
+        yield
+    except ExportModelError as error:
+        raise error.at(str(path)) from error.__cause__
+    except OSError as error:
+        raise SourceError("cannot be read", where=str(path), why=str(error), fix="check its files") from error
+    except _BROKEN as error:
+        raise GraphError(
+            "the graph cannot be understood",
+            where=str(path),
+            why=f"a step failed on something it did not expect ({type(error).__name__}: {error})",
+            fix="if the runtime it was made for loads it, please open an issue with it; else freeze it again",
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -41,11 +66,9 @@ class Source:
     def compiled(self, options: CompileOptions | None = None) -> Iterator[tuple[SourceModel, Policy]]:
         """Each model's policies; raises ExportModelError that names the file."""
         for model in self.models:
-            try:
-                for policy in compile_graph(model.graph, self.stem(model), options, model.facts):
-                    yield model, policy
-            except ExportModelError as error:
-                raise error.at(str(self.path)) from error
+            with naming(self.path):
+                policies = compile_graph(model.graph, self.stem(model), options, model.facts)
+            yield from ((model, policy) for policy in policies)
 
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
         """All policies in it."""
@@ -59,15 +82,13 @@ def read_source(path: Path | str, options: ReadOptions | None = None) -> Source:
     read = reader(kind.key)
     if read is None:
         raise not_readable(kind, path)
-    try:
+    with naming(path):
         models = read(path, options or ReadOptions())
-    except ExportModelError as error:
-        raise error.at(str(path)) from error
-    files = sorted({f for model in models for f in model.files})
-    return Source(path, kind, _digest(files), sum(f.stat().st_size for f in files), models)
+        files = sorted({f for model in models for f in model.files})
+        return Source(path, kind, _digest(files), sum(f.stat().st_size for f in files), models)
 
 
 def _digest(files: Sequence[Path]) -> str:
     """The sha256 of a single file, or of the hashes of several in the order of their names."""
-    hashes = [hashlib.sha256(f.read_bytes()).hexdigest() for f in files]
-    return hashes[0] if len(hashes) == 1 else hashlib.sha256("\n".join(hashes).encode()).hexdigest()
+    hashes = [sha256_hex(f.read_bytes()) for f in files]
+    return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())

@@ -70,6 +70,8 @@ def verdict(report: ParityReport) -> str:
     if report.passed is None:
         return "NOT VERIFIED: no independent runtime ran"
     count = len({(c.format, c.runtime) for c in report.comparisons if c.format != "reference"})
+    if report.verdict == "self-consistent":
+        return f"SELF-CONSISTENT: {count} format/runtime pairs agree with {report.reference}; nothing runs the source"
     if report.passed:
         return f"PASSED: {count} format/runtime pairs agree with {report.reference}"
     return f"FAILED: {len(report.failures)} of {len(report.comparisons)} comparisons disagree with {report.reference}"

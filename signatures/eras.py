@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
+#: What ``version_number`` says from release 17 (0.26.0) on.
+TORCH_VERSION_3 = 3
+
 
 def generation(constants: Mapping[str, int | float], placeholders: Collection[str], ops: Collection[str]) -> str:
     """A label such as ``"ML-Agents 0.19.0"`` or ``"ML-Agents 0.3-0.4"``; ``"own model"`` where nothing tells.
@@ -30,3 +33,24 @@ def generation(constants: Mapping[str, int | float], placeholders: Collection[st
     if any(n == "state" or n.startswith("observation_") for n in names):
         return "ML-Agents 0.1-0.2"
     return "own model"
+
+
+def torch_generation(version: int, inputs: Collection[str], outputs: Collection[str]) -> str:
+    """The versions of ML-Agents whose PyTorch exporter writes such inputs and outputs (its model_serialization.py).
+
+    0.20 to 0.22 have ``action`` alone; from 0.23 on actions are named by kind; 0.24 added ``obs_i`` for sensors of
+    rank 2; 0.25 renamed ``memories`` to ``recurrent_in`` and gave ``recurrent_out``; 0.26 (version 3) has ``obs_i``
+    for every sensor; 0.28 added the deterministic outputs.
+    """
+    names = set(outputs)
+    if version >= TORCH_VERSION_3:
+        span = "0.28-1.1" if any(n.startswith("deterministic_") for n in names) else "0.26-0.27"
+    elif not names & {"continuous_actions", "discrete_actions"}:
+        span = "0.20-0.22"
+    elif "recurrent_in" in inputs or "recurrent_out" in names:
+        span = "0.25"
+    elif "memories" in inputs:
+        span = "0.23-0.24"
+    else:
+        span = "0.24-0.25" if any(n.startswith("obs_") for n in inputs) else "0.23-0.25"
+    return f"ML-Agents {span} (PyTorch)"

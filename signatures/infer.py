@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.graph import Graph, Node, TensorShape, node_of, normal_ref, split_ref
 from signatures.roles import (
     ACTION_NAMES,
+    CANONICAL,
     CONSTANT_NAMES,
     INPUT_PATTERNS,
     INPUT_ROLES,
@@ -42,6 +43,9 @@ class SourceFacts:
     - ``image_layout``: NHWC, or NCHW for torch exports.
     - ``memory_layout``: the memory's parts in order; empty: found from the graph.
     - ``constants``: the ones that are no nodes of the graph.
+    - ``outputs``: the nodes that the format declares as outputs, with their roles where it says them; empty: it
+      declares none, and any node may be an output.
+    - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``notes``: what the user should know of this source.
     """
 
@@ -51,6 +55,8 @@ class SourceFacts:
     image_layout: str = "NHWC"
     memory_layout: tuple[str, ...] = ()
     constants: Mapping[str, int | float] = field(default_factory=dict)
+    outputs: Mapping[str, Role | None] = field(default_factory=dict)
+    rows: int | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -75,6 +81,8 @@ class Brain:
     #: (output's name in the source, its role, its tensor), in graph order
     outputs: tuple[tuple[str, Role, str], ...]
     constants: Mapping[str, int | float] = field(default_factory=dict)
+    #: tensors that nothing reads and that could be outputs too, in a graph whose names say nothing
+    left_out: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -102,7 +110,7 @@ class Brain:
                 if own is not None or base == "deterministic_action":
                     names[base] = heads[0].deterministic if own is None else own.deterministic
             elif role is not Role.ACTION:
-                names[base] = base
+                names[base] = CANONICAL.get(role, base)
         return names
 
     @property
@@ -114,24 +122,33 @@ class Brain:
 # ------------------------------------------------------------------ brains and outputs
 
 
-def find_brains(graph: Graph, wanted: Mapping[str, Role] | None = None) -> tuple[Brain, ...]:
+def find_brains(
+    graph: Graph, wanted: Mapping[str, Role] | None = None, declared: Mapping[str, Role | None] | None = None
+) -> tuple[Brain, ...]:
     """The policies in a graph, in graph order.
 
-    ``wanted`` (source output name → role, from ``--output``) decides instead of names. Raises NotAPolicyError when
+    ``wanted`` (source output name → role, from ``--output``) decides instead of names. ``declared`` are the outputs
+    that the format names, with their roles where it knows them. Raises NotAPolicyError when
     there is nothing that depends on a placeholder, SignatureError when several nodes could be the action.
     """
     if wanted:
-        return (_chosen(graph, wanted),)
+        return _chosen(graph, wanted, declared)
     fed = _depends_on_input(graph)
+    given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
+    if Role.ACTION in given.values():
+        outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
+        return (Brain("", outputs, _constants(graph, ""), tuple(n for n in declared or () if n in fed - set(given))),)
+    if declared:
+        fed &= set(declared)
     scopes: dict[str, int] = {}
     for node in graph.nodes:
         scope, _, base = node.name.rpartition("/")
-        if base in ACTION_NAMES and node.name in fed:
+        if base in ACTION_NAMES and node.name in fed and node.op not in _PLACEHOLDERS:
             scopes[f"{scope}/" if scope else ""] = node.name.count("/")
     if scopes:
         depth = min(scopes.values())
         return tuple(_brain(graph, scope, fed) for scope, d in scopes.items() if d == depth)
-    return (_unnamed(graph, fed),)
+    return (_unnamed(graph, fed, set(declared or ())),)
 
 
 def _constants(graph: Graph, scope: str) -> dict[str, int | float]:
@@ -149,7 +166,8 @@ def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
     outputs = []
     for node in graph.nodes:
         base = node.name[len(scope) :]
-        if node.name.startswith(scope) and base in OUTPUT_NAMES and node.name in fed:
+        named = node.name.startswith(scope) and base in OUTPUT_NAMES
+        if named and node.name in fed and node.op not in _PLACEHOLDERS:
             outputs.append((base, OUTPUT_NAMES[base], node.name))
     return Brain(scope, tuple(outputs), _constants(graph, scope))
 
@@ -163,8 +181,10 @@ def _depends_on_input(graph: Graph) -> set[str]:
     return fed
 
 
-def _chosen(graph: Graph, wanted: Mapping[str, Role]) -> Brain:
-    outputs = []
+def _chosen(
+    graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None
+) -> tuple[Brain, ...]:
+    outputs: list[tuple[str, Role, str]] = []
     for name, role in wanted.items():
         node_name, _ = split_ref(name)
         if node_name not in graph:
@@ -177,10 +197,33 @@ def _chosen(graph: Graph, wanted: Mapping[str, Role]) -> Brain:
             roles = ", ".join(OUTPUT_ROLES)
             raise UsageError(f"--output {name}={role}: that is not an output's role", fix=f"one of: {roles}")
         outputs.append((node_name.rsplit("/", 1)[-1], role, normal_ref(name)))
-    if not any(role is Role.ACTION for _, role, _ in outputs):
-        # Naming one output is enough to say that the rest is where it always is.
-        outputs.extend(o for b in find_brains(graph) for o in b.outputs if o[2] not in {x[2] for x in outputs})
-    return Brain("", tuple(outputs), _constants(graph, ""))
+    if any(role is Role.ACTION for _, role, _ in outputs):
+        scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
+        return (Brain(scope, tuple(outputs), _constants(graph, scope)),)
+    # Naming one output is enough to say that the rest is where it always is.
+    brains = find_brains(graph, declared=declared)
+    named = {reference for _, _, reference in outputs}
+    owners = [
+        max((b for b in brains if o[2].startswith(b.scope)), key=lambda b: len(b.scope), default=brains[0])
+        for o in outputs
+    ]
+    return tuple(
+        replace(
+            brain,
+            outputs=(
+                *(o for o, owner in zip(outputs, owners, strict=True) if owner is brain),
+                *(o for o in brain.outputs if o[2] not in named),
+            ),
+        )
+        for brain in brains
+    )
+
+
+def _scope_of(graph: Graph, names: Sequence[str]) -> str:
+    """The scope of a brain whose outputs are ``names``: the one they share, if a placeholder is in it, too."""
+    parents = {name.rpartition("/")[0] for name in names}
+    scope = f"{parents.pop()}/" if len(parents) == 1 else "/"
+    return scope if any(n.op in _PLACEHOLDERS and n.name.startswith(scope) for n in graph.nodes) else ""
 
 
 def _close(name: str, names: Sequence[str]) -> str | None:
@@ -190,9 +233,9 @@ def _close(name: str, names: Sequence[str]) -> str | None:
     return f"close to it: {', '.join(near)}" if near else None
 
 
-def _unnamed(graph: Graph, fed: set[str]) -> Brain:
-    """A graph without a node called ``action``: the one tensor that nothing reads is the action."""
-    read = {node_of(r) for node in graph.nodes for r in node.inputs}
+def _unnamed(graph: Graph, fed: set[str], declared: set[str]) -> Brain:
+    """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
+    read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
     sinks = [n for n in graph.nodes if n.name not in read and n.name in fed and n.op not in _PLACEHOLDERS]
     if not sinks:
         raise NotAPolicyError(
@@ -210,7 +253,8 @@ def _unnamed(graph: Graph, fed: set[str]) -> Brain:
             fix="name them: --output NAME=action (and, if it has them, --output NAME=value_estimate …)",
         )
     node = chosen[0]
-    return Brain("", ((node.name.rsplit("/", 1)[-1], Role.ACTION, node.name),), _constants(graph, ""))
+    output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
+    return Brain("", (output,), _constants(graph, ""), tuple(n.name for n in sinks if n is not node))
 
 
 # ------------------------------------------------------------------ inputs
@@ -226,8 +270,11 @@ def classify_inputs(
     """
     upstream = graph.ancestors(brain.roots)
     found = [n for n in graph.nodes if n.op in _PLACEHOLDERS and n.name in upstream]
-    wanted = dict(wanted or {})
+    inputs = {n.name for n in found}
+    others = {n.name for n in graph.nodes if n.op in _PLACEHOLDERS and not n.name.startswith(brain.scope)} - inputs
+    wanted = {name: role for name, role in (wanted or {}).items() if node_of(name) not in others}
     roles: dict[str, Role] = {}
+    decided: set[str] = set()
     for node in found:
         base = node.name[len(brain.scope) :] if node.name.startswith(brain.scope) else node.name
         override = next((wanted.pop(k) for k in (node.name, f"{node.name}:0", base) if k in wanted), None)
@@ -235,6 +282,8 @@ def classify_inputs(
         if role is None and node.op == "PlaceholderWithDefault":
             continue
         roles[node.name] = role or Role.PARAMETER
+        if override is not None or roles[node.name] is not Role.PARAMETER:
+            decided.add(node.name)
         if override is not None and override not in INPUT_ROLES:
             raise UsageError(
                 f"--input {node.name}={override}: that is not an input's role", fix=f"one of: {', '.join(INPUT_ROLES)}"
@@ -246,7 +295,6 @@ def classify_inputs(
             why=_close(name, [n.name for n in found]) or f"its inputs are {', '.join(n.name for n in found)}",
             fix="export-model inspect FILE lists them",
         )
-    decided = set(roles) - {n for n, r in roles.items() if r is Role.PARAMETER}
     _by_structure(graph, found, roles, decided)
     if not any(r in OBSERVATIONS for r in roles.values()):
         names = ", ".join(f"{n.name} {_shape_text(n)}" for n in found) or "none"

@@ -71,6 +71,9 @@ INPUT_PATTERNS: tuple[tuple[re.Pattern[str], Role, tuple[int, ...] | None], ...]
     (re.compile(r"(visual_)?observation(_?\d+)?"), Role.VISUAL, (4,)),
     (re.compile(r"obs_\d+"), Role.VISUAL, (4,)),
     (re.compile(r"obs_\d+|entities_\d+"), Role.ENTITIES, (3,)),
+    # other trainers: Stable-Baselines3, CleanRL, rsl_rl; PyTorch's own input.1
+    (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VECTOR, (2,)),
+    (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VISUAL, (4,)),
     (re.compile(r"epsilon(_\d+)?"), Role.NOISE, None),
     (re.compile(r"action_masks"), Role.MASKS, (2,)),
     (re.compile(r"prev_action"), Role.PREV_ACTION, (1, 2)),

@@ -99,6 +99,11 @@ class PolicySignature:
         """The output called ``name``; KeyError if there is none."""
         return _named(self.outputs, name)
 
+    def rows(self, feeds: Mapping[str, np.ndarray]) -> int:
+        """The batch that ``feeds`` have: a parameter's first axis may be longer, it is not free."""
+        free = (s.name for s in self.inputs if s.shape and s.shape[0] is None)
+        return next((int(feeds[name].shape[0]) for name in free), 1)
+
     @property
     def observations(self) -> tuple[TensorSpec, ...]:
         """Inputs that are observations."""
@@ -161,6 +166,7 @@ class SourceMap:
       left to draw if ``noise_kept``.
     - ``branches``: the tensors that the draws of a sampled action are made from, in branch order (None where the
       source cannot be asked for one).
+    - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     """
 
     feeds: Mapping[str, str] = field(default_factory=dict)
@@ -170,6 +176,7 @@ class SourceMap:
     noise: Mapping[str, tuple[int | None, ...]] = field(default_factory=dict)
     noise_kept: bool = False
     branches: tuple[str | None, ...] = ()
+    rows: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """What policy.json keeps of it: feeds and fetches are the ``source`` of its inputs and outputs."""
@@ -179,6 +186,7 @@ class SourceMap:
             "noise": {name: list(shape) for name, shape in self.noise.items()},
             "noise_kept": self.noise_kept,
             "branches": list(self.branches),
+            "rows": self.rows,
         }
 
     @classmethod
@@ -192,6 +200,7 @@ class SourceMap:
             noise={n: tuple(shape) for n, shape in entry.get("noise", {}).items()},
             noise_kept=bool(entry.get("noise_kept", False)),
             branches=tuple(entry.get("branches", ())),
+            rows=entry.get("rows"),
         )
 
 

@@ -16,7 +16,7 @@ from converters.frozen_graph.tensors import from_array
 from converters.graph.ops.base import REQUIRED, Attr
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import Types, infer_types
-from signatures.errors import UnsupportedOpError
+from signatures.errors import GraphError, UnsupportedOpError
 from signatures.graph import Graph, Node, TensorShape
 
 #: GraphDef version written: that of TF 1.4. (Graphs frozen by TF 1.x carry none, which TensorFlow.js cannot read.)
@@ -49,7 +49,13 @@ def encode(graph: Graph, *, explicit: bool = False) -> Any:
             value = _value(node, attr, types)
             if value is _OMIT or (not explicit and attr.since is not None and value == attr.default):
                 continue
-            _set(proto.attr[attr.name], attr, value)
+            try:
+                _set(proto.attr[attr.name], attr, value)
+            except (AttributeError, TypeError, ValueError) as error:
+                raise GraphError(
+                    f"node {node.name!r} ({node.op}) has {attr.name}={value!r}, which is no {attr.kind}",
+                    fix="the graph is damaged; freeze it again from its checkpoint",
+                ) from error
     return message
 
 

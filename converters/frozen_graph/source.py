@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from converters.bundle_source import facts_of, recalled
 from converters.frozen_graph.reader import read_graph
 from converters.source import OriginalRun, ReadOptions, SourceModel
 
 
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:
-    """The one graph in a file."""
-    graph = read_graph(path.read_bytes())
-    return [SourceModel(graph, (path,), original=OriginalRun("tensorflow", path, {"kind": "graph"}))]
+    """The one graph in a file; one that this tool wrote is what its contract says."""
+    graph, contract = recalled(read_graph(path.read_bytes()))
+    original = OriginalRun("tensorflow", path, {"kind": "graph"})
+    return [SourceModel(graph, (path,), facts_of(graph, contract), original=original)]

@@ -41,12 +41,23 @@ def compile_graph(
     Raises NotAPolicyError, SignatureError, UnsupportedOpError, GraphError, UsageError.
     """
     options, facts = options or CompileOptions(), facts or SourceFacts()
+    options = _by_nodes(graph, options)
     original, graph = graph, set_values(graph, options.values)
-    brains = find_brains(graph, options.outputs)
+    brains = find_brains(graph, options.outputs, facts.outputs)
     return [
         _Compiler(graph, original, brain, options, facts).run(f"{name}-{brain.label}" if len(brains) > 1 else name)
         for brain in _chosen_brains(brains, options.brain)
     ]
+
+
+def _by_nodes(graph: Graph, options: CompileOptions) -> CompileOptions:
+    """The options with nodes in place of names that only the source has (ONNX values are named more freely)."""
+    names = {n.origin: n.name for n in graph.nodes if isinstance(n.origin, str)}
+
+    def moved(given: Mapping[str, Any]) -> dict[str, Any]:
+        return {k if node_of(k) in graph else names.get(k, k): v for k, v in given.items()}
+
+    return replace(options, inputs=moved(options.inputs), outputs=moved(options.outputs), values=moved(options.values))
 
 
 def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain, ...]:
@@ -90,15 +101,17 @@ class _Compiler:
         masked = Role.MASKS in roles.values()
         for head in self.brain.heads:
             dtype = types[fetches[head.name]].dtype
-            self.meanings[head.name] = action_meaning(work, fetches[head.name], dtype, masked)
+            scores = masked and head.base != "continuous_actions"
+            self.meanings[head.name] = action_meaning(work, fetches[head.name], dtype, scores)
         work, fetches = _settle_single_draws(work, fetches, list(self.meanings.values()), types)
         draws = {n.name: _dims(types, n.name) for n in samplers(work)}
-        origins = {n.name: n.origin for n in samplers(work)}
         deterministic = self.options.deterministic
         kept = self.options.noise == "keep" and not deterministic
         fed = {n: _dims(types, n) for n, r in roles.items() if r is Role.NOISE and n in work}
+        before = work
         work = lift_noise(work, "keep" if kept else "zero" if deterministic else self.options.noise, fed)
         noise = {**draws, **fed}
+        tensors = {n: _tensor(before[n]) for n in noise}
         branches = self._branch_origins(work, pinned)
         for head in self.brain.heads:
             work, fetches = add_companions(work, fetches, head, self.meanings[head.name], noise)
@@ -110,8 +123,7 @@ class _Compiler:
             {n.op for n in upstream.nodes},
         )  # fmt: skip
         signature, feeds, named = build_signature(compiled)
-        policy = self._named(name, Policy(name, work, signature, feeds, named))
-        tensors = {**{n: f"{n}:0" for n in noise}, **{n: o for n, o in origins.items() if isinstance(o, str)}}
+        policy = self._named(name, Policy(name, work, signature, feeds, named), roles)
         return replace(
             policy, source=self._source_map(policy, pinned, roles, branches, {tensors[n]: s for n, s in noise.items()})
         )
@@ -123,11 +135,12 @@ class _Compiler:
 
     def _branch_origins(self, work: Graph, pinned: Graph) -> tuple[str | None, ...]:
         """The source's tensors that a sampled action is drawn from."""
+        known = {n.origin for n in pinned.nodes}
         found: list[str | None] = []
         for meaning in self.meanings.values():
             for branch in meaning.branches:
                 origin = work.producer(branch).origin if split_ref(branch)[1] == 0 else None
-                found.append(origin if isinstance(origin, str) and node_of(origin) in pinned else None)
+                found.append(origin if isinstance(origin, str) and origin in known else None)
         return tuple(found)
 
     def _without_chance(self, fetches: dict[str, str], sources: dict[str, Any]) -> dict[str, str]:
@@ -141,18 +154,24 @@ class _Compiler:
                 sources[head.name] = None
         return {n: r for n, r in fetches.items() if n != LOG_PROBS}
 
-    def _named(self, name: str, policy: Policy) -> Policy:
-        """Inputs and outputs under the signature's names; with ``--names source`` the trainer's constants too."""
-        scope = self.brain.scope
-        keys = list(self.brain.constants) if self.options.names == "source" else []
-        graph = name_tensors(policy.graph, policy.feeds, policy.fetches, (CONTRACT_NODE, *(scope + k for k in keys)))
+    def _named(self, name: str, policy: Policy, roles: Mapping[str, Role]) -> Policy:
+        """Inputs and outputs under the signature's names.
+
+        With ``--names source`` the trainer's constants are kept too, and ``sequence_length``, read by nothing: Unity's
+        internal brain of 0.3 to 0.5 feeds it to every recurrent policy without asking whether it is there.
+        """
+        scope, source = self.brain.scope, self.options.names == "source"
+        keys = list(self.brain.constants) if source else []
+        unread = [n for n, r in roles.items() if r is Role.SEQUENCE_LENGTH and source]
+        reserved = (CONTRACT_NODE, *(scope + k for k in keys), *unread)
+        graph = name_tensors(policy.graph, policy.feeds, policy.fetches, reserved)
         constants = [
             Node(scope + key, "Const", value=np.array(self.brain.constants[key], np.int32), origin=f"{scope}{key}:0")
             for key in keys
         ]
         return Policy(
             name,
-            Graph((*graph.nodes, *constants)),
+            Graph((*graph.nodes, *constants, *(self.original[n] for n in unread))),
             policy.signature,
             {s.name: s.name for s in policy.signature.inputs},
             {s.name: s.name for s in policy.signature.outputs},
@@ -162,19 +181,27 @@ class _Compiler:
         self, policy: Policy, source: Graph, roles: Mapping[str, Role], branches: tuple[str | None, ...], noise: Shapes
     ) -> SourceMap:
         """How to run the source, from what became of its placeholders."""
-        fixed = {f"{n}:0": constant_value(source[n], 1) for n, r in roles.items() if r is Role.SEQUENCE_LENGTH}
-        given = {f"{n}:0": constant_value(self.original[n], v) for n, v in self.options.values.items()}
+        fixed = {
+            _tensor(source[n]): constant_value(source[n], 1) for n, r in roles.items() if r is Role.SEQUENCE_LENGTH
+        }
+        given = {_tensor(self.original[n]): constant_value(self.original[n], v) for n, v in self.options.values.items()}
         return SourceMap(
             feeds={s.name: s.source for s in policy.signature.inputs if isinstance(s.source, str)},
             fetches={s.name: s.source for s in policy.signature.outputs if isinstance(s.source, str)},
             fixed={**fixed, **given},
             batch_sizes={
-                f"{n}:0": batch_size_rank(source, source[n]) for n, r in roles.items() if r is Role.BATCH_SIZE
+                _tensor(source[n]): batch_size_rank(source, source[n]) for n, r in roles.items() if r is Role.BATCH_SIZE
             },
             noise=dict(noise),
             noise_kept=self.options.noise == "keep" and not self.options.deterministic,
             branches=branches,
+            rows=self.facts.rows,
         )
+
+
+def _tensor(node: Node) -> str:
+    """The source's name for what a placeholder or a sampler gives."""
+    return node.origin if isinstance(node.origin, str) else f"{node.name}:0"
 
 
 def _settle_single_draws(

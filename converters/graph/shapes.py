@@ -34,12 +34,17 @@ def infer_types(graph: Graph, *, partial: bool = False) -> Types:
             dtype = types[node.inputs[0]].dtype if node.inputs and node.inputs[0] in types else FLOAT32
             if node.op == "TensorArraySizeV3":
                 dtype = INT32
-            results: Sequence[TensorType] = [TensorType(node.attrs.get("dtype", dtype), None)] * 2
+            for index in range(2):
+                types[ref(node.name, index)] = TensorType(node.attrs.get("dtype", dtype), None)
         else:
-            results = _results(op_of(node), node, _arguments(node, types), symbols)
-        for index, result in enumerate(results):
-            types[ref(node.name, index)] = result
+            add_types(types, node, symbols)
     return types
+
+
+def add_types(types: Types, node: Node, symbols: Symbols) -> None:
+    """Extend ``types`` by the outputs of a node whose inputs are in it; raises as ``infer_types`` does."""
+    for index, result in enumerate(_results(op_of(node), node, _arguments(node, types), symbols)):
+        types[ref(node.name, index)] = result
 
 
 def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:

@@ -53,6 +53,8 @@ def build_signature(compiled: Compiled) -> tuple[PolicySignature, dict[str, str]
     """(signature, name → placeholder, name → tensor). Raises SignatureError."""
     types = infer_types(compiled.graph)
     notes = list(compiled.facts.notes)
+    if compiled.brain.left_out:
+        notes.append(f"not exported: {', '.join(compiled.brain.left_out)}; name an output with --output NAME=ROLE")
     feeds, inputs = _inputs(compiled, types, notes)
     outputs, named = _outputs(compiled, types)
     meanings = compiled.meanings.values()
@@ -225,6 +227,8 @@ def _algorithm(compiled: Compiled, roles: list[Role]) -> str | None:
     SAC squashes its sample with tanh and has no critic in the export; PPO clips it (0.4 on) or not (0.1-0.3); cloned
     behaviour has no noise. Discrete graphs of PPO and SAC do not differ.
     """
+    if compiled.facts.family is not None and not compiled.facts.family.startswith("ML-Agents"):
+        return None
     head: Head = compiled.brain.heads[0]
     meaning = compiled.meanings[head.name]
     if meaning.role is Role.DETERMINISTIC and not compiled.options.deterministic:

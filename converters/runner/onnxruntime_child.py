@@ -1,21 +1,17 @@
-"""onnxruntime in its own process: ``python -m converters.runner.onnxruntime_child``."""
+"""onnxruntime in its own process: ``python -m converters.runner.onnxruntime_child``.
+
+A model of ours is loaded as it lies there. A source is loaded with ``lift`` (the values of its samplers of normals,
+which become inputs); any of its inner values can then be fetched.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from converters.runner.child import claim_stdout, serve
+from converters.runner.child import Model, claim_stdout, serve
 from converters.runner.wire import Tensors
-
-
-class _Model:
-    def __init__(self, session: Any) -> None:
-        self.session = session
-
-    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        values = self.session.run(list(fetch), feeds)
-        return dict(zip(fetch, values, strict=True))
 
 
 def main() -> None:
@@ -24,12 +20,46 @@ def main() -> None:
     import onnxruntime  # noqa: TID251  this is the child process
     from onnxruntime.capi import onnxruntime_pybind11_state as state  # noqa: TID251
 
-    def load(header: Mapping[str, Any]) -> _Model:
+    def session(model: str | bytes) -> Any:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        return _Model(onnxruntime.InferenceSession(header["path"], options, providers=["CPUExecutionProvider"]))
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+    class Written:
+        """A model that is run as it is."""
+
+        def __init__(self, path: str) -> None:
+            self.session = session(path)
+
+        def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+            values = self.session.run(list(fetch), feeds)
+            return dict(zip(fetch, values, strict=True))
+
+    class Source:
+        """A foreign model: a session for each set of values that is asked for."""
+
+        def __init__(self, path: str, draws: Sequence[str]) -> None:
+            from converters.onnx import edit
+
+            self.cut = edit.cut
+            self.model = edit.lifted(edit.load(Path(path)), draws)
+            self.sessions: dict[tuple[str, ...], Any] = {}
+
+        def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+            key = tuple(dict.fromkeys(fetch))
+            if key not in self.sessions:
+                self.sessions[key] = session(self.cut(self.model, key))
+            chosen = self.sessions[key]
+            wanted = {i.name for i in chosen.get_inputs()}
+            values = chosen.run(list(key), {n: a for n, a in feeds.items() if n in wanted})
+            return dict(zip(key, values, strict=True))
+
+    def load(header: Mapping[str, Any]) -> Model:
+        if "lift" in header:
+            return Source(header["path"], header["lift"])
+        return Written(header["path"])
 
     faults = tuple(kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception))
     serve("onnxruntime", onnxruntime.__version__, load, (*faults, RuntimeError), out)

@@ -1,4 +1,9 @@
-"""TensorFlow in its own process: frozen graphs in a Session, SavedModels through a signature.
+"""TensorFlow in its own process: graphs in a Session, SavedModels through a signature.
+
+What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``checkpoint`` (a training graph whose
+variables are restored from ``prefix``), ``variables`` (a SavedModel of TensorFlow 1 in a Session, by the names of its
+tensors), ``function`` (a SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model``
+(a SavedModel called by ``signature``).
 
 ``python -m converters.runner.tensorflow_child``
 """
@@ -11,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.runner.child import Model, claim_stdout, serve
+from converters.runner.tensorflow_freeze import frozen_function
 from converters.runner.wire import Tensors
 
 
@@ -24,21 +30,63 @@ def main() -> None:
     tf.config.threading.set_intra_op_parallelism_threads(1)
     tf.config.threading.set_inter_op_parallelism_threads(1)
 
-    class Frozen:
-        """A GraphDef in a Session; feeds and fetches are tensor names, inner ones too."""
+    class InSession:
+        """A graph in a Session; feeds and fetches are tensor names, inner ones too."""
 
-        def __init__(self, path: str) -> None:
-            definition = tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())
-            graph = tf.Graph()
-            with graph.as_default():
-                tf.import_graph_def(definition, name="")
-            self.session = tf.compat.v1.Session(graph=graph)
+        def __init__(self, graph: Any) -> None:
+            settings = tf.compat.v1.ConfigProto(allow_soft_placement=True)
+            self.session = tf.compat.v1.Session(graph=graph, config=settings)
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
             values = self.session.run(
                 [_tensor(n) for n in fetch], {_tensor(name): array for name, array in feeds.items()}
             )
             return dict(zip(fetch, values, strict=True))
+
+    def imported(definition: Any) -> Any:
+        for node in definition.node:
+            node.device = ""
+        graph = tf.Graph()
+        with graph.as_default():
+            tf.import_graph_def(definition, name="")
+        return graph
+
+    def frozen(path: str) -> InSession:
+        return InSession(imported(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())))
+
+    def restored(path: str, prefix: str) -> InSession:
+        """A training graph with a checkpoint's values: by its own saver, as the trainers did it, or one by one."""
+        data = Path(path).read_bytes()
+        if path.endswith(".meta"):
+            graph = imported(tf.compat.v1.MetaGraphDef.FromString(data).graph_def)
+        else:
+            graph = imported(tf.compat.v1.GraphDef.FromString(data))
+        model = InSession(graph)
+        operations = {o.name for o in graph.get_operations()}
+        if {"save/restore_all", "save/Const"} <= operations:
+            model.session.run("save/restore_all", {"save/Const:0": prefix})
+            return model
+        values = tf.train.load_checkpoint(prefix)
+        with graph.as_default():
+            for operation in graph.get_operations():
+                key = operation.name
+                if operation.type == "VarHandleOp":
+                    key = operation.get_attr("shared_name").decode() or key
+                if not values.has_tensor(key):
+                    continue
+                value = values.get_tensor(key)
+                if operation.type == "VarHandleOp":
+                    model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=value))
+                elif operation.type in ("VariableV2", "Variable"):
+                    model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=value).op)
+        return model
+
+    def with_variables(path: str, tags: Sequence[str]) -> InSession:
+        """A SavedModel of TensorFlow 1."""
+        model = InSession(tf.Graph())
+        with model.session.graph.as_default():
+            tf.compat.v1.saved_model.load(model.session, list(tags), path)
+        return model
 
     class Saved:
         """A SavedModel, called as TensorFlow 2 does: one signature, inputs by name."""
@@ -52,9 +100,16 @@ def main() -> None:
             return {name: results[name].numpy() for name in fetch}
 
     def load(header: Mapping[str, Any]) -> Model:
-        if header["kind"] == "saved_model":
-            return Saved(header["path"], header.get("signature", "serving_default"))
-        return Frozen(header["path"])
+        kind, path = header["kind"], header["path"]
+        if kind == "saved_model":
+            return Saved(path, header.get("signature", "serving_default"))
+        if kind == "checkpoint":
+            return restored(path, header["prefix"])
+        if kind == "variables":
+            return with_variables(path, header["tags"])
+        if kind == "function":
+            return InSession(imported(frozen_function(path, header["form"], header.get("signature")).graph_def))
+        return frozen(path)
 
     serve("tensorflow", tf.__version__, load, (tf.errors.OpError, AttributeError, RuntimeError), out)
 

@@ -86,7 +86,7 @@ class Original:
         return np.stack([np.argmax(p, axis=1) for p in logits], axis=1).astype(np.int64)
 
     def _feeds(self, feeds: Mapping[str, np.ndarray], *, zero_noise: bool) -> dict[str, np.ndarray]:
-        batch = max(a.shape[0] for a in feeds.values() if a.ndim)
+        batch = self.signature.rows(feeds)
         placed = {tensor: feeds[name] for name, tensor in self.source.feeds.items()}
         placed.update({name: np.asarray(value) for name, value in self.source.fixed.items()})
         placed.update({n: np.full([1] * rank, batch, np.int32) for n, rank in self.source.batch_sizes.items()})

@@ -75,6 +75,17 @@ class ParityReport:
     comparisons: tuple[Comparison, ...]
     sizes: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    #: No runtime reads the source by itself (a .nn): the formats were compared with this project's own reading of it.
+    self_consistent: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """passed, self-consistent, failed or not verified."""
+        if self.passed is None:
+            return "not verified"
+        if not self.passed:
+            return "failed"
+        return "self-consistent" if self.self_consistent else "passed"
 
     @property
     def failures(self) -> tuple[Comparison, ...]:
@@ -87,6 +98,7 @@ class ParityReport:
             "schema": 1,
             "policy": self.policy,
             "passed": self.passed,
+            "verdict": self.verdict,
             "seed": self.seed,
             "samples": self.samples,
             "reference": self.reference,

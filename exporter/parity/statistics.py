@@ -14,9 +14,9 @@ _MIN_EXPECTED = 5.0
 
 def chi_square_survival(statistic: float, freedom: int) -> float:
     """P(X ≥ statistic) for a chi-square variable: the regularised upper incomplete gamma function Q(k/2, x/2)."""
-    if freedom < 1 or statistic <= 0:
-        return 1.0
     a, x = freedom / 2, statistic / 2
+    if freedom < 1 or x <= 0:
+        return 1.0
     scale = math.exp(a * math.log(x) - x - math.lgamma(a))
     if x < a + 1:
         term = total = 1 / a

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +20,7 @@ from exporter.parity.report import Comparison, ParityReport
 from exporter.parity.statistics import FALSE_ALARM, fit
 from exporter.parity.tolerances import Tolerance, tolerance_for
 from exporter.runtimes import RuntimeInfo
+from signatures.errors import UsageError
 from signatures.graph import Graph
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
@@ -60,6 +63,14 @@ class VerifyOptions:
     samples: int = 2
     steps: int = 4
     tolerance: Tolerance = field(default_factory=Tolerance)
+
+    def __post_init__(self) -> None:
+        for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):
+            if value < least:
+                raise UsageError(f"{name} is {value}", fix=f"give {least} or more")
+        for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
+            if not math.isfinite(bound) or bound < 0:
+                raise UsageError(f"{name} is {bound}", fix="give a number that is not negative")
 
 
 @dataclass
@@ -121,7 +132,7 @@ class _Verification:
             self.progress(f"{self.subject.name}: {entrant.format} in {entrant.runtime}")
             self._examine(entrant)
         for model in self.unloads:
-            model.unload()
+            _unload(model)
         return self._finished(self._reference)
 
     # ---- who takes part
@@ -176,7 +187,7 @@ class _Verification:
                     if kind == "tfjs":
                         run = _predicting(model, names)
                     yield _Entrant(label, runtime, run, names)
-                    model.unload()
+                    _unload(model)
 
     # ---- comparisons
 
@@ -355,9 +366,10 @@ class _Verification:
 
     def _finished(self, reference: str) -> ParityReport:
         versions = self.pool.versions()
+        tried = {c.runtime for c in self.results}  # one that died has no version any more, but it ran
         states: dict[str, dict[str, str | None]] = {}
         for info in self.known:
-            ran = info.name in self.runtimes and info.name in versions
+            ran = info.name in self.runtimes and (info.name in versions or info.name in tried)
             reason = None if ran else "not asked for" if info.installed else f"not installed; {info.how}"
             states[info.name] = {
                 "version": versions.get(info.name, info.version),
@@ -378,7 +390,14 @@ class _Verification:
             tuple(self.results),
             self.subject.sizes,
             (*self.signature.notes, *self.notes),
+            self_consistent=self.subject.source is None,
         )
+
+
+def _unload(model: LoadedModel) -> None:
+    """Free a model; a runtime that has died has freed it already."""
+    with contextlib.suppress(RunFailedError):
+        model.unload()
 
 
 def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:

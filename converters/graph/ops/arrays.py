@@ -224,6 +224,8 @@ def _infer_transpose(node: Node, args: Sequence[TensorType], symbols: Symbols) -
 
 def _lower_transpose(node: Node, builder: OnnxBuilder) -> Any:
     permutation = constant_input(node, builder, 1, "a permutation").tolist()
+    if not permutation:  # a scalar; ONNX wants at least one axis
+        return builder.value(node.inputs[0])
     return builder.emit("Transpose", [builder.value(node.inputs[0])], perm=permutation)
 
 
@@ -409,8 +411,7 @@ def strided_steps(
     """
     masks = {k: int(node.attrs[f"{k}_mask"]) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis")}
     steps: list[SliceStep] = []
-    added = sum(1 for i in range(len(begin)) if masks["new_axis"] >> i & 1)
-    covered = len(begin) - added - (1 if masks["ellipsis"] else 0)
+    covered = sum(1 for i in range(len(begin)) if not (masks["ellipsis"] | masks["new_axis"]) >> i & 1)
     for i in range(len(begin)):
         if masks["ellipsis"] >> i & 1:
             steps.extend([("slice", None, None, 1)] * (rank - covered))
@@ -492,6 +493,9 @@ def _lower_strided_slice(node: Node, builder: OnnxBuilder) -> Any:
         else:
             first = step[1] if step[1] is not None else (0 if step[3] > 0 else limit)
             bounds = (first, step[2] if step[2] is not None else (limit if step[3] > 0 else -limit), step[3])
+            length = kind.shape[axis]
+            if isinstance(length, int) and not range(*slice(*step[1:]).indices(length)):
+                bounds = (0, 0, 1)  # backwards from before the start: ONNX would begin at element 0
         if bounds != (0, limit, 1):
             starts.append(bounds[0])
             ends.append(bounds[1])

@@ -100,10 +100,12 @@ def same_as(position: int = 0) -> Infer:
     return infer
 
 
-def broadcast_of(dtype: np.dtype | None = None) -> Infer:
-    """Result has the broadcast shape of all inputs, and ``dtype`` or the first input's."""
+def broadcast_of(dtype: np.dtype | None = None, *, count: int | None = None) -> Infer:
+    """Result has the broadcast shape of all inputs (``count`` of them), and ``dtype`` or the first input's."""
 
     def infer(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+        if count is not None and len(args) != count:
+            raise shape_error(node, args, f"it takes {count} inputs")
         shape: tuple[Dim, ...] | None = ()
         for arg in args:
             try:

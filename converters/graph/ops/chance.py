@@ -18,13 +18,34 @@ CATEGORICAL_SAMPLERS = ("Multinomial",)
 SAMPLERS = (*NORMAL_SAMPLERS, *CATEGORICAL_SAMPLERS, "RandomUniform", "TruncatedNormal")
 
 _SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
-_generator = np.random.default_rng(0)
+
+
+class _Stream:
+    """The stream that the kernels draw from: one per process, as in every runtime.
+
+    Made on the first draw: numpy.random costs megabytes, and an export draws nothing.
+    """
+
+    def __init__(self) -> None:
+        self._seed = 0
+        self._generator: np.random.Generator | None = None
+
+    def restart(self, seed: int) -> None:
+        self._seed, self._generator = seed, None
+
+    @property
+    def generator(self) -> np.random.Generator:
+        if self._generator is None:
+            self._generator = np.random.default_rng(self._seed)
+        return self._generator
+
+
+_stream = _Stream()
 
 
 def reseed(seed: int) -> None:
     """Restart the stream that the kernels draw from."""
-    global _generator
-    _generator = np.random.default_rng(seed)
+    _stream.restart(seed)
 
 
 def _infer_random(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
@@ -37,17 +58,17 @@ def _infer_random(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
 
 
 def _normal(node: Node, shape: np.ndarray) -> np.ndarray:
-    return _generator.standard_normal([int(d) for d in shape]).astype(node.attrs["dtype"])
+    return _stream.generator.standard_normal([int(d) for d in shape]).astype(node.attrs["dtype"])
 
 
 def _uniform(node: Node, shape: np.ndarray) -> np.ndarray:
-    return _generator.random([int(d) for d in shape]).astype(node.attrs["dtype"])
+    return _stream.generator.random([int(d) for d in shape]).astype(node.attrs["dtype"])
 
 
 def _truncated(node: Node, shape: np.ndarray) -> np.ndarray:
-    draws = _generator.standard_normal([int(d) for d in shape])
+    draws = _stream.generator.standard_normal([int(d) for d in shape])
     while (outside := np.abs(draws) > 2).any():
-        draws[outside] = _generator.standard_normal(int(outside.sum()))
+        draws[outside] = _stream.generator.standard_normal(int(outside.sum()))
     return draws.astype(node.attrs["dtype"])
 
 
@@ -62,7 +83,7 @@ def _lower_random(onnx_op: str) -> Any:
 def _multinomial(node: Node, logits: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Draws by the Gumbel trick: argmax of logits + Gumbel noise has the softmax distribution."""
     with np.errstate(all="ignore"):
-        uniform = _generator.random((logits.shape[0], int(count), logits.shape[1]))
+        uniform = _stream.generator.random((logits.shape[0], int(count), logits.shape[1]))
         gumbel = -np.log(-np.log(uniform + 1e-300))
         return np.asarray(np.argmax(logits[:, None, :] + gumbel, axis=-1)).astype(node.attrs["output_dtype"])
 

@@ -70,7 +70,7 @@ def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower) -> 
 
 def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
     lowering = direct(lower) if isinstance(lower, str) else lower
-    return OpDef(name, broadcast_of(), _plain(function), lowering, (T,))
+    return OpDef(name, broadcast_of(count=2), _plain(function), lowering, (T,))
 
 
 def _comparison(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
@@ -78,7 +78,7 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lower: str | Low
     if name in ("Equal", "NotEqual"):
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
     lowering = direct(lower) if isinstance(lower, str) else lower
-    return OpDef(name, broadcast_of(BOOL), _plain(function), lowering, attrs)
+    return OpDef(name, broadcast_of(BOOL, count=2), _plain(function), lowering, attrs)
 
 
 def _chain(*steps: tuple[str, float | None]) -> Lower:
@@ -106,6 +106,14 @@ def _lower_squared_difference(node: Node, builder: OnnxBuilder) -> Any:
 def _lower_clip(node: Node, builder: OnnxBuilder) -> Any:
     low, high = builder.value(node.inputs[1]), builder.value(node.inputs[2])
     return builder.emit("Max", [builder.emit("Min", [builder.value(node.inputs[0]), high]), low])
+
+
+def _real_div(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Integers, which TensorFlow's old Div takes, are divided towards zero."""
+    if a.dtype.kind == "f":
+        return np.asarray(np.divide(a, b))
+    quotient = np.floor_divide(np.abs(a), np.abs(b))
+    return np.asarray(np.where((a < 0) != (b < 0), -quotient, quotient))
 
 
 def _floor_div(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -266,12 +274,12 @@ BINARY = (
     _binary("Add", np.add, "Add"),
     _binary("Sub", np.subtract, "Sub"),
     _binary("Mul", np.multiply, "Mul"),
-    _binary("RealDiv", np.divide, "Div"),
+    _binary("RealDiv", _real_div, "Div"),
     _binary("FloorDiv", _floor_div, _lower_floor_div),
     _binary("FloorMod", np.mod, _lower_floor_mod),
     _binary("Maximum", np.maximum, "Max"),
     _binary("Minimum", np.minimum, "Min"),
-    OpDef("Pow", broadcast_of(), _wide(np.power), direct("Pow"), (T,)),
+    OpDef("Pow", broadcast_of(count=2), _wide(np.power), direct("Pow"), (T,)),
     _binary("SquaredDifference", lambda a, b: np.square(a - b), _lower_squared_difference),
     OpDef(
         "ClipByValue",
@@ -290,8 +298,8 @@ LOGIC = (
     _comparison("GreaterEqual", np.greater_equal, "GreaterOrEqual"),
     _comparison("Equal", np.equal, "Equal"),
     _comparison("NotEqual", np.not_equal, _lower_not_equal),
-    OpDef("LogicalAnd", broadcast_of(BOOL), _plain(np.logical_and), direct("And")),
-    OpDef("LogicalOr", broadcast_of(BOOL), _plain(np.logical_or), direct("Or")),
+    OpDef("LogicalAnd", broadcast_of(BOOL, count=2), _plain(np.logical_and), direct("And")),
+    OpDef("LogicalOr", broadcast_of(BOOL, count=2), _plain(np.logical_or), direct("Or")),
     OpDef("Select", _infer_select, _select, _lower_select, (type_attr("T", "in:1"),)),
     OpDef(
         "SelectV2",

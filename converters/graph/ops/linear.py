@@ -76,6 +76,15 @@ def _bias_add(node: Node, x: np.ndarray, bias: np.ndarray) -> np.ndarray:
         return np.asarray(x + bias)
 
 
+def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    x, bias = args[0].shape, args[1].shape
+    if x is not None and bias is not None:
+        last = x[-1] if x else None
+        if len(bias) != 1 or (isinstance(last, int) and isinstance(bias[0], int) and last != bias[0]):
+            raise shape_error(node, args, "a bias has one element per channel")
+    return [TensorType(args[0].dtype, x)]
+
+
 def _lower_bias_add(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Add", [builder.value(r) for r in node.inputs])
 
@@ -263,7 +272,7 @@ OPS = (
     ),
     OpDef(
         "BiasAdd",
-        same_as(0),
+        _infer_bias_add,
         _bias_add,
         _lower_bias_add,
         (T, Attr("data_format", "str", "NHWC")),

@@ -40,7 +40,18 @@ def constant_value(node: Node, value: float) -> np.ndarray:
     """The array that a placeholder with one fixed value stands for (free axes: length 1)."""
     shape: TensorShape | None = node.attrs.get("shape")
     dims = () if shape is None or shape.dims is None else tuple(1 if d is None else d for d in shape.dims)
-    return np.full(dims, value, node.attrs["dtype"])
+    dtype = node.attrs["dtype"]
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        possible = float(value).is_integer() and limits.min <= value <= limits.max
+    else:
+        possible = dtype.kind != "b" or value in (0, 1)
+    if not possible:
+        raise UsageError(
+            f"--set {node.name}={value:g} cannot be: it is of dtype {dtype.name}",
+            fix="give a whole number" if dtype.kind in "iu" else "give true or false",
+        )
+    return np.full(dims, value, dtype)
 
 
 def constant_for(node: Node, value: float) -> Node:

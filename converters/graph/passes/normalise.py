@@ -137,6 +137,12 @@ def _turn_round(editor: Editor, node: Node) -> None:
 # ------------------------------------------------------------------ ops that are written as others
 
 
+def _dtype(node: Node) -> np.dtype:
+    """The dtype of a node's operands, as GraphDefs say it."""
+    given = node.attrs.get("T")
+    return given if isinstance(given, np.dtype) else FLOAT32
+
+
 def _clip(editor: Editor, node: Node) -> str:
     """ClipByValue (TF 1.8) = Maximum(Minimum(x, high), low), the order that tf.clip_by_value had before."""
     x, low, high = node.inputs
@@ -147,7 +153,7 @@ def _clip(editor: Editor, node: Node) -> str:
 def _leaky_relu(editor: Editor, node: Node) -> str:
     """LeakyRelu (TF 1.8) = Maximum(x, alpha·x) for alpha ≤ 1, Minimum above."""
     alpha = float(node.attrs.get("alpha", 0.2))
-    slope = editor.const(np.array(alpha, np.float32), f"{node.name}/alpha")
+    slope = editor.const(np.array(alpha, _dtype(node)), f"{node.name}/alpha")
     scaled = editor.add("Mul", [node.inputs[0], slope], f"{node.name}/mul")
     return editor.add(
         "Maximum" if alpha <= 1 else "Minimum", [node.inputs[0], scaled], f"{node.name}/leaky", node.origin
@@ -155,35 +161,40 @@ def _leaky_relu(editor: Editor, node: Node) -> str:
 
 
 def _div_no_nan(editor: Editor, node: Node) -> str:
-    """DivNoNan: x / (y + [y=0]) · [y≠0]."""
+    """DivNoNan: x / y, and where y is 0 the zeros of ZerosLike, whatever x is; y is broadcast by adding them."""
     x, y = node.inputs
-    zero = editor.add(
-        "Cast",
-        [editor.add("Equal", [y, editor.const(np.zeros((), np.float32), f"{node.name}/0")], f"{node.name}/is_zero")],
-        f"{node.name}/zero",
-        DstT=FLOAT32,
-    )
-    quotient = editor.add("RealDiv", [x, editor.add("Add", [y, zero], f"{node.name}/safe")], f"{node.name}/quotient")
-    one = editor.const(np.ones((), np.float32), f"{node.name}/1")
-    return editor.add(
-        "Mul",
-        [quotient, editor.add("Sub", [one, zero], f"{node.name}/nonzero")],
-        f"{node.name}/no_nan",
-        node.origin,
-    )
+    dtype = _dtype(node)
+    quotient = editor.add("RealDiv", [x, y], f"{node.name}/quotient")
+    zeros = editor.add("ZerosLike", [quotient], f"{node.name}/zeros")
+    equal = editor.add("Equal", [y, editor.const(np.zeros((), dtype), f"{node.name}/0")], f"{node.name}/equal")
+    as_number = editor.add("Cast", [equal], f"{node.name}/number", DstT=dtype)
+    wide = editor.add("Add", [as_number, zeros], f"{node.name}/wide")
+    is_zero = editor.add("Cast", [wide], f"{node.name}/is_zero", DstT=BOOL)
+    return editor.add("Select", [is_zero, zeros, quotient], f"{node.name}/no_nan", node.origin)
 
 
 def _select_v2(editor: Editor, node: Node) -> str:
     """SelectV2 (TF 1.14) as Select of operands broadcast by adding zeros; ZerosLike of NaN is zero."""
     condition, a, b = node.inputs
-    as_float = editor.add("Cast", [condition], f"{node.name}/float", DstT=FLOAT32)
+    dtype = _dtype(node)
+
+    def cast(tensor: str, to: np.dtype, name: str) -> str:
+        return editor.add("Cast", [tensor], f"{node.name}/{name}", DstT=to)
+
+    as_float = cast(condition, FLOAT32, "float")
     zeros = editor.add("ZerosLike", [as_float], f"{node.name}/zeros")
     for side, tensor in (("a", a), ("b", b)):
         like = editor.add("ZerosLike", [tensor], f"{node.name}/zeros_{side}")
+        like = like if dtype == FLOAT32 else cast(like, FLOAT32, f"zeros_{side}_float")
         zeros = editor.add("Add", [zeros, like], f"{node.name}/zeros_{side}_sum")
-    wide = editor.add("Cast", [editor.add("Add", [as_float, zeros], f"{node.name}/wide")], f"{node.name}/c", DstT=BOOL)
-    left = editor.add("Add", [a, zeros], f"{node.name}/a")
-    right = editor.add("Add", [b, zeros], f"{node.name}/b")
+    wide = cast(editor.add("Add", [as_float, zeros], f"{node.name}/wide"), BOOL, "c")
+    if dtype == BOOL:  # which Add does not take
+        a, b = cast(a, FLOAT32, "a_float"), cast(b, FLOAT32, "b_float")
+    elif dtype != FLOAT32:
+        zeros = cast(zeros, dtype, "zeros_cast")
+    left, right = (editor.add("Add", [t, zeros], f"{node.name}/{side}") for side, t in (("a", a), ("b", b)))
+    if dtype == BOOL:
+        left, right = cast(left, BOOL, "a_bool"), cast(right, BOOL, "b_bool")
     return editor.add("Select", [wide, left, right], f"{node.name}/select", node.origin)
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.graph.shapes import infer_types
-from signatures.graph import Graph, node_of
+from converters.graph.ops.table import op_of
+from converters.graph.shapes import infer_types, run_kernel
+from signatures.graph import Graph, node_of, ref
 
 
 def normaliser(graph: Graph, name: str) -> dict[str, object] | None:
@@ -31,24 +32,34 @@ def normaliser(graph: Graph, name: str) -> dict[str, object] | None:
     return None
 
 
+#: Ops that only pick and move elements.
+_MOVES = frozenset(("StridedSlice", "Slice", "Split", "SplitV", "ConcatV2", "Tile"))
+
+
 def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
     """The parts of the memory in order: ``("c", "h")`` for one LSTM, twice that for two; empty where it is unknown.
 
     A part that is joined to the cell's input is a hidden state h; one that is only multiplied by a gate is a cell
-    state c.
+    state c. Parts are followed through slices of slices and repetitions by their columns.
     """
     types = infer_types(graph)
-    consumers = graph.consumers()
-    parts: list[tuple[int, str]] = []
-    for reader in consumers[name]:
-        if reader.op != "StridedSlice":
-            continue
-        begin = types[reader.inputs[1]].constant
-        readers = {r.op for r in consumers[reader.name]}
-        if begin is None or begin.size < 2:
-            return ()
-        if "ConcatV2" in readers:
-            parts.append((int(begin[1]), "h"))
-        elif "Mul" in readers:
-            parts.append((int(begin[1]), "c"))
-    return tuple(letter for _, letter in sorted(parts))
+    shape = types[name].shape
+    if not shape or not isinstance(shape[-1], int):
+        return ()
+    # tensor → the columns of the memory that it shows, as one row of it
+    shown = {name: np.arange(shape[-1]).reshape((1,) * (len(shape) - 1) + (shape[-1],))}
+    parts: dict[tuple[int, ...], str] = {}
+    for node in graph.nodes:
+        read = [shown[r] for r in node.inputs if r in shown]
+        operands = [shown.get(r, types[r].constant) for r in node.inputs]
+        known = [o for o in operands if o is not None]
+        if read and node.op in _MOVES and len(known) == len(operands):
+            for index, columns in enumerate(run_kernel(op_of(node), node, known)):
+                shown[ref(node.name, index)] = columns
+        elif node.op in ("ConcatV2", "Mul"):
+            for columns in read:
+                part = tuple(columns.reshape(-1).tolist())
+                parts[part] = "h" if node.op == "ConcatV2" else parts.get(part, "c")
+    ordered = sorted(parts)
+    whole = [column for part in ordered for column in part] == list(range(shape[-1]))
+    return tuple(parts[part] for part in ordered) if whole else ()

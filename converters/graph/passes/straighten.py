@@ -56,6 +56,7 @@ class _Unroller:
         self.frames = _frames(graph)
         self.made: dict[str, Node] = {}
         self.memo: dict[tuple[str, int | None], str | _Flow | None] = {}
+        self.known: dict[str, np.ndarray | None] = {}
         self.turns: dict[str, int] = {}
         self.predicates = {self.frames[n.name]: n for n in graph.nodes if n.op == "LoopCond" and n.name in self.frames}
 
@@ -154,7 +155,10 @@ class _Unroller:
             condition = self.predicates.get(frame)
             if condition is None:
                 raise unsupported([n for n in self.graph.nodes if self.frames.get(n.name) == frame][:1])
+            variables = self._variables(frame)
             for turn in range(MAX_TURNS + 1):
+                for variable in variables:  # turn by turn: no chain of calls is longer than a body
+                    self.tensor(variable, turn)
                 predicate = self.constant(self.plain(condition.inputs[0], turn))
                 if predicate is None:
                     raise _undecided(condition, "a loop's condition")
@@ -164,6 +168,11 @@ class _Unroller:
             else:
                 raise _undecided(condition, f"more than {MAX_TURNS} turns of a loop, or a number of them")
         return self.turns[frame]
+
+    def _variables(self, frame: str) -> list[str]:
+        """The Merges of a loop that take a value from turn to turn."""
+        merges = [n for n in self.graph.nodes if n.op == "Merge" and self.frames.get(n.name) == frame]
+        return [n.name for n in merges if any(self.graph.producer(r).op == "NextIteration" for r in n.inputs)]
 
     # ---- tensor arrays
 
@@ -233,6 +242,11 @@ class _Unroller:
 
     def constant(self, reference: str) -> np.ndarray | None:
         """The value of a tensor of the new graph, if it does not depend on an input."""
+        if reference not in self.known:
+            self.known[reference] = self._constant(reference)
+        return self.known[reference]
+
+    def _constant(self, reference: str) -> np.ndarray | None:
         name, index = split_ref(reference)
         node = self.made[name]
         if node.value is not None:

@@ -1,0 +1,126 @@
+"""Layers that compute number by number, with broadcasting, and reductions along an axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import MappingProxyType
+
+from converters.barracuda.builder import Builder, Shape, Value, with_length
+from converters.barracuda.moves import axis_of
+from converters.barracuda.vocabulary import C, LayerType, N
+from converters.graph.types import FLOAT32
+
+_FOLDED = MappingProxyType(
+    {
+        LayerType.ADD: "Add",
+        LayerType.SUB: "Sub",
+        LayerType.MUL: "Mul",
+        LayerType.DIV: "RealDiv",
+        LayerType.POW: "Pow",
+        LayerType.MIN: "Minimum",
+        LayerType.MAX: "Maximum",
+        LayerType.MEAN: "Add",
+    }
+)
+_COMPARED = MappingProxyType(
+    {
+        LayerType.GREATER: "Greater",
+        LayerType.GREATER_EQUAL: "GreaterEqual",
+        LayerType.LESS: "Less",
+        LayerType.LESS_EQUAL: "LessEqual",
+        LayerType.EQUAL: "Equal",
+    }
+)
+_REDUCED = MappingProxyType(
+    {
+        LayerType.REDUCE_MAX: "Max",
+        LayerType.REDUCE_MEAN: "Mean",
+        LayerType.REDUCE_MIN: "Min",
+        LayerType.REDUCE_PROD: "Prod",
+        LayerType.REDUCE_SUM: "Sum",
+    }
+)
+
+
+def folded(b: Builder, args: Sequence[Value]) -> Value:
+    """The inputs combined from left to right: ((a − b) − c) …; the mean divides the sum by their number."""
+    kind, total = LayerType(b.layer.type), args[0]
+    for value in args[1:]:
+        operands, shape = b.operands([total, value])
+        total = Value(b.op(_FOLDED[kind], operands), shape)
+    if kind is LayerType.MEAN and len(args) > 1:
+        total = Value(b.op("Mul", [total.reference, b.const(1 / len(args), "share")]), total.shape)
+    return total
+
+
+def compared(b: Builder, args: Sequence[Value]) -> Value:
+    """1 where the comparison holds, else 0."""
+    operands, shape = b.operands(args)
+    return _as_float(b, b.op(_COMPARED[LayerType(b.layer.type)], operands), shape)
+
+
+def logical(b: Builder, args: Sequence[Value]) -> Value:
+    """And, or, not, exclusive or of truths: a number is true unless it is 0."""
+    operands, shape = b.operands(args)
+    truths = [_truth(b, r) for r in operands]
+    kind = LayerType(b.layer.type)
+    if kind is LayerType.LOGICAL_NOT:
+        result = b.op("LogicalNot", truths)
+    elif kind is LayerType.LOGICAL_XOR:
+        neither = b.op("LogicalNot", [b.op("LogicalAnd", truths)])
+        result = b.op("LogicalAnd", [b.op("LogicalOr", truths), neither])
+    else:
+        result = b.op("LogicalAnd" if kind is LayerType.LOGICAL_AND else "LogicalOr", truths)
+    return _as_float(b, result, shape)
+
+
+def where(b: Builder, args: Sequence[Value]) -> Value:
+    """The second input where the first is not 0, else the third."""
+    (condition, *choices), shape = b.operands(args)
+    return Value(b.op("SelectV2", [_truth(b, condition), *choices]), shape)
+
+
+def sign(b: Builder, args: Sequence[Value]) -> Value:
+    """−1, 0 or 1."""
+    return Value(b.op("Sign", [args[0].reference]), args[0].shape)
+
+
+def _truth(b: Builder, reference: str) -> str:
+    return b.op("NotEqual", [reference, b.const(0, "zero")])
+
+
+def _as_float(b: Builder, truth: str, shape: Shape) -> Value:
+    return Value(b.op("Cast", [truth], DstT=FLOAT32), shape)
+
+
+def reduced(b: Builder, args: Sequence[Value], version: int) -> Value:
+    """One number per row along an axis, which stays with length 1. A second input names the axis and is ignored."""
+    x = args[0]
+    axis = axis_of(b, b.layer.axis, version)
+    if axis == N:
+        raise b.unsupported("it reduces over the batch", "an agent's action would depend on the other agents")
+    small = x.shape[1:3] == (1, 1)
+    data, along = (b.matrix(x), 1) if small and axis == C else (b.image(x), axis)
+    shape = with_length(x.shape, axis, 1)
+    kind = LayerType(b.layer.type)
+    operand = b.ints(along, "axis")
+    if kind in (LayerType.ARG_MAX, LayerType.ARG_MIN):
+        best = b.op("ArgMax" if kind is LayerType.ARG_MAX else "ArgMin", [data, operand])
+        return b.shaped(b.op("Cast", [best], DstT=FLOAT32), shape, best if small else None)
+    result = _reduction(b, kind, data, b.ints([along], "axes"))
+    return b.rows(result, shape[0], shape[3]) if small and axis == C else b.shaped(result, shape)
+
+
+def _reduction(b: Builder, kind: LayerType, data: str, axes: str) -> str:
+    if kind in _REDUCED:
+        return b.op(_REDUCED[kind], [data, axes], keep_dims=True)
+    if kind is LayerType.REDUCE_LOG_SUM_EXP:
+        top = b.op("Max", [data, axes], keep_dims=True)
+        total = b.op("Sum", [b.op("Exp", [b.op("Sub", [data, top])]), axes], keep_dims=True)
+        return b.op("Add", [b.op("Log", [total]), top])
+    if kind is LayerType.REDUCE_L1:
+        return b.op("Sum", [b.op("Abs", [data]), axes], keep_dims=True)
+    if kind is LayerType.REDUCE_LOG_SUM:
+        return b.op("Log", [b.op("Sum", [data, axes], keep_dims=True)])
+    squares = b.op("Sum", [b.op("Square", [data]), axes], keep_dims=True)
+    return squares if kind is LayerType.REDUCE_SUM_SQUARE else b.op("Sqrt", [squares])

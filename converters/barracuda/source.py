@@ -1,0 +1,45 @@
+"""A ``.nn`` as a source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from converters.barracuda.format import NnModel, parse
+from converters.barracuda.graph import to_graph
+from converters.source import ReadOptions, SourceModel
+from signatures.infer import SourceFacts
+from signatures.roles import ACTION_NAMES
+
+#: Suffixes that ML-Agents' converter gives to memories: the cell state and the hidden state of an LSTM; a GRU has h.
+_PARTS = ("_c", "_h")
+#: What the previews of 0.7 wrote is older; their constant ``version_number`` is still that of 0.6.
+_FIRST_RELEASED = 16
+
+
+def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+    """The one model in a file. Raises DamagedFileError, UnsupportedOpError, GraphError or SignatureError."""
+    model = parse(path.read_bytes())
+    reading = to_graph(model)
+    facts = SourceFacts(
+        family="ML-Agents 0.7 (preview)" if model.version < _FIRST_RELEASED else None,
+        memory_layout=_memory_layout(model),
+        notes=(*_notes(model), *reading.notes),
+    )
+    return [SourceModel(reading.graph, (path,), facts)]
+
+
+def _memory_layout(model: NnModel) -> tuple[str, ...]:
+    """``("c", "h")`` per LSTM, from the names' suffixes; empty where they do not say."""
+    ends = [m.input[-2:] for m in model.memories]
+    return tuple(e[1:] for e in ends) if all(e in _PARTS for e in ends) else ()
+
+
+def _notes(model: NnModel) -> list[str]:
+    notes = ["no runtime but Unity's reads a .nn: the verdict on the export is that its formats are self-consistent"]
+    if model.trailer is not None and model.trailer.producer not in ("", "Script"):
+        notes.append(f"Unity wrote this .nn from a model of {model.trailer.producer}")
+    if model.half:
+        notes.append("the weights were stored as halves (16 bits); they are float32 here")
+    if not any(layer.name in ACTION_NAMES for layer in model.layers):
+        notes.append("no layer of the .nn is called action; Unity would find no action in it")
+    return notes

@@ -1,0 +1,1 @@
+"""TensorFlow 1.x checkpoints as sources, read without TensorFlow, and the folders that training leaves."""

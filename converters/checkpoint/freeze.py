@@ -1,0 +1,173 @@
+"""Variables to constants: what TensorFlow's ``convert_variables_to_constants`` does, with a checkpoint's values.
+
+A variable becomes a Const of its own name, what reads it an Identity. Only what an input can reach through is read: the
+slots of an optimizer make up most of a checkpoint, and nothing that a policy computes depends on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from converters.checkpoint.bundle import Checkpoint
+from converters.checkpoint.training_graph import Saved, TrainingGraph
+from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
+from signatures.graph import Graph, NameScope, Node, TensorShape, node_of, topological
+from signatures.infer import find_brains
+from signatures.roles import CONSTANT_NAMES
+
+VARIABLES = frozenset(("VariableV2", "Variable", "VarHandleOp", "AutoReloadVariable"))
+_PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
+#: What only training runs: it changes or keeps variables.
+_EFFECTS = ("Assign", "Apply", "ResourceApply", "SparseApply", "Scatter", "ResourceScatter", "Save", "Restore")
+
+
+def is_effect(node: Node) -> bool:
+    """Whether a node changes a variable, or writes or reads a checkpoint."""
+    return node.op.startswith(_EFFECTS)
+
+
+def freeze(training: TrainingGraph, checkpoint: Checkpoint | None, roots: Sequence[str] | None = None) -> Graph:
+    """The graph with its variables' values.
+
+    Raises NotAPolicyError or DamagedFileError when a variable that the policy needs has no value, or one that does not
+    fit. ``checkpoint`` is None where there is none: a graph may do without. ``roots`` are the policy's outputs; by
+    default they are found by their names.
+    """
+    graph = training.graph
+    variables = {n.name: n for n in graph.nodes if n.op in VARIABLES}
+    values: dict[str, np.ndarray] = {}
+    missing: dict[str, str] = {}
+    for name in _wanted(graph, variables):
+        place = _place(variables[name], training, checkpoint)
+        if checkpoint is None or place is None:
+            missing[name] = _key(variables[name], training)
+        else:
+            values[name] = _checked(variables[name], checkpoint.read(place.key, place.extents), checkpoint)
+    frozen = _replaced(graph, values)
+    if missing:
+        needed = frozen.ancestors(_roots(frozen) if roots is None else roots)
+        names = [name for name in missing if name in needed]
+        if names:
+            raise _missing([missing[n] for n in names], checkpoint)
+    return frozen
+
+
+def _roots(graph: Graph) -> list[str]:
+    """The policies' outputs; none where no policy is found: the compiler says so, with the candidates."""
+    try:
+        return [root for brain in find_brains(graph) for root in brain.roots]
+    except ExportModelError:
+        return []
+
+
+# ------------------------------------------------------------------ which variables, and where they are
+
+
+def _wanted(graph: Graph, variables: Collection[str]) -> list[str]:
+    """Variables that something computes with an input from, and ML-Agents' constants."""
+    fed: set[str] = set()
+    for node in graph.nodes:
+        if node.op in _PLACEHOLDERS or (not is_effect(node) and any(node_of(r) in fed for r in node.inputs)):
+            fed.add(node.name)
+    needed = graph.ancestors(sorted(fed))
+    return [n for n in variables if n in needed or n.rpartition("/")[2] in CONSTANT_NAMES]
+
+
+def _key(node: Node, training: TrainingGraph) -> str:
+    saved = training.saved.get(node.name)
+    return saved.key if saved is not None else str(node.attrs.get("shared_name") or node.name)
+
+
+def _place(node: Node, training: TrainingGraph, checkpoint: Checkpoint | None) -> Saved | None:
+    """Where the checkpoint keeps a variable: the saver's name for it, the name it is shared under, its own."""
+    if checkpoint is None:
+        return None
+    saved = training.saved.get(node.name)
+    names = [Saved(str(name)) for name in (node.attrs.get("shared_name"), node.name) if name]
+    for place in ([saved] if saved is not None else []) + names:
+        if place.key in checkpoint:
+            return place
+    return None
+
+
+def _checked(node: Node, value: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
+    """The value, if it has the variable's dtype and shape."""
+    dtype, shape = node.attrs.get("dtype"), node.attrs.get("shape")
+    dims = shape.dims if isinstance(shape, TensorShape) else None
+    fits = dims is None or (
+        len(dims) == value.ndim and all(d is None or d == n for d, n in zip(dims, value.shape, strict=True))
+    )
+    if not fits or (isinstance(dtype, np.dtype) and dtype != value.dtype):
+        raise DamagedFileError(
+            f"the variable {node.name!r} is {dtype} {list(dims or ())} in the graph and {value.dtype.name} "
+            f"{list(value.shape)} in the checkpoint",
+            where=checkpoint.prefix.name,
+            why="they are of different networks; a later run has overwritten one of them",
+            fix="give a checkpoint whose own .meta is there, or another step: --step N",
+        )
+    return value
+
+
+def _missing(keys: Sequence[str], checkpoint: Checkpoint | None) -> NotAPolicyError:
+    """The error for variables without values."""
+    key, more = keys[0], f" (and {len(keys) - 1} more)" if len(keys) > 1 else ""
+    if checkpoint is None:
+        return NotAPolicyError(
+            f"the graph has variables and no values for them: {key!r}{more}",
+            why="it is the graph that training started from; the values are in a checkpoint, and none lies beside it",
+            fix="give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended",
+        )
+    if checkpoint.of_objects:
+        return of_objects(checkpoint)
+    alike = [n for n in checkpoint.names if n.rpartition("/")[2] == key.rpartition("/")[2]]
+    return NotAPolicyError(
+        f"the checkpoint has no value for the variable {key!r}{more}",
+        where=checkpoint.prefix.name,
+        why=f"the policy needs it; what it does have: {', '.join((alike or checkpoint.names)[:4]) or 'nothing'}",
+        fix="give the checkpoint of this graph, or another step: --step N",
+    )
+
+
+def of_objects(checkpoint: Checkpoint) -> NotAPolicyError:
+    """The refusal of what ``tf.train.Checkpoint`` writes."""
+    return NotAPolicyError(
+        "is a checkpoint of Python objects",
+        where=checkpoint.prefix.name,
+        why="TensorFlow 2's tf.train.Checkpoint wrote it; what is computed with its values is in the Python code only",
+        fix="save the model as a SavedModel (tf.saved_model.save, model.export), and give that",
+    )
+
+
+# ------------------------------------------------------------------ the graph with constants
+
+
+def _replaced(graph: Graph, values: dict[str, np.ndarray]) -> Graph:
+    handles = _handles(graph, values)
+    scope = NameScope(n.name for n in graph.nodes)
+    nodes: list[Node] = []
+    for node in graph.nodes:
+        if node.name in values:
+            node = Node(node.name, "Const", value=values[node.name], origin=node.origin)
+        elif node.inputs and node_of(node.inputs[0]) in handles:
+            if node.op == "ReadVariableOp":
+                node = replace(node, op="Identity", attrs={})
+            elif node.op == "ResourceGather":
+                axis = Node(scope.fresh(f"{node.name}/axis"), "Const", value=np.array(0, np.int32))
+                nodes.append(axis)
+                node = replace(node, op="GatherV2", inputs=(*node.inputs, axis.name), attrs={"batch_dims": 0})
+            elif node.op == "VariableShape":
+                node = replace(node, op="Shape")
+        nodes.append(node)
+    return Graph(topological(nodes))
+
+
+def _handles(graph: Graph, values: Collection[str]) -> set[str]:
+    """Frozen variables, and what passes them on."""
+    found = set(values)
+    for node in graph.nodes:
+        if node.op in ("Identity", "Enter", "Switch", "Merge") and any(node_of(r) in found for r in node.inputs):
+            found.add(node.name)
+    return found

@@ -1,0 +1,120 @@
+"""A model changed in memory so that it can be compared: draws come in as inputs, inner values go out as outputs.
+
+The source's own numbers are what everything else is judged by, so nothing else is touched; what the asked-for values do
+not depend on is taken out, so that inputs which only training needs do not have to be fed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from converters.onnx.proto import load_external
+from converters.recognise import read_bytes
+
+_FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
+_NORMAL = ("RandomNormal", "RandomNormalLike")
+
+
+def load(path: Path) -> Any:
+    """The ModelProto with the data of all its files."""
+    import onnx
+
+    model = onnx.ModelProto.FromString(read_bytes(path))
+    load_external(model.graph, path.parent)
+    return model
+
+
+def lifted(model: Any, draws: Collection[str]) -> Any:
+    """The model with N(0, 1) draws as inputs, and integer seeds (tf2onnx 1.5.5) as the floats that ONNX asks for.
+
+    A sampler of N(mean, scale²) becomes the input times ``scale`` plus ``mean``.
+    """
+    import onnx.helper
+
+    wanted = frozenset(draws)
+    graph = model.graph
+    nodes: list[Any] = []
+    for node in graph.node:
+        if node.op_type not in _NORMAL or not wanted.intersection(node.output):
+            _repair_seed(node)
+            nodes.append(node)
+            continue
+        (name,) = node.output
+        graph.input.append(onnx.helper.make_tensor_value_info(name, _FLOAT, None))
+        numbers = {a.name: a.f for a in node.attribute if a.type == _FLOAT}
+        moved = name
+        for key, op, plain in (("scale", "Mul", 1.0), ("mean", "Add", 0.0)):
+            if numbers.get(key, plain) != plain:
+                value = onnx.helper.make_tensor(f"{name}/{key}", _FLOAT, [], [numbers[key]])
+                graph.initializer.append(value)
+                nodes.append(onnx.helper.make_node(op, [moved, value.name], [f"{name}/{op}"]))
+                moved = f"{name}/{op}"
+        if moved != name:
+            _rename_reads(graph.node, name, moved)
+    del graph.node[:]
+    graph.node.extend(nodes)
+    return model
+
+
+def _repair_seed(node: Any) -> None:
+    for attribute in node.attribute:
+        if attribute.name == "seed" and attribute.type == _INT:
+            attribute.f, attribute.type = float(attribute.i), _FLOAT
+
+
+def _rename_reads(nodes: Iterable[Any], old: str, new: str) -> None:
+    for node in nodes:
+        for index, name in enumerate(node.input):
+            if name == old:
+                node.input[index] = new
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _rename_reads(attribute.g.node, old, new)
+
+
+def cut(model: Any, fetch: Sequence[str]) -> bytes:
+    """The part of a model that makes the values in ``fetch``, with these as its outputs, serialised."""
+    import onnx
+    import onnx.helper
+
+    part = onnx.ModelProto()
+    part.CopyFrom(model)
+    graph = part.graph
+    makers = {output: node for node in graph.node for output in node.output if output}
+    needed: set[str] = set()
+    kept: set[int] = set()
+    stack = list(fetch)
+    while stack:
+        name = stack.pop()
+        if name in needed:
+            continue
+        needed.add(name)
+        maker = makers.get(name)
+        if maker is not None:
+            kept.add(id(maker))
+            stack.extend(_reads(maker))
+    nodes = [n for n in graph.node if id(n) in kept]
+    inputs = [v for v in graph.input if v.name in needed]
+    constants = [t for t in graph.initializer if t.name in needed]
+    outputs = [onnx.ValueInfoProto(name=name) for name in dict.fromkeys(fetch)]
+    types = {v.name: v for v in (*graph.output, *graph.value_info) if v.HasField("type")}
+    outputs = [types.get(o.name, o) for o in outputs]
+    fresh = onnx.helper.make_graph(nodes, graph.name or "graph", inputs, outputs, constants)
+    part.graph.CopyFrom(fresh)
+    data: bytes = part.SerializeToString()
+    return data
+
+
+def _reads(node: Any) -> list[str]:
+    """What a node reads, its bodies' outer values included."""
+    names = [name for name in node.input if name]
+    for attribute in node.attribute:
+        if attribute.HasField("g"):
+            body = attribute.g
+            inner = {v.name for v in body.input} | {t.name for t in body.initializer}
+            inner |= {o for n in body.node for o in n.output}
+            outer = [r for n in body.node for r in _reads(n)] + [o.name for o in body.output]
+            names.extend(r for r in outer if r not in inner)
+    return names

@@ -1,0 +1,207 @@
+"""Which trainer wrote an ONNX model, what follows from that, and which of its faults the user should know.
+
+ML-Agents' PyTorch exporter (model_serialization.py, 0.20 to 1.1), tf2onnx inside its TensorFlow trainers (0.15 to
+0.23), this tool itself (its contract is in the metadata), and other trainers by what they call their tensors.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+
+from converters.bundle_source import Contract, contract_of, redrawn
+from converters.bundle_source import facts_of as facts_of_contract
+from converters.onnx.reader import OnnxModel
+from converters.onnx.writer import CONTRACT_KEY
+from converters.renaming import renamed
+from signatures.eras import torch_generation
+from signatures.graph import Graph, NameScope, Node, topological
+from signatures.infer import SourceFacts
+from signatures.roles import ACTION_NAMES, OUTPUT_NAMES, Role
+
+#: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
+_ACTION = re.compile(r"actions?|action_mean|mean_actions?|outputs?|mean|mu|pi|policy")
+_VALUE = re.compile(r"values?|value_estimate|critic")
+_COLOURS = (1, 3, 4)
+_IMAGE = 4
+
+
+def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
+    """The graph, faults of old exporters repaired where the repair is the same at batch 1, and the facts."""
+    text = model.metadata.get(CONTRACT_KEY)
+    if text is not None:
+        contract = contract_of(text)
+        facts = facts_of_contract(model.graph, contract)
+        return redrawn(model.graph, contract), replace(facts, outputs=_roles_of_contract(model, contract))
+    version = model.graph.constant("version_number") if "version_number" in model.graph else None
+    number = 0 if version is None or version.size != 1 else int(version.reshape(()))
+    graph, notes = _with_rows_of_memory(model)
+    rows = 1 if model.one_row or notes else model.batch
+    facts = SourceFacts(image_layout=_image_layout(model), rows=rows, outputs=dict.fromkeys(model.outputs.values()))
+    if model.producer.startswith("tf2onnx"):
+        facts = _of_tensorflow(model, facts, number)
+    elif number:
+        facts = _of_torch(model, facts, number)
+    else:
+        facts = replace(facts, family="own model", outputs=_roles_by_name(model), notes=_notes_of_others(model))
+        if _positional(model):
+            facts = replace(facts, family="Stable-Baselines3")
+    return graph, replace(facts, notes=(*facts.notes, *notes, *_common_notes(model)))
+
+
+def _image_layout(model: OnnxModel) -> str:
+    """tf2onnx leaves images NHWC, PyTorch has them NCHW; a model of neither shows its colours where it has them."""
+    if model.producer.startswith("tf2onnx"):
+        return "NHWC"
+    images = [s for s in (model.shapes.get(n) for n in model.inputs.values()) if s is not None and len(s) == _IMAGE]
+    if images and all(s[3] in _COLOURS and s[1] not in _COLOURS for s in images):
+        return "NHWC"
+    return "NCHW"
+
+
+# ------------------------------------------------------------------ this tool's own
+
+
+def _roles_of_contract(model: OnnxModel, contract: Contract) -> dict[str, Role | None]:
+    """Output node → its role, as the contract says it; None leaves it to the name."""
+    outputs = [s for s in contract.signature.outputs if s.name in model.outputs]
+    if any(s.name.rpartition("/")[2] in ACTION_NAMES for s in outputs):
+        return {model.outputs[s.name]: None for s in outputs}
+    roles: dict[str, Role | None] = {}
+    for position, spec in enumerate(outputs):
+        own = OUTPUT_NAMES.get(spec.name, spec.role)
+        roles[model.outputs[spec.name]] = Role.ACTION if position == 0 else own
+    return roles
+
+
+# ------------------------------------------------------------------ ML-Agents
+
+
+def _of_tensorflow(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts:
+    """0.15 to 0.23. The constants of 0.15 and 0.16 are initializers; later ones tell the version by themselves."""
+    told = "trainer_major_version" in model.graph
+    notes = []
+    if model.integer_seeds:
+        notes.append(
+            "a sampler's seed is an integer where ONNX says float (a fault of tf2onnx 1.5.5): onnxruntime refuses the "
+            "file; for the comparison it is repaired in memory"
+        )
+    return replace(facts, family="ML-Agents 0.15-0.16" if version and not told else None, notes=tuple(notes))
+
+
+def _of_torch(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts:
+    outputs = model.outputs
+    notes = []
+    if "action" in outputs and "continuous_actions" in outputs:
+        if len(model.draws) > 1:
+            notes.append(
+                "action and continuous_actions are two independent draws of one action in the source (ML-Agents 0.23 "
+                "to 0.25); one of them is exported, with one epsilon"
+            )
+        else:
+            notes.append("continuous_actions is the same as action; it is exported once")
+    if "action" in outputs and "discrete_actions" in outputs:
+        notes.append("discrete_actions stands for the same as action; it is exported once")
+    raw = outputs.get("deterministic_continuous_actions")
+    if raw is not None and "continuous_actions" in outputs and _squashed(model.graph, outputs["continuous_actions"]):
+        notes.append(
+            "deterministic_continuous_actions is the raw mean of SAC, neither squashed by tanh nor clipped (a fault of "
+            "ML-Agents 0.28 to 1.1); it is exported as it is"
+        )
+    return replace(
+        facts,
+        family=torch_generation(version, model.inputs, outputs),
+        memory_layout=("h", "c") if "LSTM" in model.kinds else (),
+        notes=tuple(notes),
+    )
+
+
+def _squashed(graph: Graph, name: str) -> bool:
+    """Whether an action is a tanh (SAC)."""
+    node = graph[name]
+    while node.op in ("Identity", "Reshape", "ConcatV2") and node.inputs:
+        node = graph.producer(node.inputs[0])
+    return node.op == "Tanh"
+
+
+def _with_rows_of_memory(model: OnnxModel) -> tuple[Graph, list[str]]:
+    """ML-Agents 0.25 joined the LSTM's states [1, B, H] to recurrent_out without turning them to [B, 1, H].
+
+    At batch 1 that is the same, beyond it TF Serving and Unity would find no batch axis; so it is turned here.
+    """
+    name = model.outputs.get("recurrent_out")
+    shape = None if name is None else model.shapes.get(name)
+    if name is None or shape is None or len(shape) != 3 or shape[0] != 1 or not isinstance(shape[1], str):
+        return model.graph, []
+    names = NameScope(n.name for n in model.graph.nodes)
+    inner, target = names.fresh(f"{name}/time_first"), names.fresh(f"{name}/shape")
+    graph = renamed(model.graph, {name: inner})
+    rows = Node(target, "Const", value=np.array([-1, 1, int(shape[2])], np.int32))
+    turned = Node(name, "Reshape", (inner, target), origin=model.graph[name].origin)
+    return Graph(topological([*graph.nodes, rows, turned])), [
+        "the memory is handled rightly for one row only in the source (a fault of ML-Agents 0.25); the export takes any "
+        "number of rows and is compared with the source row by row"
+    ]
+
+
+# ------------------------------------------------------------------ other trainers
+
+
+def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
+    """Output node → role, by the names that other trainers use; by position where no name says anything."""
+    roles: dict[str, Role | None] = {}
+    if _positional(model):
+        for node, role in zip(model.outputs.values(), (Role.ACTION, Role.VALUE, None), strict=False):
+            roles[node] = role
+        return roles
+    for name, node in model.outputs.items():
+        base = node.rpartition("/")[2].lower()
+        known = OUTPUT_NAMES.get(base)
+        roles[node] = known or (Role.ACTION if _ACTION.fullmatch(base) else None)
+        if known is None and _VALUE.fullmatch(base) and _columns(model, name) == 1:
+            roles[node] = Role.VALUE
+    actions = [n for n, role in roles.items() if role is Role.ACTION]
+    if len(actions) != 1:  # none, or more than one: names and structure decide, or ask
+        return dict.fromkeys(roles)
+    return roles
+
+
+def _positional(model: OnnxModel) -> bool:
+    """Stable-Baselines3's policies return (actions, values, log_prob); its recipe names none of the outputs.
+
+    Unnamed outputs are numbers, or what PyTorch calls its inner tensors.
+    """
+    names = list(model.outputs)
+    said = [n for n in names if _ACTION.fullmatch(n.lower()) or n in OUTPUT_NAMES or _VALUE.fullmatch(n.lower())]
+    if said or len(names) not in (2, 3):
+        return False
+    ranks = [len(model.shapes.get(n) or ()) for n in model.outputs.values()]
+    return _columns(model, names[1]) == 1 and ranks[1] == 2 and ranks[2:] in ([], [1])
+
+
+def _columns(model: OnnxModel, name: str) -> int | str | None:
+    shape = model.shapes.get(model.outputs[name])
+    return shape[-1] if shape else None
+
+
+def _notes_of_others(model: OnnxModel) -> tuple[str, ...]:
+    if not _positional(model):
+        return ()
+    names = list(model.outputs)
+    order = f"{names[0]} is the action, {names[1]} the value"
+    return (f"outputs by their order, as Stable-Baselines3's policies give them: {order}",)
+
+
+def _common_notes(model: OnnxModel) -> list[str]:
+    notes = [f"the output {name} is left out: {why}" for name, why in model.left_out.items()]
+    if model.batch is not None:
+        rows = "1 row" if model.batch == 1 else f"{model.batch} rows"
+        notes.append(
+            f"the model was exported for {rows} only; the export takes any number of rows and is compared with the "
+            f"source {rows} at a time"
+        )
+    if model.doubles:
+        notes.append("float64 numbers of the source are computed as float32")
+    return notes

@@ -1,0 +1,177 @@
+"""What is inside ONNX messages, checked: tensors, attributes, the data that lies in files of its own.
+
+A model file is untrusted. Sizes are compared with the bytes that are there before anything is allocated, and external
+data is read from the model's own folder only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.graph.types import FLOAT32
+from converters.recognise import MAX_BYTES, read_bytes
+from signatures.errors import DamagedFileError, UnsupportedOpError
+
+_MAX_AXES = 32
+_EXTERNAL = 1  # TensorProto.DataLocation
+_DOUBLE, _STRING = 11, 8
+#: TensorProto.DataType → (dtype, field of values that are not raw bytes)
+_STORED = {
+    1: (np.float32, "float_data"),
+    2: (np.uint8, "int32_data"),
+    3: (np.int8, "int32_data"),
+    4: (np.uint16, "int32_data"),
+    5: (np.int16, "int32_data"),
+    6: (np.int32, "int32_data"),
+    7: (np.int64, "int64_data"),
+    9: (np.bool_, "int32_data"),
+    11: (np.float64, "double_data"),
+    12: (np.uint32, "uint64_data"),
+    13: (np.uint64, "uint64_data"),
+}
+#: AttributeProto.AttributeType → field, for the kinds that are read
+_FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "strings"}
+
+
+def array_of(tensor: Any) -> np.ndarray:
+    """The values of a TensorProto, float64 narrowed to float32. Raises DamagedFileError, UnsupportedOpError."""
+    name = tensor.name or "(constant)"
+    if tensor.data_type not in _STORED:
+        raise UnsupportedOpError(
+            f"the tensor {name!r} has data type {tensor.data_type}, which is not converted",
+            issues=[(name, "Constant")],
+            why="policies compute in float32; half precision, quantised numbers and strings stand in no op table here",
+            fix="export the model in float32, without quantisation",
+        )
+    dtype, field = _STORED[tensor.data_type]
+    shape = tuple(int(d) for d in tensor.dims)
+    count = math.prod(shape)
+    if len(shape) > _MAX_AXES or any(d < 0 for d in shape):
+        raise _damaged(name, f"its shape is {list(shape[:8])}")
+    if tensor.HasField("raw_data"):
+        size = count * np.dtype(dtype).itemsize
+        if len(tensor.raw_data) != size:
+            raise _damaged(name, f"it holds {len(tensor.raw_data)} bytes where its shape needs {size}")
+        array = np.frombuffer(tensor.raw_data, np.dtype(dtype).newbyteorder("<")).astype(dtype)
+    else:
+        values = getattr(tensor, field)
+        if len(values) != count:
+            raise _damaged(name, f"it holds {len(values)} values where its shape needs {count}")
+        array = np.array(values).astype(dtype)
+    array = array.reshape(shape)
+    if tensor.data_type == _DOUBLE:
+        with np.errstate(over="ignore"):
+            return array.astype(FLOAT32)
+    return array
+
+
+def _damaged(name: str, why: str) -> DamagedFileError:
+    return DamagedFileError(
+        f"the tensor {name!r} cannot be read", why=why, fix="export the model again; this file is damaged"
+    )
+
+
+def attribute_of(attribute: Any) -> Any:
+    """The value of an attribute: number, text, tuple, array, or the message of a subgraph.
+
+    tf2onnx 1.5.5 wrote ``seed`` with type INT where the operator says FLOAT; the type that is there is taken.
+    """
+    field = _FIELDS.get(attribute.type)
+    if field is None:
+        field = next((f for f in _FIELDS.values() if _is_set(attribute, f)), None)
+    if field is None:
+        return None
+    value = getattr(attribute, field)
+    if field == "t":
+        return array_of(value)
+    if field == "s":
+        return value.decode("utf-8", "replace")
+    if field == "strings":
+        return tuple(v.decode("utf-8", "replace") for v in value)
+    return tuple(value) if field in ("floats", "ints") else value
+
+
+def _is_set(attribute: Any, field: str) -> bool:
+    """Models before IR version 3 do not say which kind an attribute is of."""
+    if field in ("floats", "ints", "strings"):
+        return len(getattr(attribute, field)) > 0
+    return bool(attribute.HasField(field))
+
+
+# ------------------------------------------------------------------ external data
+
+
+def tensors(graph: Any) -> Iterator[Any]:
+    """Every TensorProto of a graph: initializers, constants, and those of its subgraphs."""
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("t"):
+                yield attribute.t
+            yield from attribute.tensors
+            if attribute.HasField("g"):
+                yield from tensors(attribute.g)
+            for inner in attribute.graphs:
+                yield from tensors(inner)
+
+
+def load_external(graph: Any, folder: Path) -> list[Path]:
+    """Bring data that lies in files beside the model into the tensors of a graph; returns the files.
+
+    Raises DamagedFileError where a file is missing, too short, too large, or outside of ``folder``.
+    """
+    files: dict[Path, bytes] = {}
+    total = 0
+    for tensor in tensors(graph):
+        if tensor.data_location == _EXTERNAL:
+            total += _bring(tensor, folder, files)
+            if total > MAX_BYTES:
+                raise _damaged(tensor.name, "the model's weights together are larger than 2 GiB")
+    return sorted(files)
+
+
+def _bring(tensor: Any, folder: Path, files: dict[Path, bytes]) -> int:
+    entries = {e.key: e.value for e in tensor.external_data}
+    path = _inside(folder, entries.get("location", ""), tensor.name)
+    if path not in files:
+        files[path] = read_bytes(path)
+    data = files[path]
+    try:
+        offset = int(entries.get("offset") or 0)
+        length = int(entries.get("length") or len(data) - offset)
+    except ValueError as error:
+        raise _damaged(tensor.name, f"it says to lie at {entries}") from error
+    if offset < 0 or length < 0 or offset + length > len(data):
+        raise _damaged(tensor.name, f"{path.name} has {len(data)} bytes, it wants {length} from {offset} on")
+    tensor.raw_data = data[offset : offset + length]
+    del tensor.external_data[:]
+    tensor.data_location = 0
+    return length
+
+
+def _inside(folder: Path, location: str, name: str) -> Path:
+    """The file of a tensor's data, which must lie in the model's folder (or below it) and be a plain file."""
+    root = folder.resolve()
+    try:
+        path = (root / location).resolve()
+        inside = bool(location) and "\0" not in location and path.is_relative_to(root) and path != root
+    except (OSError, RuntimeError, ValueError):
+        inside = False
+    if not inside:
+        raise DamagedFileError(
+            f"the weights of {name!r} are said to lie in {location!r}, outside of the model's folder",
+            why="a model file is untrusted: nothing else of this machine is read for it",
+            fix="put the file beside the model and export the model again",
+        )
+    if not path.is_file():
+        raise DamagedFileError(
+            f"the weights of {name!r} lie in {location!r}, which is not there",
+            why="PyTorch writes large weights to a file beside the model",
+            fix=f"put {location} beside the model",
+        )
+    return path

@@ -1,0 +1,270 @@
+"""Products, reductions, softmax: what mixes the elements of a tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from converters.graph.types import INT64, Dim, product
+from converters.onnx.raising.elementwise import is_bias
+from converters.onnx.raising.node import Op, Raise
+from converters.onnx.raising.raiser import Raiser
+
+#: Product with a matrix behind further axes is written on two axes: TF 1.x multiplies batches of equal shape only.
+_MATRIX = 2
+
+
+# ------------------------------------------------------------------ products
+
+
+def _gemm(op: Op, r: Raiser) -> str:
+    """alpha·A'·B' + beta·C; A is a matrix, or flattened to one by the exporter."""
+    a, b = op.need(0), op.need(1)
+    if op.integer("transA", 0):
+        a = r.transpose(a, (1, 0))
+    if op.integer("transB", 0):
+        b = r.transpose(b, (1, 0))
+    value = r.add("MatMul", [a, b])
+    alpha, beta, c = op.number("alpha", 1.0), op.number("beta", 1.0), op.get(2)
+    if alpha != 1:
+        value = r.add("Mul", [value, r.number(value, alpha)])
+    if c is None or beta == 0:
+        return value
+    constant = r.constant(c)
+    if beta != 1:
+        scaled = None if constant is None else (constant * constant.dtype.type(beta)).astype(constant.dtype)
+        c = r.add("Mul", [c, r.number(c, beta)]) if scaled is None else r.const(scaled, "c")
+        constant = scaled
+    if constant is not None and constant.ndim == _MATRIX and constant.shape[0] == 1:
+        row = r.const(constant.reshape(-1), "bias")
+        c = row if is_bias(r, value, row) else c
+    return r.add("BiasAdd" if is_bias(r, value, c) else "Add", [value, c])
+
+
+def _matmul(op: Op, r: Raiser) -> str:
+    """Numpy's matmul: vectors are rows or columns, further axes broadcast."""
+    return matmul(op, r, op.need(0), op.need(1))
+
+
+def matmul(op: Op, r: Raiser, a: str, b: str) -> str:
+    """See ``_matmul``."""
+    left, right = r.rank(op, a), r.rank(op, b)
+    if left == 1:
+        a = r.expand_dims(a, 0)
+    if right == 1:
+        b = r.expand_dims(b, 1)
+    value = _batched(op, r, a, b)
+    rank = r.rank(op, value)
+    return r.squeeze(value, [axis for axis, gone in ((rank - 2, left == 1), (rank - 1, right == 1)) if gone])
+
+
+def _batched(op: Op, r: Raiser, a: str, b: str) -> str:
+    x, y = r.shape(op, a), r.shape(op, b)
+    if len(x) == _MATRIX and len(y) == _MATRIX:
+        return r.add("MatMul", [a, b])
+    if len(y) == _MATRIX:
+        rows = r.reshape(a, (-1, r.length(op, a, -1)))
+        return r.reshape(r.add("MatMul", [rows, b]), (*x[:-1], y[-1]))
+    batch = r.joined(op, [x[:-2], y[:-2]])
+    wide = [r.broadcast(t, (*batch, *s[-2:])) for t, s in ((a, x), (b, y))]
+    return r.add("BatchMatMul", wide)
+
+
+def _einsum(op: Op, r: Raiser) -> str:
+    """Sums of products of one or two tensors, each label at most once per operand."""
+    equation = op.text("equation", "").replace(" ", "")
+    left, arrow, result = equation.partition("->")
+    terms = left.split(",")
+    if not arrow:
+        letters = sorted(set(left) - {","})
+        result = "".join(c for c in letters if left.count(c) == 1)
+    simple = "." not in equation and all(len(set(t)) == len(t) for t in (*terms, result))
+    if not simple or len(terms) != len(op.inputs) or len(terms) > _MATRIX or set(result) - set(left):
+        raise op.refused(
+            f"the equation {equation!r} is no plain product",
+            "one or two operands without repeated labels are written as products; no policy uses others",
+        )
+    tensors = [op.need(i) for i in range(len(terms))]
+    lone = [[c for c in t if c not in result and not any(c in o for o in terms if o is not t)] for t in terms]
+    for i, labels in enumerate(lone):
+        if labels:
+            tensors[i] = r.reduce("Sum", tensors[i], [terms[i].index(c) for c in labels], keep=False)
+            terms[i] = "".join(c for c in terms[i] if c not in labels)
+    if len(terms) == 1:
+        return r.transpose(tensors[0], [terms[0].index(c) for c in result])
+    return _contracted(op, r, tensors, terms, result)
+
+
+def _contracted(op: Op, r: Raiser, tensors: Sequence[str], terms: Sequence[str], result: str) -> str:
+    """Two operands as one batch of matrix products: [batch, rows, inner] × [batch, inner, columns]."""
+    a, b = terms
+    groups = {
+        "batch": [c for c in a if c in b and c in result],
+        "inner": [c for c in a if c in b and c not in result],
+        "rows": [c for c in a if c not in b],
+        "columns": [c for c in b if c not in a],
+    }
+    lengths: dict[str, Dim] = {}
+    for tensor, term in zip(tensors, terms, strict=True):
+        lengths.update(zip(term, r.shape(op, tensor), strict=True))
+
+    def total(name: str) -> Dim:
+        return product((lengths[c] for c in groups[name]), r.symbols)
+
+    matrices = []
+    for tensor, term, (first, second) in zip(tensors, terms, (("rows", "inner"), ("inner", "columns")), strict=True):
+        order = [*groups["batch"], *groups[first], *groups[second]]
+        turned = r.transpose(tensor, [term.index(c) for c in order])
+        sizes = [total("batch"), total(first), total(second)]
+        matrices.append(r.reshape(turned, _one_open(sizes)))
+    value = r.add("BatchMatMul", matrices)
+    order = [*groups["batch"], *groups["rows"], *groups["columns"]]
+    value = r.reshape(value, [lengths[c] for c in order])
+    return r.transpose(value, [order.index(c) for c in result])
+
+
+def _one_open(sizes: Sequence[Dim]) -> list[Dim]:
+    """A single length that is not known as -1."""
+    names = [s for s in sizes if isinstance(s, str)]
+    return [-1 if isinstance(s, str) and len(names) == 1 else s for s in sizes]
+
+
+# ------------------------------------------------------------------ reductions
+
+
+def _axes(op: Op, r: Raiser, since: int) -> list[int] | None:
+    """The axes of a reduction: an attribute, from opset ``since`` on an input. None: the input is left as it is."""
+    x = op.need(0)
+    axes = op.integers("axes")
+    operand = op.get(1)
+    if op.opset >= since and operand is not None:
+        axes = tuple(int(a) for a in r.needed_constant(op, operand, "the list of axes").reshape(-1))
+    if not axes:
+        if op.integer("noop_with_empty_axes", 0):
+            return None
+        return list(range(r.rank(op, x)))
+    return sorted({r.axis(op, x, a) for a in axes})
+
+
+def _reduction(build: Callable[[Raiser, str, list[int], bool], str], since: int = 18) -> Raise:
+    def function(op: Op, r: Raiser) -> str:
+        axes, keep = _axes(op, r, since), bool(op.integer("keepdims", 1))
+        if axes is None:
+            axes = []
+        return build(r, op.need(0), axes, keep)
+
+    return function
+
+
+def _plain(kind: str) -> Callable[[Raiser, str, list[int], bool], str]:
+    def build(r: Raiser, x: str, axes: list[int], keep: bool) -> str:
+        return r.reduce(kind, x, axes, keep=keep) if axes else x
+
+    return build
+
+
+def _log_sum_exp(r: Raiser, x: str, axes: list[int], keep: bool) -> str:
+    """log Σ exp(x), the largest element taken out first (zero where all are −∞, as onnxruntime does)."""
+    top = r.reduce("Max", x, axes, keep=True)
+    finite = r.add("Less", [r.add("Abs", [top]), r.number(top, np.inf)])
+    top = r.add("Select", [finite, top, r.add("ZerosLike", [top])])
+    total = r.reduce("Sum", r.add("Exp", [r.add("Sub", [x, top])]), axes, keep=True)
+    value = r.add("Add", [r.add("Log", [total]), top])
+    return value if keep else r.squeeze(value, axes)
+
+
+_REDUCTIONS: Mapping[str, Callable[[Raiser, str, list[int], bool], str]] = {
+    "ReduceMean": _plain("Mean"),
+    "ReduceMax": _plain("Max"),
+    "ReduceMin": _plain("Min"),
+    "ReduceProd": _plain("Prod"),
+    "ReduceL1": lambda r, x, axes, keep: r.reduce("Sum", r.add("Abs", [x]), axes, keep=keep),
+    "ReduceL2": lambda r, x, axes, keep: r.add("Sqrt", [r.reduce("Sum", r.add("Square", [x]), axes, keep=keep)]),
+    "ReduceSumSquare": lambda r, x, axes, keep: r.reduce("Sum", r.add("Square", [x]), axes, keep=keep),
+    "ReduceLogSum": lambda r, x, axes, keep: r.add("Log", [r.reduce("Sum", x, axes, keep=keep)]),
+    "ReduceLogSumExp": _log_sum_exp,
+}
+
+
+def _arg(kind: str) -> Raise:
+    def function(op: Op, r: Raiser) -> str:
+        x = op.need(0)
+        axis = r.axis(op, x, op.integer("axis", 0))
+        if op.integer("select_last_index", 0):
+            raise op.refused("it takes the last of equal elements", "the targets take the first")
+        best = r.add(kind, [x, r.ints(axis, "axis")], output_type=INT64)
+        return r.expand_dims(best, axis) if op.integer("keepdims", 1) else best
+
+    return function
+
+
+def _top_k(op: Op, r: Raiser) -> list[str | None]:
+    """The one best element. k is an attribute before opset 10."""
+    x = op.need(0)
+    count = op.get(1)
+    k = op.integer("k", 0) if count is None else int(r.needed_constant(op, count, "k").reshape(-1)[0])
+    if k != 1:
+        raise op.refused(f"k is {k}", "only the one best element is taken in policies")
+    axis = r.axis(op, x, op.integer("axis", -1))
+    largest = op.integer("largest", 1)
+    best = r.reduce("Max" if largest else "Min", x, [axis], keep=True)
+    place = r.add("ArgMax" if largest else "ArgMin", [x, r.ints(axis, "axis")], output_type=INT64)
+    return [best, r.expand_dims(place, axis)]
+
+
+# ------------------------------------------------------------------ softmax
+
+
+def _softmax(op: Op, r: Raiser) -> str:
+    """Over one axis from opset 13 on; before, over everything from that axis on.
+
+    Written on two axes: TF 1.x takes no others.
+    """
+    x = op.need(0)
+    dims = r.shape(op, x)
+    whole = op.opset < 13
+    axis = r.axis(op, x, op.integer("axis", 1 if whole else -1)) if dims else 0
+    last = len(dims) - 1
+    if whole and axis < last:
+        size = product(dims[axis:], r.symbols)
+        if not isinstance(size, int):
+            raise op.refused("it is taken over axes whose lengths are not known")
+        return r.reshape(r.add(op.kind, [r.reshape(x, (-1, size))]), dims)
+    order = [i for i in range(len(dims)) if i != axis] + [axis]
+    turned = r.transpose(x, order)
+    value = _on_rows(op, r, turned)
+    return r.transpose(value, [order.index(i) for i in range(len(dims))]) if axis != last else value
+
+
+def _on_rows(op: Op, r: Raiser, x: str) -> str:
+    dims = r.shape(op, x)
+    if len(dims) == _MATRIX:
+        return r.add(op.kind, [x])
+    return r.reshape(r.add(op.kind, [r.reshape(x, (-1, r.length(op, x, -1)))]), dims)
+
+
+def _hardmax(op: Op, r: Raiser) -> str:
+    """1 at the first largest element; one axis from opset 13 on."""
+    x = op.need(0)
+    axis = r.axis(op, x, op.integer("axis", 1 if op.opset < 13 else -1))
+    if axis != r.rank(op, x) - 1:
+        raise op.refused("it is taken over an axis that is not the last")
+    best = r.add("ArgMax", [x, r.ints(axis, "axis")], output_type=INT64)
+    depth = r.ints(r.length(op, x, axis), "depth")
+    return r.add("OneHot", [best, depth, r.number(x, 1, "on"), r.number(x, 0, "off")], axis=-1)
+
+
+OPS: Mapping[str, Raise] = {
+    "Gemm": _gemm,
+    "MatMul": _matmul,
+    "Einsum": _einsum,
+    "ReduceSum": _reduction(_plain("Sum"), since=13),
+    **{kind: _reduction(build) for kind, build in _REDUCTIONS.items()},
+    "ArgMax": _arg("ArgMax"),
+    "ArgMin": _arg("ArgMin"),
+    "TopK": _top_k,
+    "Softmax": _softmax,
+    "LogSoftmax": _softmax,
+    "Hardmax": _hardmax,
+}

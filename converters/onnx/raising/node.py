@@ -1,0 +1,108 @@
+"""An ONNX node as the raising functions see it: inputs as tensors of the new graph, attributes as Python values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+from signatures.errors import UnsupportedOpError
+
+if TYPE_CHECKING:
+    from converters.onnx.raising.raiser import Raiser
+
+#: Domains that mean ONNX's own operators.
+STANDARD = ("", "ai.onnx")
+
+#: TensorProto.DataType → dtype, for what a policy computes in. Doubles are computed as float32: TensorFlow.js has no
+#: float64, and no trainer's weights need it (verification judges the difference).
+DTYPES: Mapping[int, np.dtype] = {
+    1: FLOAT32,
+    2: np.dtype(np.uint8),
+    3: np.dtype(np.int8),
+    4: np.dtype(np.uint16),
+    5: np.dtype(np.int16),
+    6: INT32,
+    7: INT64,
+    9: BOOL,
+    11: FLOAT32,
+}
+DOUBLE = 11
+
+
+@dataclass(frozen=True, slots=True)
+class Op:
+    """One ONNX node. ``inputs`` are references into the new graph, None for one that is left out.
+
+    ``opset`` is the version of the node's own domain; ``outputs`` are the values' names, empty for one left out.
+    """
+
+    kind: str
+    domain: str
+    name: str
+    opset: int
+    inputs: tuple[str | None, ...]
+    attrs: Mapping[str, Any]
+    outputs: tuple[str, ...]
+
+    def get(self, position: int) -> str | None:
+        """An optional input."""
+        return self.inputs[position] if position < len(self.inputs) else None
+
+    def need(self, position: int) -> str:
+        """A required input; raises UnsupportedOpError."""
+        found = self.get(position)
+        if found is None:
+            raise self.refused(f"input {position} is missing", "the op cannot be computed without it")
+        return found
+
+    def integer(self, name: str, default: int) -> int:
+        """An integer attribute."""
+        return int(self.attrs.get(name, default))
+
+    def integer_or_none(self, name: str) -> int | None:
+        """An integer attribute that may be left out."""
+        return int(self.attrs[name]) if name in self.attrs else None
+
+    def number(self, name: str, default: float) -> float:
+        """A float attribute."""
+        return float(self.attrs.get(name, default))
+
+    def text(self, name: str, default: str) -> str:
+        """A string attribute."""
+        return str(self.attrs.get(name, default))
+
+    def integers(self, name: str, default: Sequence[int] | None = None) -> tuple[int, ...] | None:
+        """A list of integers, ``default`` where the attribute is left out."""
+        value = self.attrs.get(name, default)
+        return None if value is None else tuple(int(v) for v in value)
+
+    def dtype(self, name: str, default: int) -> np.dtype:
+        """A data type attribute; raises UnsupportedOpError for types that no target has."""
+        number = self.integer(name, default)
+        if number not in DTYPES:
+            raise self.refused(f"{name} {number} is a data type that is not converted", "policies compute in float32")
+        return DTYPES[number]
+
+    def uses(self, position: int) -> bool:
+        """Whether somebody reads the output at ``position``."""
+        return position < len(self.outputs) and bool(self.outputs[position])
+
+    def refused(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:
+        """The error that this node cannot be converted."""
+        domain = f" of {self.domain}" if self.domain not in STANDARD else ""
+        return UnsupportedOpError(
+            f"cannot convert {self.kind}{domain} (node {self.name!r}): {what}",
+            issues=[(self.name, self.kind)],
+            why=why,
+            fix=fix
+            or "if the node is not part of the policy, name the outputs you need with --output; else please "
+            "open an issue with the model",
+        )
+
+
+#: Makes the op's outputs in the new graph: the reference of the only one, or one per output (None where not made).
+Raise = Callable[[Op, "Raiser"], "str | Sequence[str | None]"]

@@ -1,0 +1,244 @@
+"""ONNX bytes to Graph: the model is checked, its functions are inlined, its nodes are raised one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.graph.types import Dim
+from converters.onnx.proto import array_of, load_external, tensors
+from converters.onnx.raising.node import DTYPES, STANDARD
+from converters.onnx.raising.raiser import Raiser, joined_errors
+from converters.onnx.raising.table import TABLE
+from converters.recognise import read_bytes
+from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
+from signatures.graph import Graph, TensorShape
+from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
+
+#: Opsets that are read. Before 7 broadcasting was an attribute of each op.
+FIRST_OPSET = 7
+_FLOAT16, _BFLOAT16, _DOUBLE = 10, 16, 11
+_INT = 2  # AttributeProto.AttributeType
+#: The scalar that TensorFlow's recurrent policies take: how many steps a sequence has. A policy runs one.
+_SEQUENCE_LENGTH = "sequence_length"
+
+
+@dataclass(frozen=True)
+class OnnxModel:
+    """A model as it was read.
+
+    ``inputs`` and ``outputs`` map the model's values to nodes of the graph, in the file's order. ``draws`` are the
+    values that an in-graph sampler of normals makes. ``batch`` is the number of rows it was exported for, where that
+    is fixed. ``left_out`` are outputs that cannot be converted, with the reason.
+    """
+
+    graph: Graph
+    files: tuple[Path, ...]
+    producer: str
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+    draws: tuple[str, ...] = ()
+    batch: int | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    #: op types, those of bodies too
+    kinds: frozenset[str] = frozenset()
+    #: a recurrent layer takes its memory in a form that is right for one row only
+    one_row: bool = False
+    #: a sampler's seed is an integer where ONNX says float
+    integer_seeds: bool = False
+    doubles: bool = False
+    #: node → shape, for inputs and outputs
+    shapes: Mapping[str, tuple[Dim, ...] | None] = field(default_factory=dict)
+
+
+def read_onnx(path: Path) -> OnnxModel:
+    """Read a model. Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError."""
+    model, files = parse(path)
+    opsets = _opsets(model)
+    graph = model.graph
+    constants = {t.name for t in graph.initializer}
+    declared = [v for v in graph.input if v.name not in constants]
+    batch = _fixed_batch(declared)
+    _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
+    reserved = [v.name for v in (*declared, *graph.output)] + [c for c in CONSTANT_NAMES if c in constants]
+    raiser = Raiser(TABLE, opsets, reserved, batch)
+    for value in declared:
+        _input(raiser, value, batch)
+    for tensor in graph.initializer:
+        raiser.initializer(tensor.name, array_of(tensor))
+    raiser.run(graph.node)
+    outputs, left_out = _outputs(raiser, [v.name for v in graph.output])
+    return OnnxModel(
+        raiser.graph(),
+        (path, *files),
+        f"{model.producer_name} {model.producer_version}".strip(),
+        {v.name: raiser.values[v.name] for v in declared},
+        outputs,
+        tuple(raiser.draws),
+        batch,
+        {p.key: p.value for p in model.metadata_props},
+        left_out,
+        frozenset(n.op_type for n in _all_nodes(graph)),
+        raiser.one_row,
+        any(a.name == "seed" and a.type == _INT for n in graph.node for a in n.attribute),
+        any(t.data_type == _DOUBLE for t in tensors(graph)),
+        {n: raiser.type_of(n).shape for n in (*(raiser.values[v.name] for v in declared), *outputs.values())},
+    )
+
+
+def parse(path: Path) -> tuple[Any, list[Path]]:
+    """(ModelProto without functions and with all its data, the files of that data). Raises DamagedFileError."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.ModelProto.FromString(read_bytes(path))
+    except DecodeError as error:
+        raise DamagedFileError(
+            "cannot be decoded as ONNX", why="the file is cut off or damaged", fix="export or download it again"
+        ) from error
+    if not model.graph.node and not model.graph.output:
+        raise NotAPolicyError("the model has no nodes", fix="give the model that training exported")
+    if model.graph.sparse_initializer:
+        raise UnsupportedOpError(
+            "the model has sparse weights", issues=[(model.graph.sparse_initializer[0].values.name, "Constant")]
+        )
+    model = _inlined(model)
+    return model, load_external(model.graph, path.parent)
+
+
+def _inlined(model: Any) -> Any:
+    """The model without functions: its own, and those of ONNX's ops that are defined by others and not in the table."""
+    import onnx.defs
+    import onnx.inliner
+
+    known = {kind for domain, kind in TABLE if not domain}
+    used = {n.op_type for n in _all_nodes(model.graph) if n.domain in STANDARD}
+    defined = [
+        ("", kind)
+        for kind in sorted(used - known)
+        if onnx.defs.has(kind) and _is_function(onnx.defs.get_schema(kind))
+    ]
+    if not model.functions and not defined:
+        return model
+    try:
+        if model.functions:
+            model = onnx.inliner.inline_local_functions(model)
+        if defined:
+            model = onnx.inliner.inline_selected_functions(model, defined, inline_schema_functions=True)
+    except (RuntimeError, ValueError, onnx.checker.ValidationError) as error:
+        raise DamagedFileError(
+            "the model's functions cannot be inlined",
+            why=str(error).strip().splitlines()[0],
+            fix="export it with functions inlined (onnx.inliner.inline_local_functions)",
+        ) from error
+    return model
+
+
+def _is_function(schema: Any) -> bool:
+    return bool(schema.has_function or schema.has_context_dependent_function)
+
+
+def _all_nodes(graph: Any) -> list[Any]:
+    found = list(graph.node)
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                found.extend(_all_nodes(attribute.g))
+    return found
+
+
+def _opsets(model: Any) -> dict[str, int]:
+    opsets = {("" if o.domain in STANDARD else o.domain): int(o.version) for o in model.opset_import}
+    version = opsets.setdefault("", 1)
+    if version < FIRST_OPSET:
+        raise UnsupportedOpError(
+            f"the model is written in opset {version}",
+            issues=[(model.graph.name or "model", f"opset {version}")],
+            why=f"opsets from {FIRST_OPSET} on are read; before, broadcasting was an attribute of each op",
+            fix="onnx.version_converter.convert_version(model, 9) brings it forward",
+        )
+    return opsets
+
+
+def _check_names(names: Sequence[str]) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if not name or name in seen:
+            raise DamagedFileError(
+                f"two inputs or constants are called {name!r}" if name else "an input or constant has no name",
+                why="names of values must be unique",
+                fix="export the model again",
+            )
+        seen.add(name)
+
+
+# ------------------------------------------------------------------ inputs and outputs
+
+
+def _dims(value: Any) -> tuple[int | None, ...] | None:
+    """The declared shape; a length of 0 or below, and a named one, is free."""
+    kind = value.type.tensor_type
+    if not kind.HasField("shape"):
+        return None
+    return tuple(int(d.dim_value) if d.HasField("dim_value") and d.dim_value > 0 else None for d in kind.shape.dim)
+
+
+def _fixed_batch(declared: Sequence[Any]) -> int | None:
+    """The number of rows that all inputs were exported with, None where an input leaves it free.
+
+    torch.onnx.export fixes every length that ``dynamic_axes`` does not name; Stable-Baselines3's and rsl_rl's recipes
+    name none.
+    """
+    leading = {dims[0] for dims in map(_dims, declared) if dims is not None and len(dims) > 1}
+    unknown = any(_dims(v) is None for v in declared)
+    return None if unknown or len(leading) != 1 else leading.pop()
+
+
+def _input(raiser: Raiser, value: Any, batch: int | None) -> None:
+    kind = value.type.tensor_type
+    if not value.type.HasField("tensor_type") or kind.elem_type not in DTYPES or kind.elem_type == _DOUBLE:
+        wide = value.type.HasField("tensor_type") and kind.elem_type in (_FLOAT16, _BFLOAT16, _DOUBLE)
+        raise NotAPolicyError(
+            f"the input {value.name!r} is no tensor of float32, integers or booleans",
+            why=f"its data type is {kind.elem_type}; policies take float32, and TensorFlow.js has no other float"
+            if wide
+            else "policies take tensors",
+            fix="export the model in float32 (model.float())" if wide else None,
+        )
+    dtype, dims = DTYPES[kind.elem_type], _dims(value)
+    assumed = None
+    if value.name.split(":")[0].rpartition("/")[2] == _SEQUENCE_LENGTH and dtype.kind in "iu" and not dims:
+        assumed, dims = np.ones((), dtype), ()
+    elif batch is not None and dims is not None and len(dims) > 1:
+        dims = (None, *dims[1:])
+    raiser.placeholder(value.name, dtype, TensorShape(dims), assumed)
+
+
+def _outputs(raiser: Raiser, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """(output → node, output that could not be made → why). An action that cannot be made is an error."""
+    outputs: dict[str, str] = {}
+    broken: dict[str, UnsupportedOpError] = {}
+    for name in dict.fromkeys(names):
+        if name in raiser.values:
+            outputs[name] = raiser.values[name]
+        elif name in raiser.broken:
+            broken[name] = raiser.broken[name]
+        else:
+            raise DamagedFileError(
+                f"nothing makes the output {name!r}", why="the model was cut or edited", fix="export the model again"
+            )
+    needed = [n for n in broken if n.split(":")[0] in ACTION_NAMES]
+    if broken and (needed or not _computed(outputs, raiser)):
+        raise joined_errors([broken[n] for n in needed or broken])
+    return outputs, {name: error.what for name, error in broken.items()}
+
+
+def _computed(outputs: Mapping[str, str], raiser: Raiser) -> Collection[str]:
+    """The outputs that are no constants of the model."""
+    return [name for name, node in outputs.items() if raiser.constant(node) is None]

@@ -1,0 +1,20 @@
+"""An ONNX model as a source: which trainer wrote it, and how the model itself is run beside what is made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from converters.onnx.generation import understood
+from converters.onnx.reader import read_onnx
+from converters.source import OriginalRun, ReadOptions, SourceModel
+
+
+def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+    """The one model in a file. Raises SourceError, GraphError and their kinds.
+
+    The model itself is run by onnxruntime, the draws of its samplers fed from outside (``lift``).
+    """
+    model = read_onnx(path)
+    graph, facts = understood(model)
+    original = OriginalRun("onnxruntime", path, {"lift": list(model.draws)})
+    return [SourceModel(graph, model.files, facts, original=original)]

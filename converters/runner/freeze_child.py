@@ -1,0 +1,46 @@
+"""TensorFlow freezing what cannot be read without it: ``python -m converters.runner.freeze_child``.
+
+A model is loaded by ``path``, ``form`` and ``signature``; run, it gives its GraphDef's bytes as ``graph`` and a JSON
+object of its inputs' and outputs' tensors as ``names``, both as bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.runner.child import claim_stdout, serve
+from converters.runner.tensorflow_freeze import FrozenFunction, frozen_function
+from converters.runner.wire import Tensors
+
+
+class _Frozen:
+    def __init__(self, function: FrozenFunction) -> None:
+        self.function = function
+
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        function = self.function
+        names = {"inputs": function.inputs, "outputs": function.outputs, "signature": function.signature}
+        graph = function.graph_def.SerializeToString(deterministic=True)
+        return {name: np.frombuffer(data, np.uint8) for name, data in
+                (("graph", graph), ("names", json.dumps(names).encode()))}  # fmt: skip
+
+
+def main() -> None:
+    """Entry of the child process."""
+    out = claim_stdout()
+    os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISIBLE_DEVICES="-1")
+    import tensorflow as tf  # noqa: TID251  this is the child process
+
+    def load(header: Mapping[str, Any]) -> _Frozen:
+        return _Frozen(frozen_function(header["path"], header["form"], header.get("signature")))
+
+    serve("tensorflow", tf.__version__, load, (tf.errors.OpError, AttributeError, RuntimeError, ImportError), out)
+
+
+if __name__ == "__main__":
+    main()

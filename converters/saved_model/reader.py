@@ -1,0 +1,81 @@
+"""SavedModel files (saved_model.proto, meta_graph.proto) without TensorFlow.
+
+A SavedModel of TensorFlow 1 holds a flat graph, signatures, and in ``variables/`` a checkpoint. One of TensorFlow 2 is
+a tree of Python objects whose functions call one another; only TensorFlow itself can flatten it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from converters import schema
+from converters.saved_model.signature import ModelSignature, Tensor
+from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.graph import TensorShape, node_of
+
+SERVING = "serving_default"
+_INIT = "__saved_model_"
+_CALLS = frozenset(("PartitionedCall", "StatefulPartitionedCall", "TPUPartitionedCall"))
+
+
+@dataclass(frozen=True)
+class Saved:
+    """One MetaGraph of a SavedModel, and the signature that stands for the policy."""
+
+    graph_def: Any
+    tags: tuple[str, ...]
+    signature: ModelSignature
+    #: every signature's key
+    keys: tuple[str, ...]
+    #: whether what the signature computes is in functions
+    calls: bool
+
+
+def read_saved_model(data: bytes) -> Saved:
+    """The MetaGraph that is tagged for serving (else the first). Raises DamagedFileError, NotAPolicyError."""
+    message = schema.parse(schema.SavedModel, data, "SavedModel")
+    if not message.meta_graphs:
+        raise NotAPolicyError("the SavedModel has no graph", fix="save the model again")
+    meta = next((m for m in message.meta_graphs if "serve" in m.meta_info_def.tags), message.meta_graphs[0])
+    keys = tuple(sorted(k for k, s in meta.signature_def.items() if s.outputs and not k.startswith(_INIT)))
+    key = SERVING if SERVING in keys else next(iter(keys), None)
+    signature = ModelSignature()
+    if key is not None:
+        definition = meta.signature_def[key]
+        signature = ModelSignature(_tensors(definition.inputs), _tensors(definition.outputs), key)
+    return Saved(
+        meta.graph_def, tuple(meta.meta_info_def.tags), signature, keys, _calls_functions(meta.graph_def, signature)
+    )
+
+
+def _tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
+    found: dict[str, Tensor] = {}
+    for key in sorted(entries):
+        info = entries[key]
+        if not info.name:
+            raise DamagedFileError(f"the signature's {key!r} names no tensor", fix="save the model again, dense")
+        shape = info.tensor_shape
+        dims = tuple(None if d.size < 0 else int(d.size) for d in shape.dim)
+        found[key] = Tensor(info.name, schema.dtype_of(info.dtype), TensorShape(None if shape.unknown_rank else dims))
+    return found
+
+
+def _calls_functions(graph_def: Any, signature: ModelSignature) -> bool:
+    """Whether a node upstream of the signature (of anything, where there is none) calls a function."""
+    functions = {f.signature.name for f in graph_def.library.function} | _CALLS
+    calling = {n.name for n in graph_def.node if n.op in functions}
+    if not calling or not signature.outputs:
+        return bool(calling)
+    inputs = {n.name: [node_of(i) for i in n.input if not i.startswith("^")] for n in graph_def.node}
+    seen: set[str] = set()
+    stack = [node_of(r) for r in signature.roots]
+    while stack:
+        name = stack.pop()
+        if name in calling:
+            return True
+        if name not in seen:
+            seen.add(name)
+            stack.extend(inputs.get(name, ()))
+    return False

@@ -1,0 +1,148 @@
+"""A model's own signature (names for its inputs and outputs) put into its graph, so that the compiler sees it.
+
+SavedModels and TensorFlow.js models name tensors by keys; what is called ``action`` by its key may be ``Identity:0`` in
+the graph. An output becomes a node of the name that says what it is: its key, if that is a name of ML-Agents; else its
+node's own name, if that is; ``action`` where only one is left and none was called so; else its key. What the signature
+does not name is no output.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from converters.graph.compile import CONTRACT_NODE
+from converters.renaming import renamed
+from signatures.errors import DamagedFileError
+from signatures.graph import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
+from signatures.infer import role_by_name
+from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
+
+
+@dataclass(frozen=True, slots=True)
+class Tensor:
+    """One entry of a signature."""
+
+    name: str
+    dtype: np.dtype | None = None
+    shape: TensorShape = field(default_factory=lambda: TensorShape(None))
+
+
+@dataclass(frozen=True)
+class ModelSignature:
+    """Key → tensor of the inputs and of the outputs; ``key`` is what the signature itself is called."""
+
+    inputs: Mapping[str, Tensor] = field(default_factory=dict)
+    outputs: Mapping[str, Tensor] = field(default_factory=dict)
+    key: str | None = None
+
+    @property
+    def roots(self) -> list[str]:
+        """The outputs' references."""
+        return [normal_ref(t.name) for t in self.outputs.values()]
+
+
+def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Role]]:
+    """(the graph with its outputs under telling names, the roles that the inputs' keys say).
+
+    Raises DamagedFileError where the signature names what the graph does not have.
+    """
+    if not signature.outputs:
+        return graph, {}
+    for key, tensor in (*signature.inputs.items(), *signature.outputs.items()):
+        if node_of(tensor.name) not in graph:
+            raise DamagedFileError(
+                f"the signature's {key!r} is the tensor {tensor.name!r}, which is not in the graph",
+                fix="save the model again",
+            )
+    graph = _without_bundles(graph)
+    keep = [n.name for n in graph.nodes if n.name in (*CONSTANT_NAMES, CONTRACT_NODE)]
+    graph = _with_placeholders(graph, signature)
+    graph = graph.pruned([*signature.roots, *keep])
+    names = _names(signature)
+    taken = {n.name for n in graph.nodes}
+    scope = NameScope((*taken, *names.values()))
+    pins: list[Node] = []
+    moved: dict[str, str] = {}
+    for key, tensor in signature.outputs.items():
+        name, reference = names[key], normal_ref(tensor.name)
+        if reference == name:
+            continue
+        if name in taken:
+            moved[name] = scope.fresh(f"{name}/inner")
+        node, index = graph.producer(reference), split_ref(reference)[1]
+        origin = node.origin if index == 0 else f"{node.name}:{index}"
+        pins.append(Node(name, "Identity", (reference,), origin=origin))
+    roles = {node_of(t.name): role for k, t in signature.inputs.items() if (role := _role(graph, k, t)) is not None}
+    nodes = [*renamed(graph, moved).nodes, *(p.with_inputs(_moved(r, moved) for r in p.inputs) for p in pins)]
+    return Graph(topological(nodes)), {moved.get(n, n): role for n, role in roles.items()}
+
+
+def _moved(reference: str, names: Mapping[str, str]) -> str:
+    name, index = split_ref(reference)
+    return ref(names.get(name, name), index)
+
+
+def _with_placeholders(graph: Graph, signature: ModelSignature) -> Graph:
+    """An input may be any tensor of the graph; what computes it is then left out."""
+    given = {node_of(t.name): t for t in signature.inputs.values() if split_ref(t.name)[1] == 0}
+    nodes = []
+    for node in graph.nodes:
+        tensor = given.get(node.name)
+        if tensor is not None and node.op not in ("Placeholder", "PlaceholderWithDefault") and tensor.dtype is not None:
+            node = Node(
+                node.name, "Placeholder", (), {"dtype": tensor.dtype, "shape": tensor.shape}, origin=node.origin
+            )
+        nodes.append(node)
+    return Graph(tuple(nodes))
+
+
+def _without_bundles(graph: Graph) -> Graph:
+    """Without IdentityN, which custom gradients (swish) leave: an Identity per output."""
+    several = {n.name: n for n in graph.nodes if n.op == "IdentityN" and n.inputs}
+    if not several:
+        return graph
+    scope = NameScope(n.name for n in graph.nodes)
+    single: dict[str, str] = {}
+    nodes: list[Node] = []
+    for node in graph.nodes:
+        if node.name not in several:
+            nodes.append(node)
+            continue
+        for index, reference in enumerate(node.inputs):
+            name = scope.fresh(f"{node.name}/{index}") if index else node.name
+            single[ref(node.name, index)] = name
+            nodes.append(Node(name, "Identity", (reference,), origin=f"{node.name}:{index}"))
+    return Graph(topological([n.with_inputs(single.get(r, r) for r in n.inputs) for n in nodes]))
+
+
+def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:
+    node = graph.get(node_of(tensor.name))
+    if node is None or split_ref(tensor.name)[1]:
+        return None
+    return role_by_name(key, node)
+
+
+def _names(signature: ModelSignature) -> dict[str, str]:
+    """Output's key → the node that stands for it."""
+    names: dict[str, str] = {}
+    left: list[str] = []
+    for key, tensor in signature.outputs.items():
+        node, index = split_ref(normal_ref(tensor.name))
+        if key in OUTPUT_NAMES:
+            names[key] = key
+        elif index == 0 and node.rpartition("/")[2] in OUTPUT_NAMES and node not in names.values():
+            names[key] = node
+        else:
+            left.append(key)
+    if len(left) == 1 and not any(n.rpartition("/")[2] in ACTION_NAMES for n in names.values()):
+        names[left[0]] = "action"
+    else:
+        scope = NameScope(names.values())
+        names.update(
+            {key: scope.fresh(re.sub(r"[^A-Za-z0-9_./-]", "_", key).lstrip("/_-") or "output") for key in left}
+        )
+    return names

@@ -1,0 +1,245 @@
+"""A TensorFlow.js graph model to a Graph: model.json and its weight shards (tfjs-core io/types.ts, tfjs-converter).
+
+``modelTopology`` is a GraphDef as protobuf writes JSON: integers as strings, bytes in base64, enum values by name or
+number. Constants have their values in the shards: ``weightsManifest`` is a list of groups; a group's shards, joined,
+hold its weights one after the other. A weight may be quantised (``quantization``): float16, or uint8 and uint16 with
+``value = stored · scale + min``. Fused ops of the official converter become the plain ones that they stand for.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters import schema
+from converters.saved_model.signature import ModelSignature, Tensor
+from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from signatures.graph import Graph, Node, TensorShape, normal_ref, topological
+
+MODEL = "model.json"
+_DTYPES = {
+    "float32": np.dtype(np.float32),
+    "int32": np.dtype(np.int32),
+    "bool": np.dtype(np.bool_),
+    "uint8": np.dtype(np.uint8),
+    "uint16": np.dtype(np.uint16),
+    "float16": np.dtype(np.float16),
+    "int64": np.dtype(np.int64),
+}
+_NUMBERS = {
+    "DT_FLOAT": 1, "DT_DOUBLE": 2, "DT_INT32": 3, "DT_UINT8": 4, "DT_INT16": 5, "DT_INT8": 6, "DT_STRING": 7,
+    "DT_INT64": 9, "DT_BOOL": 10, "DT_UINT16": 17, "DT_HALF": 19, "DT_RESOURCE": 20, "DT_VARIANT": 21,
+}  # fmt: skip
+_MAX_AXES = 32
+_FIX = "copy the model again: model.json and all the .bin files beside it"
+
+
+@dataclass(frozen=True)
+class WebModel:
+    """What a model.json and its shards hold."""
+
+    graph: Graph
+    signature: ModelSignature
+    files: tuple[Path, ...]
+    #: the contract, where this tool wrote it
+    contract: Any = None
+
+
+def read_model(path: Path) -> WebModel:
+    """Read a model.json and its shards. Raises DamagedFileError, NotAPolicyError, SourceError, GraphError."""
+    try:
+        model = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise _damaged("model.json is not JSON", str(error)[:200]) from error
+    topology = model.get("modelTopology") if isinstance(model, dict) else None
+    if not isinstance(topology, dict):
+        raise _damaged("model.json has no modelTopology")
+    if model.get("format") == "layers-model" or "node" not in topology:
+        raise NotAPolicyError(
+            "is a TensorFlow.js layers model",
+            where=path.name,
+            why="it holds Keras layers, not a graph",
+            fix="convert it: tensorflowjs_converter --input_format tfjs_layers_model --output_format tfjs_graph_model; "
+            "or give the Keras model it came from",
+        )
+    try:
+        weights, shards = _weights(model.get("weightsManifest") or [], path.parent)
+        if topology.get("library", {}).get("function"):
+            _refuse_functions(topology)
+        graph = Graph(topological([_node(entry, weights) for entry in topology["node"]]))
+        extra = model.get("userDefinedMetadata") or {}
+        signature = _signature(model.get("signature") or extra.get("signature") or {})
+        return WebModel(graph, signature, (path, *shards), extra.get("contract"))
+    except (AttributeError, KeyError, TypeError, ValueError, binascii.Error) as error:
+        raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
+
+
+def _refuse_functions(topology: Mapping[str, Any]) -> None:
+    names = {f["signature"]["name"] for f in topology["library"]["function"]}
+    calls = [n for n in topology["node"] if n["op"] in names or n["op"] in ("While", "StatelessWhile", "If")]
+    if calls:
+        raise NotAPolicyError(
+            f"node {calls[0]['name']!r} ({calls[0]['op']}) calls a function",
+            why="loops of TensorFlow 2 are functions, which are not read from TensorFlow.js models",
+            fix="give the SavedModel that it was converted from",
+        )
+
+
+# ------------------------------------------------------------------ weights
+
+
+def _weights(manifest: Sequence[Mapping[str, Any]], folder: Path) -> tuple[dict[str, np.ndarray], list[Path]]:
+    """(name → value, the shards)."""
+    found: dict[str, np.ndarray] = {}
+    files: list[Path] = []
+    for group in manifest:
+        paths = [_shard(folder, name) for name in group["paths"]]
+        files.extend(paths)
+        data = b"".join(_bytes(p) for p in paths)
+        at = 0
+        for entry in group["weights"]:
+            stored, shape = _stored(entry)
+            size = math.prod(shape) * stored.itemsize
+            if size > len(data) - at:
+                raise _damaged(f"the weight {entry['name']!r} lies beyond the end of its files")
+            raw = np.frombuffer(data, stored.newbyteorder("<"), math.prod(shape), at)
+            found[entry["name"]] = _restored(raw.astype(stored), entry).reshape(shape)
+            at += size
+        if at != len(data):
+            raise _damaged(
+                f"{len(data) - at} bytes are left over after the last weight", f"in {', '.join(p.name for p in paths)}"
+            )
+    return found, files
+
+
+def _shard(folder: Path, name: str) -> Path:
+    """A shard's path, which must stay inside the model's folder."""
+    path = folder / name
+    if not name or "://" in name or not path.resolve().is_relative_to(folder.resolve()):
+        raise SourceError(
+            f"names the weights {name[:120]!r}",
+            where=MODEL,
+            why="the weights of a model lie in its own folder; nothing else is read",
+            fix="put the .bin files beside model.json, and their bare names into weightsManifest",
+        )
+    return path
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SourceError("cannot be read", where=path.name, why=error.strerror, fix=_FIX) from error
+
+
+def _stored(entry: Mapping[str, Any]) -> tuple[np.dtype, tuple[int, ...]]:
+    """(dtype in the shard, shape) of a weight."""
+    quantised = entry.get("quantization") or {}
+    name = quantised.get("dtype", entry["dtype"])
+    shape = tuple(entry["shape"])
+    if name not in _DTYPES:
+        raise NotAPolicyError(
+            f"the weight {entry['name']!r} has dtype {name}", where=MODEL, fix="convert the model again, in float32"
+        )
+    if len(shape) > _MAX_AXES or not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise _damaged(f"the weight {entry['name']!r} has the shape {str(entry['shape'])[:80]}")
+    return _DTYPES[name], shape
+
+
+def _restored(stored: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+    """A weight in its own dtype."""
+    dtype = _DTYPES[entry["dtype"]]
+    quantised = entry.get("quantization")
+    if not quantised or stored.dtype == np.float16:
+        return stored.astype(dtype)
+    values = stored.astype(np.float32) * np.float32(quantised["scale"]) + np.float32(quantised["min"])
+    return np.rint(values).astype(dtype) if dtype.kind in "iu" else values.astype(dtype)
+
+
+# ------------------------------------------------------------------ topology
+
+
+def _node(entry: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Node:
+    name, op = str(entry["name"]), str(entry["op"])
+    attrs = {key: _attribute(value) for key, value in (entry.get("attr") or {}).items() if not key.startswith("_")}
+    if op == "Const":
+        if name not in weights:
+            raise _damaged(f"the constant {name!r} has no values", "weightsManifest does not name it")
+        return Node(name, op, value=_shaped(weights[name], entry), origin=f"{name}:0")
+    if op in ("Placeholder", "PlaceholderWithDefault"):
+        attrs.setdefault("shape", TensorShape(None))
+        if not isinstance(attrs.get("dtype"), np.dtype) or not isinstance(attrs["shape"], TensorShape):
+            raise _damaged(f"the placeholder {name!r} does not say its dtype or shape")
+    inputs = tuple(normal_ref(i) for i in entry.get("input") or () if not i.startswith("^"))
+    return Node(name, op, inputs, attrs, origin=f"{name}:0")
+
+
+def _shaped(value: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+    """A constant in the shape that the graph says; the manifest may have a scalar as a vector of one."""
+    tensor = ((entry.get("attr") or {}).get("value") or {}).get("tensor")
+    dims = _shape(tensor.get("tensorShape") or {}).dims if tensor else None
+    if dims is None or None in dims or math.prod(d or 0 for d in dims) != value.size:
+        return value
+    return value.reshape([d or 0 for d in dims])
+
+
+def _attribute(value: Mapping[str, Any]) -> Any:
+    """One AttrValue in its JSON form."""
+    if not value:
+        return None
+    (kind, content), *_ = value.items()
+    if kind == "list":
+        if not content:
+            return ()
+        (inner, items), *_ = content.items()
+        return tuple(_attribute({inner: item}) for item in items)
+    if kind == "s":
+        return base64.b64decode(content).decode("utf-8", "replace")
+    if kind == "i":
+        return int(content)
+    if kind == "f":
+        return float(content)
+    if kind == "b":
+        return bool(content)
+    if kind == "type":
+        return _dtype(content)
+    if kind == "shape":
+        return _shape(content)
+    return None
+
+
+def _dtype(value: Any) -> np.dtype:
+    number = value if isinstance(value, int) else _NUMBERS.get(value)
+    if number is None:
+        raise _damaged(f"the dtype {value!r} is not known")
+    return schema.dtype_of(number)
+
+
+def _shape(value: Mapping[str, Any]) -> TensorShape:
+    if value.get("unknownRank"):
+        return TensorShape(None)
+    sizes = [int(d.get("size", 0)) for d in value.get("dim") or ()]
+    return TensorShape(tuple(None if n < 0 else n for n in sizes))
+
+
+def _signature(value: Mapping[str, Any]) -> ModelSignature:
+    def tensor(info: Mapping[str, Any]) -> Tensor:
+        dtype = _dtype(info["dtype"]) if "dtype" in info else None
+        return Tensor(str(info["name"]), dtype, _shape(info.get("tensorShape") or {"unknownRank": True}))
+
+    inputs, outputs = (
+        {key: tensor(info) for key, info in (value.get(side) or {}).items()} for side in ("inputs", "outputs")
+    )
+    return ModelSignature(inputs, outputs)
+
+
+def _damaged(what: str, why: str | None = None) -> DamagedFileError:
+    return DamagedFileError(what, why=why, fix=_FIX)

@@ -1,0 +1,23 @@
+"""A TensorFlow.js graph model as a source: its folder, or its model.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from converters.bundle_source import contract_of, facts_of, redrawn, retyped
+from converters.saved_model.signature import expose
+from converters.source import ReadOptions, SourceModel
+from converters.tfjs.reader import MODEL, read_model
+from converters.tfjs.unfuse import unfuse
+from signatures.infer import SourceFacts
+
+
+def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+    """The model's signature as a policy; one that this tool wrote is what its contract says."""
+    model = read_model(path / MODEL if path.is_dir() else path)
+    graph, roles = expose(unfuse(model.graph), model.signature)
+    if model.contract is None:
+        return [SourceModel(graph, model.files, SourceFacts(roles=roles))]
+    contract = contract_of(model.contract)
+    graph = retyped(redrawn(graph, contract), contract)
+    return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]

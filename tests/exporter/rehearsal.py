@@ -1,0 +1,137 @@
+"""Runtimes that are not there: the numpy kernels play every part, in this process, and can be told to go wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from converters.frozen_graph.reader import read_graph
+from converters.graph.passes.normalise import normalise
+from converters.graph.run import run_graph
+from converters.runner.process import RunFailedError
+from exporter import pipeline
+from exporter.pipeline import ExportResult
+from exporter.runtimes import RuntimeInfo
+from signatures.graph import Graph
+
+Array = npt.NDArray[Any]
+Tensors = dict[str, Array]
+#: (format, runtime, what it answers) → what it says instead
+Spoil = Callable[[str, str, Tensors], Tensors]
+
+ALL = ("numpy", "tensorflow", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
+KNOWN = tuple(RuntimeInfo(name, True, "1.0", f"install {name}") for name in ALL)
+
+
+def honest(kind: str, runtime: str, answer: Tensors) -> Tensors:
+    """Nothing goes wrong."""
+    return answer
+
+
+def graph_in(path: Path) -> Graph:
+    """The graph of a source or of a bundle's .bytes, without the contract."""
+    graph = read_graph(path.read_bytes())
+    return normalise(Graph(tuple(n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S")))
+
+
+@dataclass
+class Actor:
+    """A model in a runtime that is only played."""
+
+    kind: str
+    process: ActingProcess
+    graph: Graph
+
+    def run(self, feeds: Mapping[str, Array], fetch: Sequence[str], **request: Any) -> Tensors:
+        self.process.must_live()
+        jitter = request.get("jitter")
+        generator = None if jitter is None else np.random.default_rng(jitter)
+        answer = run_graph(self.graph, feeds, list(fetch), generator)
+        answer = self.process.pool.spoil(self.kind, self.process.name, dict(answer))
+        missing = [name for name in fetch if name not in answer]
+        if missing:
+            raise RunFailedError(f"{self.process.name} gave no output {missing[0]!r}")
+        return answer
+
+    def predict(self, feeds: Mapping[str, Array], outputs: Sequence[str]) -> Tensors:
+        return self.run(feeds, outputs)
+
+    def unload(self) -> None:
+        self.process.must_live()
+        self.process.pool.unloaded.append((self.kind, self.process.name))
+
+
+@dataclass
+class ActingProcess:
+    """A runtime's process, played."""
+
+    name: str
+    pool: ActingPool
+    alive: bool = True
+
+    def must_live(self) -> None:
+        if not self.alive:
+            raise RunFailedError(f"{self.name} is not running")
+
+    def load(self, path: str, **options: Any) -> Actor:
+        place = Path(path)
+        kind = "bytes" if self.name == "numpy" else format_of(place)
+        if (kind, self.name) in self.pool.refused:
+            raise RunFailedError(f"{self.name} failed", why="it does not like this model")
+        if place.suffix == ".bytes":
+            graph = graph_in(place)
+            if self.name == "numpy":
+                self.pool.reference = graph
+        else:
+            assert self.pool.reference is not None, "numpy is always the first to load"
+            graph = self.pool.reference
+        return Actor(kind, self, graph)
+
+
+@dataclass
+class ActingPool:
+    """Takes the part of RuntimePool. The .bytes that numpy reads stands for every format."""
+
+    spoil: Spoil = honest
+    refused: frozenset[tuple[str, str]] = frozenset()
+    unloaded: list[tuple[str, str]] = field(default_factory=list)
+    processes: dict[str, ActingProcess] = field(default_factory=dict)
+    reference: Graph | None = None
+
+    def process(self, name: str) -> ActingProcess:
+        found = self.processes.setdefault(name, ActingProcess(name, self))
+        found.alive = True
+        return found
+
+    def versions(self) -> dict[str, str]:
+        return {name: "1.0" for name, process in self.processes.items() if process.alive}
+
+    def __enter__(self) -> ActingPool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.processes.clear()
+
+
+def format_of(path: Path) -> str:
+    """Which format a loader is given; a ``.bytes`` that is not in a bundle is the source."""
+    if path.suffix == ".bytes":
+        return "bytes" if (path.parent / "policy.json").exists() else "source"
+    return {"saved_model": "saved_model", "tfjs": "tfjs"}.get(path.name, "onnx")
+
+
+def export(
+    monkeypatch: pytest.MonkeyPatch, source: Path, out: Path, pool: ActingPool, **options: Any
+) -> list[ExportResult]:
+    """Export ``source``, the runtimes of ``pool`` verifying."""
+    monkeypatch.setattr(pipeline, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+    return list(pipeline.export([source], pipeline.ExportOptions(out, **options), pool=pool))  # type: ignore[arg-type]

@@ -1,0 +1,300 @@
+"""Flags and folders that cannot be: one message, status 2 (3 for a runtime that is not here), nothing written."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from exporter import export_model as export_by_python
+from exporter.parity.tolerances import Tolerance
+from exporter.parity.verify import VerifyOptions
+from fixtures import path as fixture
+from signatures.errors import UsageError
+from tests.commands import export_model, files_in, is_refused, python
+from tests.handmade import continuous_policy, graph_bytes
+
+BALL = fixture("continuous")
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Iterator[Path]:
+    """An output folder that must not exist afterwards."""
+    folder = tmp_path / "out"
+    yield folder
+    assert files_in(tmp_path) == set()
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--to", "onx"], ["--to onx", "did you mean onnx?"]),
+        (["--to", "saved-model"], ["did you mean saved_model?"]),
+        (["--to", "coreml"], ["--to coreml", "the formats are bytes, saved_model, tfjs, onnx"]),
+        (["--to", "bytes,onnx,coreml"], ["--to coreml"]),
+        (["--to", ""], ["--to names no format", "bytes, saved_model, tfjs, onnx"]),
+        (["--to", ","], ["--to names no format"]),
+        (["--brain", "Ball"], ["--brain Ball", "(no scope)"]),
+        (["--input", "state"], ["--input state: NAME=VALUE is expected"]),
+        (["--input", "=noise"], ["NAME=VALUE is expected"]),
+        (["--input", "state=observations"], ["--input state=observations", "the roles are", "vector_observation"]),
+        (["--input", "stat=vector_observation"], ["--input names 'stat'", "close to it: state"]),
+        (["--input", "nothing=noise"], ["--input names 'nothing'", "its inputs are state, epsilon"]),
+        (["--input", "state=value_estimate"], ["that is not an input's role"]),
+        (["--output", "action"], ["--output action: NAME=VALUE is expected"]),
+        (["--output", "action=deed"], ["--output action=deed", "the roles are"]),
+        (["--output", "actoin=action"], ["--output names 'actoin'", "close to it: action"]),
+        (["--output", "action=noise"], ["that is not an output's role"]),
+        (["--set", "epsilon"], ["--set epsilon: NAME=VALUE is expected"]),
+        (["--set", "epsilon=much"], ["--set epsilon=much", "a number, true or false is expected"]),
+        (["--set", "epsilonn=0"], ["--set names 'epsilonn'"]),
+        (["--set", "action=0"], ["--set names 'action'", "not a placeholder"]),
+        (["--set", "state=0"], ["none of the inputs can be told to be an observation"]),
+        (["--opset", "12"], ["opset 12", "13 to 21"]),
+        (["--opset", "22"], ["opset 22"]),
+        (["--opset", "-1"], ["opset -1"]),
+        (["--verify", "tensorflo"], ["there is no runtime 'tensorflo'", "numpy, tensorflow"]),
+        (["--verify", "onnxruntime,torch"], ["there is no runtime 'torch'"]),
+        (["--seed", "-1"], ["seed is -1"]),
+        (["--atol", "nan"], ["atol is nan"]),
+        (["--rtol", "inf"], ["rtol is inf"]),
+        (["--atol", "-1e-5"], ["atol is -1e-05"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) and value[0].startswith("--") else "",
+)
+def test_a_flag_that_cannot_be_is_refused(flags: list[str], words: list[str], out: Path) -> None:
+    is_refused(export_model(BALL, "-o", out, "--verify", "none", *flags), *words)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
+@pytest.mark.parametrize("value", ["0.5", "1e30", "nan", "-1e300"])
+def test_a_value_that_an_integer_cannot_have_is_refused(value: str, out: Path) -> None:
+    ran = export_model(fixture("recurrent"), "-o", out, "--verify", "none", "--set", f"sequence_length={value}")
+    is_refused(ran, "--set sequence_length", "int32")
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (["--noise", "some"], "--noise"),
+        (["--names", "unity"], "--names"),
+        (["--opset", "many"], "--opset"),
+        (["--samples", "0"], "--samples"),
+        (["--steps", "0"], "--steps"),
+        (["--seed", "x"], "--seed"),
+        (["--faster"], "--faster"),
+        (["-o"], "-o"),
+    ],
+)
+def test_what_the_option_parser_refuses_is_status_2_too(flags: list[str], word: str, out: Path) -> None:
+    ran = export_model(BALL, "--out", out, *flags)
+    assert ran.status == 2
+    assert ran.out == ""
+    assert word in ran.err
+    assert "Traceback" not in ran.err
+    as_json = export_model(BALL, "--out", out, "--json", *flags)
+    assert as_json.status == 2
+    assert as_json.json["error"] == "UsageError"
+    assert as_json.json["exit_status"] == 2
+    assert word in as_json.json["what"]
+
+
+def test_no_source_is_refused(out: Path) -> None:
+    is_refused(export_model("-o", out), "no source was given")
+    is_refused(export_model("export"), "no source was given")
+
+
+def test_a_name_goes_with_one_policy(out: Path) -> None:
+    twobrains = fixture("twobrains")
+    is_refused(export_model(twobrains, "-o", out, "--name", "a"), "--name goes with a single policy", "--brain")
+    is_refused(export_model(BALL, fixture("discrete"), "-o", out, "--name", "a"), "--name goes with a single policy")
+
+
+def test_a_brain_that_is_not_there_lists_those_that_are(out: Path) -> None:
+    ran = export_model(fixture("twobrains"), "-o", out, "--brain", "Striker")
+    is_refused(ran, "--brain Striker", "StrikerBrain, Goalie-Brain-2")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        ({"names": "unity"}, "names='unity'"),
+        ({"noise": "some"}, "noise='some'"),
+        ({"inputs": {"state": "deed"}}, "--input state=deed: there is no such role"),
+        ({"to": "onx"}, "did you mean onnx"),
+        ({"verify": ["nothing"]}, "there is no runtime 'nothing'"),
+        ({"opset": 99}, "opset 99"),
+    ],
+)
+def test_the_python_interface_refuses_the_same(call: dict[str, object], words: str, out: Path) -> None:
+    with pytest.raises(UsageError, match=words):
+        export_by_python(BALL, out, **{"verify": "none", **call})
+
+
+@pytest.mark.parametrize("options", [{"seed": -1}, {"samples": 0}, {"steps": 0}])
+def test_options_of_verification_have_bounds(options: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match="or more"):
+        VerifyOptions(**options)
+
+
+def test_tolerances_are_finite_and_not_negative() -> None:
+    for tolerance in (Tolerance(atol=float("inf")), Tolerance(rtol=-1.0), Tolerance(atol=float("nan"))):
+        with pytest.raises(UsageError, match="not negative"):
+            VerifyOptions(tolerance=tolerance)
+    assert VerifyOptions(tolerance=Tolerance(0.0, 0.0)).tolerance.atol == 0
+
+
+# ------------------------------------------------------------------ runtimes that are not here
+
+
+def test_a_runtime_that_was_asked_for_and_is_missing_is_status_3(
+    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with tempfile.TemporaryDirectory() as empty:
+        monkeypatch.setenv("EXPORT_MODEL_JS", empty)
+        ran = export_model(BALL, "-o", out, "--verify", "tfjs-cpu")
+        is_refused(ran, "the runtime tfjs-cpu is not installed", "export-model runtimes install tfjs", status=3)
+        as_json = export_model(BALL, "-o", out, "--verify", "onnxruntime,tfjs-cpu", "--json")
+    assert as_json.status == 3
+    assert as_json.json["error"] == "RuntimeUnavailableError"
+
+
+def test_a_runtime_of_a_later_version_is_status_3(out: Path) -> None:
+    is_refused(export_model(BALL, "-o", out, "--verify", "tf1.4"), "tf1.4", status=3)
+
+
+def test_full_verification_asks_for_every_runtime(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory() as empty:
+        monkeypatch.setenv("EXPORT_MODEL_JS", empty)
+        is_refused(export_model(BALL, "-o", out, "--verify", "full"), "is not installed", status=3)
+
+
+# ------------------------------------------------------------------ the output folder
+
+
+@pytest.fixture
+def ball(tmp_path: Path) -> Path:
+    """A policy file in a folder of its own."""
+    (tmp_path / "source").mkdir()
+    (tmp_path / "source" / "Ball.bytes").write_bytes(graph_bytes(continuous_policy()))
+    return tmp_path / "source" / "Ball.bytes"
+
+
+def test_a_folder_that_is_no_bundle_is_not_replaced(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "out" / "Ball").mkdir(parents=True)
+    (tmp_path / "out" / "Ball" / "thesis.tex").write_text("years")
+    before = files_in(tmp_path)
+    ran = export_model(ball, "-o", tmp_path / "out", "--verify", "none")
+    is_refused(ran, tmp_path / "out" / "Ball", "in the way", "policy.json", "--name")
+    assert files_in(tmp_path) == before
+    assert (tmp_path / "out" / "Ball" / "thesis.tex").read_text() == "years"
+
+
+def test_a_file_or_link_in_the_place_of_the_bundle_is_not_replaced(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "Ball").write_text("mine")
+    is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), "in the way")
+    assert (tmp_path / "out" / "Ball").read_text() == "mine"
+    (tmp_path / "out" / "Ball").unlink()
+    for target in (tmp_path / "source", tmp_path / "nowhere"):
+        (tmp_path / "out" / "Ball").symlink_to(target)
+        is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), "in the way")
+        (tmp_path / "out" / "Ball").unlink()
+    assert files_in(tmp_path / "out") == set()
+
+
+def test_an_empty_folder_is_taken(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "out" / "Ball").mkdir(parents=True)
+    assert export_model(ball, "-o", tmp_path / "out", "--verify", "none").status == 0
+    assert (tmp_path / "out" / "Ball" / "policy.json").is_file()
+
+
+def test_an_output_folder_that_is_a_file_is_refused(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), tmp_path / "out", "-o")
+    is_refused(export_model(ball, "-o", tmp_path / "out" / "deeper", "--verify", "none"), "-o")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_two_sources_whose_names_fall_together_are_refused(ball: Path, tmp_path: Path) -> None:
+    for name in ("BALL.bytes", "ball!.bytes", "ball-.bytes"):
+        shutil.copyfile(ball, tmp_path / "source" / name)
+    before = files_in(tmp_path)
+    upper, shout, dash = (tmp_path / "source" / n for n in ("BALL.bytes", "ball!.bytes", "ball-.bytes"))
+    is_refused(export_model(ball, upper, "-o", tmp_path / "out", "--verify", "none"), ball, upper, "--name")
+    is_refused(export_model(shout, dash, "-o", tmp_path / "out", "--verify", "none"), shout, dash)
+    assert files_in(tmp_path) == before
+
+
+AS_NOBODY = """
+import os, sys
+from exporter.cli import main
+from fixtures import path
+from tests.commands import export_model
+warm, *arguments = sys.argv[1:]
+assert export_model(path("continuous"), "-o", warm, "--verify", "none").status == 0
+if os.geteuid() == 0:  # root may do anything: everything is imported by now, so go on as nobody
+    os.setegid(65534)
+    os.seteuid(65534)
+main(arguments)
+"""
+needs_rights = pytest.mark.skipif(sys.platform == "win32", reason="permissions are another matter there")
+
+
+@needs_rights
+@pytest.mark.parametrize("hidden", [False, True], ids=["no right to write", "no right to look"])
+def test_an_output_folder_without_rights_is_refused(hidden: bool, ball: Path, tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory() as top:
+        Path(top).chmod(0o755)
+        locked = Path(top) / "locked"
+        locked.mkdir(mode=0o000 if hidden else 0o555)
+        copy = shutil.copyfile(ball, Path(top) / "Ball.bytes")
+        out = locked / "out" if hidden else locked
+        is_refused(python("-c", AS_NOBODY, tmp_path / "warm", copy, "-o", out, "--verify", "none"), out, "denied", "-o")
+        locked.chmod(0o755)
+        assert files_in(locked) == set()
+
+
+@needs_rights
+def test_a_source_without_rights_is_refused(ball: Path, tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory() as top:
+        Path(top).chmod(0o755)
+        (Path(top) / "closed").mkdir(mode=0o000)
+        copy = Path(shutil.copyfile(ball, Path(top) / "Ball.bytes"))
+        copy.chmod(0o000)
+        is_refused(python("-c", AS_NOBODY, tmp_path / "warm", copy), copy, "cannot be read", "ermission denied")
+        inside = Path(top) / "closed" / "a.bytes"
+        is_refused(python("-c", AS_NOBODY, tmp_path / "warm", inside), inside, "cannot be read", "ermission denied")
+
+
+def test_a_full_disk_leaves_nothing_behind(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = Path.write_bytes
+
+    def full_at_the_graph_of_the_saved_model(path: Path, data: bytes) -> int:
+        if path.name == "saved_model.pb":
+            raise OSError(28, "No space left on device")
+        return written(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full_at_the_graph_of_the_saved_model)
+    ran = export_model(ball, "-o", tmp_path / "out", "--verify", "none")
+    is_refused(ran, tmp_path / "out", "No space left on device")
+    assert files_in(tmp_path / "out") == set()
+
+
+def test_a_disk_that_is_full_at_the_report_leaves_nothing_behind(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = Path.write_bytes
+
+    def full_at_the_report(path: Path, data: bytes) -> int:
+        if path.name == "parity.json":
+            raise OSError(28, "No space left on device")
+        return written(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full_at_the_report)
+    is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "numpy"), "No space left on device")
+    assert files_in(tmp_path / "out") == set()

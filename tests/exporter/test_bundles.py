@@ -1,0 +1,363 @@
+"""What is in a bundle: the fields of policy.json, true hashes, the same contract in every artefact."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import onnx
+import pytest
+
+from converters.frozen_graph.reader import from_graph_def, read_graph
+from converters.graph.compile import CONTRACT_NODE
+from converters.onnx.writer import CONTRACT_KEY
+from converters.schema import SavedModel, parse
+from exporter import bundle
+from exporter.version import __version__
+from fixtures import FIXTURES
+from fixtures import path as fixture
+from signatures.errors import BundleError
+from signatures.graph import Graph
+from signatures.roles import Role
+from tests.commands import export_model, files_in, is_refused
+
+POLICIES = [*(n for n in FIXTURES if n != "twobrains"), "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2"]
+KEYS = [
+    *("schema", "name", "family", "algorithm", "action_space", "inputs", "outputs", "memory", "branches"),
+    *("preprocess", "constants", "notes", "source", "files", "tool"),
+]
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All fixtures, exported."""
+    folder = tmp_path_factory.mktemp("bundles")
+    ran = export_model(*(fixture(name) for name in FIXTURES), "-o", folder, "--verify", "none")
+    assert ran.status == 0, ran.err
+    return folder
+
+
+def contract_of(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "policy.json").read_text(encoding="ascii"))
+    return content
+
+
+def test_every_policy_has_a_folder_of_its_own(bundles: Path) -> None:
+    assert {p.name for p in bundles.iterdir()} == set(POLICIES)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_a_bundle_has_exactly_its_files(name: str, bundles: Path) -> None:
+    assert files_in(bundles / name) == {
+        *(f"{name}.bytes", f"{name}.onnx", "policy.json", "saved_model", "saved_model/saved_model.pb"),
+        *("tfjs", "tfjs/model.json", "tfjs/group1-shard1of1.bin"),
+    }
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_contract_has_the_fields_that_others_rely_on(name: str, bundles: Path) -> None:
+    content = contract_of(bundles / name)
+    assert list(content) == KEYS
+    assert (content["schema"], content["name"]) == (1, name)
+    assert content["tool"] == {"name": "export-model", "version": __version__}
+    assert content["action_space"] in ("continuous", "discrete", "hybrid")
+    assert isinstance(content["family"], str)
+    assert all(isinstance(size, int) for size in content["branches"])
+    assert isinstance(content["preprocess"], dict)
+    assert all(isinstance(value, int | float) for value in content["constants"].values())
+    for tensor in content["inputs"] + content["outputs"]:
+        assert set(tensor) - {"distribution"} == {"name", "role", "dtype", "shape", "source"}
+        assert tensor["role"] in set(Role)
+        assert tensor["shape"][0] is None
+        assert all(size is None or isinstance(size, int) for size in tensor["shape"])
+        assert tensor["dtype"] in ("float32", "int32", "int64")
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_hashes_and_sizes_are_true(name: str, bundles: Path) -> None:
+    files = contract_of(bundles / name)["files"]
+    on_disk = {p for p in files_in(bundles / name) if (bundles / name / p).is_file()}
+    assert set(files) == on_disk - {"policy.json"}
+    for path, entry in files.items():
+        data = (bundles / name / path).read_bytes()
+        assert entry == {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+
+
+def test_the_source_is_named_by_its_base_name_and_hash(bundles: Path) -> None:
+    for name in FIXTURES[:5]:
+        source = contract_of(bundles / name)["source"]
+        assert source["path"] == f"{name}.bytes"
+        assert source["sha256"] == hashlib.sha256(fixture(name).read_bytes()).hexdigest()
+        assert str(fixture(name).parent) not in (bundles / name / "policy.json").read_text()
+
+
+def sources(folder: Path, key: str) -> dict[str, Any]:
+    return {tensor["name"]: tensor["source"] for tensor in contract_of(folder)[key]}
+
+
+def test_tensors_say_what_they_are_in_the_source(bundles: Path) -> None:
+    assert sources(bundles / "continuous", "inputs") == {"state": "state:0", "epsilon": "epsilon:0"}
+    assert sources(bundles / "continuous", "outputs") == {
+        "action": "action:0",
+        "deterministic_action": None,
+        "action_probs": "action_probs:0",
+        "value_estimate": "value_estimate:0",
+    }
+    assert sources(bundles / "visual", "inputs") == {
+        "state": "state:0",
+        "observation_0": "observation_0:0",
+        "epsilon": "random_normal/RandomStandardNormal:0",
+    }
+    assert sources(bundles / "recurrent", "outputs")["recurrent_out"] == "recurrent_out:0"
+    assert sources(bundles / "twobrains-StrikerBrain", "inputs") == {
+        "state": "StrikerBrain/state:0",
+        "epsilon": "StrikerBrain/random_normal/RandomStandardNormal:0",
+    }
+
+
+def test_tensors_say_what_they_look_like(bundles: Path) -> None:
+    inputs = {t["name"]: t for t in contract_of(bundles / "recurrent")["inputs"]}
+    assert inputs["state"]["shape"] == [None, 6]
+    assert (inputs["prev_action"]["dtype"], inputs["prev_action"]["shape"]) == ("int32", [None, 2])
+    assert inputs["action_masks"]["distribution"] == {"kind": "mask", "allowed": 1, "forbidden": 0}
+    outputs = {t["name"]: t for t in contract_of(bundles / "sampled")["outputs"]}
+    assert (outputs["action"]["dtype"], outputs["action"]["role"], outputs["action"]["shape"]) == (
+        *("int64", "sampled"),
+        [None, 3],
+    )
+    assert outputs["action_log_probs"]["shape"] == [None, 9]
+    normalised = contract_of(bundles / "continuous")["inputs"][0]["distribution"]
+    assert (normalised["kind"], len(normalised["mean"]), len(normalised["std"])) == ("normal", 8, 8)
+    assert contract_of(bundles / "visual")["preprocess"] == {
+        "observation_0": {"layout": "NHWC", "range": [0, 1], "from_bytes": "divide by 255"}
+    }
+
+
+def test_the_facts_are_those_of_the_policy(bundles: Path) -> None:
+    facts = {n: contract_of(bundles / n) for n in POLICIES}
+    assert {n: f["action_space"] for n, f in facts.items()} == {
+        "continuous": "continuous",
+        "discrete": "discrete",
+        "sampled": "discrete",
+        "recurrent": "discrete",
+        "visual": "continuous",
+        "twobrains-StrikerBrain": "continuous",
+        "twobrains-Goalie-Brain-2": "discrete",
+    }
+    assert facts["discrete"]["branches"] == [3, 2, 4]
+    assert facts["twobrains-Goalie-Brain-2"]["branches"] == [4, 2]
+    assert facts["continuous"]["branches"] == []
+    assert facts["visual"]["algorithm"] == "SAC"
+    assert facts["recurrent"]["constants"]["memory_size"] == 32
+    assert facts["continuous"]["memory"] is None
+    assert any("epsilon" in note for note in facts["visual"]["notes"])
+
+
+# ------------------------------------------------------------------ the embedded contract
+
+
+def text_constant(graph: Graph) -> str:
+    value = graph[CONTRACT_NODE].value
+    assert value is not None
+    text = value.item()
+    assert isinstance(text, bytes)
+    return text.decode()
+
+
+def in_bytes(folder: Path, name: str) -> str:
+    return text_constant(read_graph((folder / f"{name}.bytes").read_bytes()))
+
+
+def in_saved_model(folder: Path, name: str) -> str:
+    message = parse(SavedModel, (folder / "saved_model" / "saved_model.pb").read_bytes(), "SavedModel")
+    return text_constant(from_graph_def(message.meta_graphs[0].graph_def))
+
+
+def in_tfjs(folder: Path, name: str) -> str:
+    model = json.loads((folder / "tfjs" / "model.json").read_text())
+    return json.dumps(model["userDefinedMetadata"]["contract"])
+
+
+def in_onnx(folder: Path, name: str) -> str:
+    model = onnx.load(folder / f"{name}.onnx")
+    properties = {p.key: p.value for p in model.metadata_props}
+    return properties[CONTRACT_KEY]
+
+
+@pytest.mark.parametrize("embedded", [in_bytes, in_saved_model, in_tfjs, in_onnx])
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_artefact_embeds_the_contract(name: str, embedded: Callable[[Path, str], str], bundles: Path) -> None:
+    content = contract_of(bundles / name)
+    del content["files"]
+    assert json.loads(embedded(bundles / name, name)) == content
+    assert CONTRACT_NODE == CONTRACT_KEY == "export_model_contract"
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_no_artefact_says_where_or_when_it_was_made(name: str, bundles: Path) -> None:
+    for path in contract_of(bundles / name)["files"]:
+        data = (bundles / name / path).read_bytes()
+        for private in (str(bundles), str(fixture("continuous").parent), "/root", "/home"):
+            assert private.encode() not in data
+
+
+# ------------------------------------------------------------------ reading a bundle back
+
+
+@pytest.fixture
+def ball(bundles: Path, tmp_path: Path) -> Path:
+    """A bundle to spoil."""
+    import shutil
+
+    return Path(shutil.copytree(bundles / "continuous", tmp_path / "continuous"))
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = contract_of(folder)
+    change(content)
+    (folder / "policy.json").write_text(json.dumps(content))
+
+
+def is_no_bundle(folder: Path, *words: object) -> None:
+    is_refused(export_model("verify", folder, "--runtimes", "numpy"), *words)
+    as_json = export_model("verify", folder, "--runtimes", "numpy", "--json")
+    assert as_json.status == 2
+    assert as_json.json["error"] == "BundleError"
+
+
+def test_a_bundle_that_was_not_touched_is_whole(ball: Path) -> None:
+    ran = export_model("verify", ball, "--runtimes", "numpy", "--allow-unverified")
+    assert (ran.status, ran.err) == (0, "")
+    assert "NOT VERIFIED" in ran.out
+
+
+def test_a_folder_without_a_contract_is_no_bundle(tmp_path: Path) -> None:
+    is_no_bundle(tmp_path, tmp_path, "is no bundle", "policy.json")
+    is_no_bundle(tmp_path / "nothing", "is no bundle")
+    (tmp_path / "file").write_text("x")
+    is_no_bundle(tmp_path / "file", tmp_path / "file")
+
+
+@pytest.mark.parametrize("text", ["", "{", "nonsense", "[" * 100_000, '{"schema": 1', "\x00"])
+def test_a_contract_that_is_no_json_is_refused(text: str, ball: Path) -> None:
+    (ball / "policy.json").write_text(text)
+    is_no_bundle(ball, ball / "policy.json", "cannot be read")
+
+
+@pytest.mark.parametrize("text", ["[]", "null", "7", '"policy"', "{}", '{"schema": 2}', '{"schema": "1"}'])
+def test_a_contract_of_another_schema_is_refused(text: str, ball: Path) -> None:
+    (ball / "policy.json").write_text(text)
+    is_no_bundle(ball, ball / "policy.json", "schema", "this version reads 1")
+
+
+SPOILT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "no name": (lambda c: c.pop("name"), "None is not the name of a policy"),
+    "a name that leads out": (lambda c: c.update(name="../continuous"), "'../continuous' is not the name"),
+    "a name that is a number": (lambda c: c.update(name=3), "3 is not the name"),
+    "no files": (lambda c: c.pop("files"), "it names no files"),
+    "files that are a list": (lambda c: c.update(files=["continuous.bytes"]), "it names no files"),
+    "a file without a hash": (
+        lambda c: c["files"]["continuous.bytes"].pop("sha256"),
+        "no sha256 of 'continuous.bytes'",
+    ),
+    "a file without a size": (lambda c: c["files"]["continuous.bytes"].update(bytes="7"), "no size of"),
+    "a file that is a number": (lambda c: c["files"].update(a=7), "no sha256 of 'a'"),
+    "no source": (lambda c: c.pop("source"), "which source it was made from"),
+    "a source without a hash": (lambda c: c["source"].pop("sha256"), "which source it was made from"),
+}
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_a_contract_that_does_not_say_where_to_look_is_refused(what: str, ball: Path) -> None:
+    change, words = SPOILT[what]
+    rewrite(ball, change)
+    is_no_bundle(ball, ball / "policy.json", words)
+
+
+CHANGED: dict[str, Callable[[dict[str, Any]], object]] = {
+    "another input": lambda c: c["inputs"][0].update(name="stat"),
+    "another shape": lambda c: c["inputs"][0].update(shape=[None, 10**12]),
+    "a shape that is none": lambda c: c["inputs"][0].update(shape="wide"),
+    "a dtype that is none": lambda c: c["inputs"][0].update(dtype="floaty"),
+    "a role that is none": lambda c: c["inputs"][0].update(role="deed"),
+    "no outputs": lambda c: c.update(outputs=[]),
+    "outputs that are names": lambda c: c.update(outputs=["action"]),
+    "branches": lambda c: c.update(branches=[10**9]),
+    "a memory": lambda c: c.update(memory={"size": 4, "input": "h", "output": "h", "layout": []}),
+    "fixed values": lambda c: c["source"].update(fixed={"state:0": {"dtype": "O", "value": 1}}),
+    "another tool": lambda c: c["tool"].update(version="9.9"),
+    "one field more": lambda c: c.update(comment="hello"),
+}
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_a_contract_that_is_not_the_embedded_one_is_refused(what: str, ball: Path) -> None:
+    rewrite(ball, CHANGED[what])
+    is_no_bundle(ball, ball / "policy.json", "has been changed since it was exported", "embeds")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "continuous.bytes",
+        "continuous.onnx",
+        "saved_model/saved_model.pb",
+        "tfjs/model.json",
+        "tfjs/group1-shard1of1.bin",
+    ],
+)
+def test_a_file_that_was_changed_or_removed_is_named(path: str, ball: Path) -> None:
+    data = (ball / path).read_bytes()
+    (ball / path).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    is_no_bundle(ball, ball / path, "has been changed since it was exported", "sha256")
+    (ball / path).unlink()
+    is_no_bundle(ball, ball / path, "is missing", "policy.json names it")
+    (ball / path).mkdir()
+    is_no_bundle(ball, ball / path, "cannot be read")
+
+
+@pytest.mark.parametrize("path", ["../secret", "tfjs/../../secret", "/etc/hostname", "a\0b"])
+def test_a_contract_that_names_a_file_outside_is_refused(path: str, ball: Path) -> None:
+    (ball.parent / "secret").write_text("secret")
+    rewrite(ball, lambda c: c["files"].update({path: {"sha256": "0" * 64, "bytes": 6}}))
+    is_no_bundle(ball, "names a file outside of the bundle")
+
+
+def test_a_link_that_leads_outside_is_refused(ball: Path) -> None:
+    (ball / "continuous.onnx").rename(ball.parent / "outside.onnx")
+    (ball / "continuous.onnx").symlink_to(ball.parent / "outside.onnx")
+    is_no_bundle(ball, "names a file outside of the bundle: continuous.onnx")
+    (ball / "continuous.onnx").unlink()
+    (ball / "continuous.onnx").symlink_to(ball / "continuous.onnx")
+    is_no_bundle(ball, "continuous.onnx")
+
+
+def test_a_format_that_the_contract_does_not_name_is_not_run(ball: Path) -> None:
+    rewrite(ball, lambda c: c["files"].pop("continuous.onnx"))
+    (ball / "continuous.onnx").write_bytes(b"anything")
+    ran = export_model("verify", ball, "--runtimes", "numpy", "--allow-unverified", "--json")
+    assert ran.status == 0
+    assert "onnx" not in ran.json["reports"][0]["sizes"]
+
+
+def test_a_bundle_without_bytes_has_no_reference(tmp_path: Path) -> None:
+    export_model(fixture("continuous"), "-o", tmp_path, "--verify", "none", "--to", "onnx")
+    is_no_bundle(tmp_path / "continuous", "has no .bytes", "--to")
+
+
+def test_another_source_is_refused(ball: Path) -> None:
+    ran = export_model("verify", ball, "--source", fixture("discrete"), "--runtimes", "numpy")
+    is_refused(ran, fixture("discrete"), "is not the source of this bundle", "continuous.bytes")
+
+
+def test_a_signature_that_is_not_complete_is_a_bundle_error(bundles: Path) -> None:
+    content = contract_of(bundles / "recurrent")
+    signature, source = bundle.signature_of(content)
+    assert signature.to_dict().items() <= content.items()
+    assert source.to_dict().items() <= content["source"].items()
+    for broken in ({**content, "inputs": ["a"]}, {**content, "outputs": [{}]}, {**content, "source": {"fixed": []}}):
+        with pytest.raises(BundleError, match="not complete"):
+            bundle.signature_of(broken)

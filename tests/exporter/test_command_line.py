@@ -1,0 +1,344 @@
+"""The command line's contract: which command is meant, what goes to stdout and stderr, the statuses, the JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import exporter
+from converters.registry import TARGETS
+from exporter import cli
+from exporter.cli import app
+from fixtures import path as fixture
+from tests.commands import export_model, files_in, is_refused, python
+from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
+
+BALL = fixture("continuous")
+UNVERIFIED = ("--verify", "none")
+
+
+# ------------------------------------------------------------------ which command is meant
+
+
+def test_a_source_alone_is_exported_into_a_folder_of_the_current_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ran = export_model(BALL, *UNVERIFIED)
+    assert (ran.status, ran.err) == (0, "")
+    assert "exported/continuous/policy.json" in files_in(tmp_path)
+
+
+def test_naming_the_command_makes_no_difference(tmp_path: Path) -> None:
+    short = export_model(BALL, "-o", tmp_path / "a", *UNVERIFIED)
+    long = export_model("export", BALL, "-o", tmp_path / "a", *UNVERIFIED)
+    assert short == long
+
+
+def test_options_may_come_before_the_source(tmp_path: Path) -> None:
+    assert export_model("--verify", "none", "-o", tmp_path, BALL).status == 0
+    assert export_model("--json", "-o", tmp_path, *UNVERIFIED, BALL).json["policies"][0]["name"] == "continuous"
+
+
+def test_a_source_that_is_called_like_a_command_is_given_with_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("inspect").write_bytes(graph_bytes(continuous_policy()))
+    assert export_model("./inspect", "-o", tmp_path / "out", *UNVERIFIED).status == 0
+    assert export_model("export", "inspect", "-o", tmp_path / "out", *UNVERIFIED).status == 0
+
+
+def test_help_lists_every_command() -> None:
+    ran = export_model("-h")
+    assert (ran.status, ran.err) == (0, "")
+    assert ran.out.startswith("Usage: export-model SOURCE... [-o DIR] [OPTIONS]\n       export-model COMMAND ...\n")
+    assert export_model("--help") == ran
+    for name in ("export", "inspect", "verify", "runtimes"):
+        assert f"\n  {name} " in ran.out
+        own = export_model(name, "-h")
+        assert (own.status, own.err) == (0, "")
+        assert own.out.startswith(f"Usage: export-model {name} ")
+
+
+def test_every_option_has_a_help_text() -> None:
+    for name, command in app.commands.items():
+        for parameter in command.params:
+            if parameter.param_type_name == "option":
+                assert parameter.help, (name, parameter.name)
+
+
+def test_no_argument_shows_the_usage_and_is_status_2() -> None:
+    ran = export_model()
+    assert (ran.status, ran.out) == (2, "")
+    assert "Usage: export-model SOURCE..." in ran.err
+
+
+def test_the_version_is_the_packages() -> None:
+    ran = export_model("--version")
+    assert (ran.status, ran.out.split()[-1], ran.err) == (0, exporter.__version__, "")
+
+
+def test_the_module_is_the_command() -> None:
+    ran = python("-m", "exporter", "inspect", BALL, "--json")
+    assert (ran.status, ran.err) == (0, "")
+    assert ran.out == export_model("inspect", BALL, "--json").out
+    is_refused(python("-m", "exporter", "nothing.bytes"), "nothing.bytes: no such file")
+
+
+# ------------------------------------------------------------------ export
+
+
+def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) -> None:
+    ran = export_model(BALL, "-o", tmp_path, *UNVERIFIED)
+    lines = ran.out.splitlines()
+    assert ran.err == ""
+    assert lines[0].startswith("continuous: ")
+    assert lines[0].endswith(f" -> {tmp_path / 'continuous'}")
+    assert lines[-1].startswith(f"next: export-model verify {tmp_path / 'continuous'}")
+    assert "NOT VERIFIED: --verify none" in lines
+    assert [line.split()[0] for line in lines[3:7]] == list(TARGETS)
+
+
+def test_an_export_of_bytes_says_that_unity_wants_the_trainers_names(tmp_path: Path) -> None:
+    def says_so(*flags: str) -> bool:
+        return "--names source for Unity" in export_model(BALL, "-o", tmp_path, *UNVERIFIED, *flags).out
+
+    assert says_so()
+    assert not says_so("--names", "source")
+    assert not says_so("--to", "onnx")
+
+
+def test_the_result_as_json_has_every_policy(tmp_path: Path) -> None:
+    ran = export_model(BALL, fixture("twobrains"), "-o", tmp_path, *UNVERIFIED, "--json")
+    assert (ran.status, ran.err) == (0, "")
+    policies = ran.json["policies"]
+    assert [p["name"] for p in policies] == ["continuous", "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2"]
+    for policy in policies:
+        assert set(policy) == {"name", "folder", "passed", "sizes", "parity"}
+        assert policy["folder"] == str(tmp_path / policy["name"])
+        assert (policy["passed"], policy["parity"]) == (None, None)
+        on_disk = sum(f.stat().st_size for f in (tmp_path / policy["name"]).rglob("*") if f.is_file())
+        assert sum(policy["sizes"].values()) == on_disk - (tmp_path / policy["name"] / "policy.json").stat().st_size
+
+
+@pytest.mark.parametrize(
+    "targets", [["bytes"], ["onnx"], ["tfjs"], ["saved_model"], ["onnx", "bytes"], ["tfjs", "saved_model", "tfjs"]]
+)
+def test_only_the_formats_that_were_asked_for_are_written(targets: list[str], tmp_path: Path) -> None:
+    ran = export_model(BALL, "-o", tmp_path, *UNVERIFIED, "--to", ",".join(targets), "--json")
+    assert list(ran.json["policies"][0]["sizes"]) == list(dict.fromkeys(targets))
+    heads = {"bytes": "continuous.bytes", "saved_model": "saved_model", "tfjs": "tfjs", "onnx": "continuous.onnx"}
+    found = {p.name for p in (tmp_path / "continuous").iterdir()}
+    assert found == {"policy.json", *(heads[t] for t in targets)}
+
+
+def test_one_brain_of_several_can_be_chosen(tmp_path: Path) -> None:
+    flags = ("-o", tmp_path, *UNVERIFIED, "--brain", "StrikerBrain", "--json")
+    assert [p["name"] for p in export_model(fixture("twobrains"), *flags).json["policies"]] == [
+        "twobrains-StrikerBrain"
+    ]
+    named = export_model(fixture("twobrains"), *flags, "--name", "Striker")
+    assert [p["name"] for p in named.json["policies"]] == ["Striker"]
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("3DBall", "3DBall"),
+        ("Ball (hard) ü", "Ball--hard---"),
+        ("../up", "..-up"),
+        ("a/b", "a-b"),
+        ("..", "policy"),
+        (".", "policy"),
+    ],
+)
+def test_a_name_is_made_safe_for_files(given: str, name: str, tmp_path: Path) -> None:
+    ran = export_model(BALL, "-o", tmp_path / "out", *UNVERIFIED, "--name", given, "--json")
+    assert ran.json["policies"][0]["name"] == name
+    assert f"out/{name}/{name}.bytes" in files_in(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["frozen_graph_def.pb", "saved_model.pb"])
+def test_a_file_whose_name_says_nothing_is_called_after_its_folder(name: str, tmp_path: Path) -> None:
+    (tmp_path / "My Behavior").mkdir()
+    (tmp_path / "My Behavior" / name).write_bytes(graph_bytes(continuous_policy()))
+    ran = export_model(tmp_path / "My Behavior" / name, "-o", tmp_path / "out", *UNVERIFIED, "--json")
+    assert ran.json["policies"][0]["name"] == "My-Behavior"
+
+
+def test_the_trainers_names_are_kept_on_request(tmp_path: Path) -> None:
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(continuous_policy("BallBrain/")))
+    ran = export_model(tmp_path / "a.bytes", "-o", tmp_path / "out", *UNVERIFIED, "--names", "source")
+    assert ran.status == 0
+    policy = json.loads((tmp_path / "out" / "a" / "policy.json").read_text())
+    assert [t["name"] for t in policy["inputs"]] == ["BallBrain/vector_observation"]
+    assert policy["outputs"][0]["name"] == "BallBrain/action"
+
+
+def _tensors(folder: Path, *flags: str) -> tuple[list[str], list[str]]:
+    (folder / "a.bytes").write_bytes(fixture("visual").read_bytes())
+    ran = export_model(folder / "a.bytes", "-o", folder / "out", *UNVERIFIED, *flags)
+    assert ran.status == 0, ran
+    policy = json.loads((folder / "out" / "a" / "policy.json").read_text())
+    return [t["name"] for t in policy["inputs"]], [t["name"] for t in policy["outputs"]]
+
+
+def test_noise_is_lifted_kept_or_removed(tmp_path: Path) -> None:
+    outputs = ["action", "deterministic_action", "value_estimate"]
+    assert _tensors(tmp_path) == (["state", "observation_0", "epsilon"], outputs)
+    assert _tensors(tmp_path, "--noise", "lift") == (["state", "observation_0", "epsilon"], outputs)
+    for mode in ("keep", "zero"):
+        inputs, _ = _tensors(tmp_path, "--noise", mode)
+        assert inputs == ["state", "observation_0"]
+    inputs, _ = _tensors(tmp_path, "--deterministic")
+    assert inputs == ["state", "observation_0"]
+
+
+def test_roles_and_values_can_be_given(tmp_path: Path) -> None:
+    nodes = continuous_policy(observation="what_it_sees")
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))
+    ran = export_model("inspect", tmp_path / "a.bytes", "--json", "--input", "what_it_sees=parameter")
+    assert ran.status == 2
+    ran = export_model("inspect", tmp_path / "a.bytes", "--json", "--input", "what_it_sees=state")
+    assert [t["role"] for t in ran.json["policies"][0]["inputs"]] == ["vector_observation"]
+    ran = export_model("inspect", BALL, "--json", "--set", "epsilon=0")
+    assert [t["name"] for t in ran.json["policies"][0]["inputs"]] == ["state"]
+    for word, same in (("true", "1"), ("False", "0")):
+        assert export_model("inspect", BALL, "--json", "--set", f"epsilon={word}") == export_model(
+            "inspect", BALL, "--json", "--set", f"epsilon={same}"
+        )
+
+
+# ------------------------------------------------------------------ inspect
+
+
+def test_inspection_says_what_to_feed_and_what_comes_out() -> None:
+    ran = export_model("inspect", fixture("sampled"))
+    assert (ran.status, ran.err) == (0, "")
+    assert "branches [3, 2, 4]" in ran.out
+    assert "1 = allowed, 0 = forbidden" in ran.out
+    assert "action drawn inside the graph" in ran.out
+    assert "can be written as: bytes, saved_model, tfjs, onnx" in ran.out
+    assert ran.out.splitlines()[-1] == f"next: export-model {fixture('sampled')} -o exported"
+    assert "memory 32 [c|h]" in export_model("inspect", fixture("recurrent")).out
+    assert "divide bytes by 255" in export_model("inspect", fixture("visual")).out
+    assert "2 policies" in export_model("inspect", fixture("twobrains")).out
+
+
+def test_inspection_as_json_has_the_contract_of_each_policy() -> None:
+    ran = export_model("inspect", fixture("recurrent"), "--json")
+    assert (ran.status, ran.err) == (0, "")
+    assert set(ran.json) == {"schema", "path", "kind", "sha256", "bytes", "nodes", "policies"}
+    policy = ran.json["policies"][0]
+    assert policy["memory"] == {"size": 32, "input": "recurrent_in", "output": "recurrent_out", "layout": ["c", "h"]}
+    assert policy["branches"] == [3, 2]
+    assert policy["targets"] == {t: {"ok": True, "reason": None} for t in TARGETS}
+    assert policy["ops"]["Placeholder"] == 4
+
+
+def test_inspection_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert export_model("inspect", BALL).status == 0
+    assert files_in(tmp_path) == set()
+
+
+def test_inspection_says_which_format_cannot_take_a_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(*_: object) -> None:
+        raise TypeError("no")
+
+    monkeypatch.setattr("converters.tfjs.writer.write", refusing)
+    found = export_model("inspect", BALL, "--json").json["policies"][0]["targets"]
+    assert found["onnx"] == {"ok": True, "reason": None}
+    assert found["tfjs"] == {"ok": False, "reason": "the graph cannot be understood"}
+    assert "cannot be written as tfjs: " in export_model("inspect", BALL).out
+
+
+def test_an_integer_state_is_shown_with_its_range(tmp_path: Path) -> None:
+    nodes: list[NodeDef] = [
+        placeholder("state", (None, 1), np.int32),
+        *(constant(n, v) for n, v in (("depth", 5), ("on", 1.0), ("off", 0.0), ("shape", [-1, 5]))),
+        node("hot", "OneHot", "state", "depth", "on", "off", axis=-1),
+        node("flat", "Reshape", "hot", "shape"),
+        *dense("mu", "flat", 5, 2),
+        node("action", "Tanh", "mu"),
+    ]
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))
+    ran = export_model("inspect", tmp_path / "a.bytes")
+    assert "the discrete state, an integer from 0 to 4" in ran.out
+
+
+# ------------------------------------------------------------------ runtimes
+
+
+def test_the_runtimes_are_listed_whether_they_are_here_or_not() -> None:
+    ran = export_model("runtimes")
+    assert (ran.status, ran.err) == (0, "")
+    names = [line.split()[0] for line in ran.out.splitlines()[2:]]
+    assert names == [r["name"] for r in export_model("runtimes", "--json").json["runtimes"]]
+    assert {"numpy", "tensorflow", "onnxruntime", "tfjs-cpu", "tfjs-wasm"} <= set(names)
+
+
+def test_the_runtimes_as_json_say_how_to_install_each() -> None:
+    for runtime in export_model("runtimes", "--json").json["runtimes"]:
+        assert set(runtime) == {"name", "installed", "version", "install"}
+        assert runtime["install"]
+
+
+def test_only_tfjs_is_installed_by_the_command() -> None:
+    is_refused(export_model("runtimes", "install", "onnxruntime"), "only tfjs", "pip install")
+    is_refused(export_model("runtimes", "install", "nothing"), "only tfjs", "export-model runtimes")
+
+
+def test_installing_tfjs_reports_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("exporter.runtimes.install_tfjs", lambda progress: progress("done"))
+    ran = export_model("runtimes", "install", "tfjs")
+    assert (ran.status, ran.out, ran.err) == (0, "done\n", "")
+
+
+# ------------------------------------------------------------------ ends that are neither success nor error
+
+
+def test_an_interrupted_run_says_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("exporter.sources.compile_graph", interrupted)
+    ran = export_model(BALL, "-o", tmp_path / "out", *UNVERIFIED)
+    assert (ran.status, ran.out) == (130, "")
+    assert ran.err.strip() == "stopped"
+    assert files_in(tmp_path) == set()
+
+
+def test_progress_is_shown_on_a_terminal_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
+    cli._progress(quiet=False)("working")
+    assert "working" in shown.getvalue()
+    cli._progress(quiet=True)("hidden")
+    assert "hidden" not in shown.getvalue()
+
+
+def test_the_same_source_twice_is_written_once_more_and_not_refused(tmp_path: Path) -> None:
+    ran = export_model(BALL, BALL, "-o", tmp_path, *UNVERIFIED)
+    assert ran.status == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"continuous"}
+
+
+def test_a_drawn_action_is_described_in_both_forms(tmp_path: Path) -> None:
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(sampled_policy()))
+    policy = export_model("inspect", tmp_path / "a.bytes", "--json").json["policies"][0]
+    assert [(t["name"], t["role"], t["source"]) for t in policy["outputs"]] == [
+        ("action", "sampled", "action:0"),
+        ("deterministic_action", "deterministic", None),
+        ("action_log_probs", "log_probs", None),
+    ]

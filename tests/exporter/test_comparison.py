@@ -1,0 +1,245 @@
+"""Two arrays that should be the same: when they are, and what is said when they are not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from exporter.parity.compare import compare, ties
+from exporter.parity.statistics import FALSE_ALARM, chi_square_survival, fit
+from exporter.parity.tolerances import ATOL, RTOL, Tolerance, tolerance_for
+from signatures.roles import Role
+from signatures.spec import PolicySignature, TensorSpec
+
+PLAIN = Tolerance()
+
+
+def floats(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)
+
+
+# ------------------------------------------------------------------ numbers
+
+
+@pytest.mark.parametrize("reference", [0.0, 1.0, -1000.0])
+def test_the_bound_is_absolute_plus_relative(reference: float) -> None:
+    bound = ATOL + RTOL * abs(reference)
+    near = compare(np.array([reference]), np.array([reference + 0.99 * bound]), PLAIN)
+    far = compare(np.array([reference]), np.array([reference + 1.01 * bound]), PLAIN)
+    assert (near.passed, far.passed) == (True, False)
+    assert far.max_abs == pytest.approx(1.01 * bound)
+    assert far.reason == ""
+
+
+def test_the_relative_part_is_of_the_reference() -> None:
+    assert compare(floats(1000.0), floats(1000.005), PLAIN).passed
+    assert not compare(np.array([0.0]), np.array([0.005]), PLAIN).passed
+    assert compare(np.array([1e9]), np.array([0.0]), PLAIN).max_rel == 1.0
+
+
+def test_the_worst_element_counts() -> None:
+    difference = compare(floats(1, 2, 3), floats(1, 2.5, 3), PLAIN)
+    assert (difference.max_abs, difference.max_rel, difference.passed) == (0.5, 0.25, False)
+
+
+def test_a_relative_difference_from_zero_is_finite() -> None:
+    assert compare(floats(0), floats(1), PLAIN).max_rel == 1e30
+
+
+def test_nothing_is_equal_to_nothing() -> None:
+    assert compare(np.zeros((0, 3)), np.zeros((0, 3)), PLAIN).passed
+
+
+@given(arrays.arrays(np.float32, arrays.array_shapes(max_dims=3, max_side=4)))
+@settings(max_examples=50, deadline=None)
+def test_anything_is_equal_to_itself(values: np.ndarray) -> None:
+    difference = compare(values, values.copy(), Tolerance(0, 0))
+    assert (difference.passed, difference.max_abs, difference.max_rel) == (True, 0, 0)
+
+
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_stands_on_both_sides_or_it_is_a_fault(odd: float) -> None:
+    assert compare(floats(1, odd), floats(1, odd), PLAIN).passed
+    for a, b in ((floats(1, odd), floats(1, 2)), (floats(1, 2), floats(1, odd)), (floats(odd), floats(5e37))):
+        difference = compare(a, b, Tolerance(1e30, 1e30))
+        assert (difference.passed, difference.reason) == (False, "NaN or infinity on one side only")
+        assert difference.max_abs == math.inf
+    assert not compare(floats(math.inf), floats(-math.inf), PLAIN).passed
+    assert not compare(floats(math.inf), floats(math.nan), PLAIN).passed
+
+
+def test_what_is_not_finite_does_not_hide_the_rest() -> None:
+    assert not compare(floats(math.nan, 1), floats(math.nan, 2), PLAIN).passed
+
+
+def test_another_shape_is_a_fault() -> None:
+    difference = compare(np.zeros((2, 3)), np.zeros((3, 2)), PLAIN)
+    assert (difference.passed, difference.reason) == (False, "shape [3, 2] instead of [2, 3]")
+    assert not compare(np.zeros(()), np.zeros((1,)), PLAIN).passed
+
+
+def test_another_dtype_is_a_fault_and_narrow_integers_where_they_are_not_allowed() -> None:
+    wide, narrow = np.array([1], np.int64), np.array([1], np.int32)
+    assert compare(wide, narrow, PLAIN).reason == "dtype int32 instead of int64"
+    assert compare(wide, narrow, PLAIN, narrowed=True).passed
+    assert not compare(narrow, wide, PLAIN, narrowed=True).passed
+    assert not compare(np.array([1.0]), floats(1), PLAIN, narrowed=True).passed
+
+
+def test_integers_are_equal_or_not() -> None:
+    a, b = np.array([[1000, 2000]]), np.array([[1000, 2001]])
+    assert compare(a, a, Tolerance(5, 5)).passed
+    assert not compare(a, b, Tolerance(5, 5)).passed
+    assert compare(a, b, PLAIN, free=np.array([[False, True]])).passed
+    assert not compare(a, b, PLAIN, free=np.array([[True, False]])).passed
+
+
+def test_rounding_takes_the_place_of_a_smaller_tolerance() -> None:
+    a, b = floats(1, 1), floats(1, 1.5)
+    assert not compare(a, b, PLAIN, rounding=np.array([0.6, 0.4])).passed
+    explained = compare(a, b, PLAIN, rounding=np.array([0.0, 0.6]))
+    assert (explained.passed, explained.rounding) == (True, 0.6)
+    assert compare(a, floats(1, 1 + 5e-6), PLAIN, rounding=np.zeros(2)).passed
+
+
+# ------------------------------------------------------------------ ties
+
+
+def test_scores_that_are_too_close_are_a_tie() -> None:
+    scores = np.array([[0.0, 1.0, -1.0, -1.0], [0.0, 1e-6, 5.0, 1.0], [2.0, 2.0, 0.0, 1e-3]])
+    assert ties(scores, (2, 2), PLAIN).tolist() == [[False, True], [True, False], [True, False]]
+
+
+def test_a_branch_of_one_has_no_tie() -> None:
+    assert ties(np.zeros((2, 3)), (1, 2), PLAIN).tolist() == [[False, True], [False, True]]
+
+
+def test_scores_that_are_not_finite_decide_nothing() -> None:
+    scores = np.array([[math.nan, 1.0], [math.inf, math.inf], [-math.inf, 0.0]])
+    assert ties(scores, (2,), PLAIN).tolist() == [[True], [True], [False]]
+
+
+# ------------------------------------------------------------------ tolerances
+
+
+def signature(algorithm: str | None) -> PolicySignature:
+    spec = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
+    return PolicySignature((spec,), (spec,), "own model", "continuous", algorithm=algorithm)
+
+
+def test_only_sac_has_a_wider_tolerance_and_says_why() -> None:
+    assert tolerance_for(signature("PPO"), "action_probs", PLAIN) is PLAIN
+    assert tolerance_for(signature("SAC"), "action", PLAIN) is PLAIN
+    wider = tolerance_for(signature("SAC"), "action_probs", PLAIN)
+    assert (wider.atol, wider.rtol) == (5e-3, 5e-3)
+    assert "cancels" in wider.reason
+
+
+def test_a_tolerance_that_is_wider_still_is_kept() -> None:
+    own = Tolerance(0.1, 0.1)
+    assert tolerance_for(signature("SAC"), "action_probs", own) is own
+
+
+# ------------------------------------------------------------------ goodness of fit
+
+
+@pytest.mark.parametrize(
+    ("statistic", "freedom", "expected"),
+    [
+        # published critical values of the chi-square distribution
+        (3.841458820694124, 1, 0.05),
+        (6.634896601021213, 1, 0.01),
+        (10.827566170662733, 1, 0.001),
+        (5.991464547107979, 2, 0.05),
+        (9.210340371976182, 2, 0.01),
+        (11.070497693516351, 5, 0.05),
+        (15.08627246938899, 5, 0.01),
+        (18.307038053275146, 10, 0.05),
+        (31.410432844230918, 20, 0.05),
+        (124.34211340400407, 100, 0.05),
+        (0.6931471805599453 * 2, 2, 0.5),
+    ],
+)
+def test_the_tail_of_chi_square_is_that_of_the_tables(statistic: float, freedom: int, expected: float) -> None:
+    assert chi_square_survival(statistic, freedom) == pytest.approx(expected, rel=1e-9)
+
+
+@given(st.floats(0.001, 700))
+@settings(deadline=None)
+def test_the_tail_has_a_closed_form_for_one_and_two_degrees_of_freedom(x: float) -> None:
+    assert chi_square_survival(x, 2) == pytest.approx(math.exp(-x / 2), rel=1e-9, abs=1e-300)
+    assert chi_square_survival(x, 1) == pytest.approx(math.erfc(math.sqrt(x / 2)), rel=1e-9, abs=1e-300)
+
+
+@given(st.floats(0, 500), st.integers(1, 200))
+@settings(deadline=None)
+def test_the_tail_is_a_probability_that_falls_and_grows_with_freedom(x: float, freedom: int) -> None:
+    p = chi_square_survival(x, freedom)
+    assert 0 <= p <= 1
+    assert chi_square_survival(x + 1, freedom) <= p + 1e-12
+    assert chi_square_survival(x, freedom + 1) >= p - 1e-12
+
+
+def test_no_difference_or_no_freedom_is_no_doubt() -> None:
+    assert chi_square_survival(0.0, 3) == chi_square_survival(-1.0, 3) == chi_square_survival(5.0, 0) == 1.0
+
+
+def test_extreme_statistics_have_no_doubt_left() -> None:
+    assert 0 <= chi_square_survival(1e6, 3) < 1e-300
+
+
+LOG = np.log(np.array([0.5, 0.3, 0.2]))
+
+
+def test_draws_from_the_distribution_fit_it() -> None:
+    rng = np.random.default_rng(7)
+    values = [fit(rng.choice(3, 512, p=np.exp(LOG)), LOG) for _ in range(200)]
+    assert min(values) > FALSE_ALARM
+    assert 0.3 < float(np.mean(values)) < 0.7  # p-values are uniform
+
+
+def test_draws_from_another_distribution_do_not() -> None:
+    rng = np.random.default_rng(7)
+    assert fit(rng.choice(3, 512, p=[0.3, 0.5, 0.2]), LOG) < FALSE_ALARM
+    assert fit(np.zeros(512, int), LOG) < FALSE_ALARM
+
+
+def test_the_scores_need_not_be_normalised() -> None:
+    draws = np.random.default_rng(7).choice(3, 512, p=np.exp(LOG))
+    assert fit(draws, LOG + 0.25) == pytest.approx(fit(draws, LOG))
+
+
+def test_the_order_of_the_classes_does_not_matter() -> None:
+    draws = np.random.default_rng(7).choice(3, 512, p=np.exp(LOG))
+    assert fit(2 - draws, LOG[::-1]) == pytest.approx(fit(draws, LOG))
+
+
+@pytest.mark.parametrize("draws", [[], [-1, 0], [0, 3]])
+def test_no_draws_or_impossible_ones_do_not_fit(draws: list[int]) -> None:
+    assert fit(np.array(draws, int), LOG) == 0.0
+
+
+def test_a_masked_class_may_never_be_drawn() -> None:
+    masked = np.log(np.array([1.0, 1e-10]))
+    assert fit(np.zeros(512, int), masked) == 1.0
+    assert fit(np.array([0] * 511 + [1]), masked) == 0.0
+
+
+def test_rare_classes_are_counted_together() -> None:
+    """Forty classes that are expected once each are one class of forty, or join the rarest that is large."""
+    rng = np.random.default_rng(7)
+    probabilities = np.array([0.9, *[0.1 / 40] * 40])
+    assert fit(rng.choice(41, 400, p=probabilities), np.log(probabilities)) > 1e-3
+    assert fit(np.where(rng.random(400) < 0.5, 0, rng.integers(1, 41, 400)), np.log(probabilities)) < FALSE_ALARM
+    few = np.array([0.6, 0.395, 0.005])
+    assert fit(rng.choice(3, 400, p=few), np.log(few)) > 1e-3
+    assert fit(rng.choice(3, 400, p=[0.3, 0.2, 0.5]), np.log(few)) < FALSE_ALARM
+
+
+def test_too_few_draws_to_tell_are_no_fault() -> None:
+    assert fit(np.array([0, 1]), LOG) == 1.0

@@ -1,0 +1,111 @@
+"""What imports what: one direction between the packages, and nothing heavy before it is used."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.commands import ROOT, python
+
+#: package → the packages of this project that it may import
+ALLOWED = {
+    "signatures": {"signatures"},
+    "converters": {"signatures", "converters"},
+    "exporter": {"signatures", "converters", "exporter"},
+}
+MODULES = [
+    path for package in ALLOWED for path in sorted((ROOT / package).rglob("*.py")) if "node_modules" not in str(path)
+]
+HEAVY = {"tensorflow", "onnxruntime", "tensorflowjs", "tf2onnx", "torch", "keras"}
+RUNTIMES = {"tensorflow", "onnxruntime"}
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Top-level names of all imports in a piece of code."""
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in found.names)
+        elif isinstance(found, ast.ImportFrom):
+            assert found.level == 0, "relative imports hide what is imported"
+            assert found.module is not None
+            yield found.module.split(".")[0]
+
+
+def at_module_level(tree: ast.Module) -> Iterator[str]:
+    """The same, for imports that run when the module is imported."""
+    for statement in tree.body:
+        if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":
+            continue
+        yield from imported(statement)
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_the_modules_are_found() -> None:
+    names = {name_of(m) for m in MODULES}
+    assert {"signatures/roles.py", "converters/registry.py", "exporter/cli.py"} <= names
+
+
+@pytest.mark.parametrize("module", MODULES, ids=name_of)
+def test_imports_go_one_way(module: Path) -> None:
+    package = module.relative_to(ROOT).parts[0]
+    own = set(imported(ast.parse(module.read_text(encoding="utf-8")))) & set(ALLOWED)
+    assert own <= ALLOWED[package]
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if m.is_relative_to(ROOT / "signatures")], ids=name_of)
+def test_signatures_know_numpy_and_the_standard_library_only(module: Path) -> None:
+    assert set(imported(ast.parse(module.read_text(encoding="utf-8")))) <= {
+        *sys.stdlib_module_names,
+        "numpy",
+        "signatures",
+    }
+
+
+@pytest.mark.parametrize("module", MODULES, ids=name_of)
+def test_no_runtime_is_imported_with_a_module(module: Path) -> None:
+    assert not set(at_module_level(ast.parse(module.read_text(encoding="utf-8")))) & HEAVY
+
+
+@pytest.mark.parametrize("module", MODULES, ids=name_of)
+def test_only_the_room_of_the_children_imports_a_runtime(module: Path) -> None:
+    if not module.is_relative_to(ROOT / "converters" / "runner"):
+        assert not set(imported(ast.parse(module.read_text(encoding="utf-8")))) & RUNTIMES
+
+
+def loaded_by(*arguments: object) -> set[str]:
+    """Top-level modules that a command imports."""
+    ran = python("-X", "importtime", *arguments)
+    assert ran.status == 0, ran.err
+    return {
+        line.rpartition("|")[2].strip().split(".")[0]
+        for line in ran.err.splitlines()
+        if line.startswith("import time:")
+    }
+
+
+def test_help_starts_without_anything_heavy() -> None:
+    loaded = loaded_by("-m", "exporter", "--help")
+    assert "click" in loaded
+    assert not loaded & {"tensorflow", "onnxruntime", "onnx", "rich", "numpy", "google", "converters"}
+
+
+def test_an_export_without_verification_loads_no_runtime(tmp_path: Path) -> None:
+    source = ROOT / "fixtures" / "continuous.bytes"
+    loaded = loaded_by("-m", "exporter", source, "-o", tmp_path, "--verify", "none", "--to", "bytes,saved_model,tfjs")
+    assert not loaded & {"tensorflow", "onnxruntime", "onnx", "rich"}
+    assert "onnx" in loaded_by("-m", "exporter", source, "-o", tmp_path, "--verify", "none", "--to", "onnx")
+
+
+def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
+    code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
+    assert python("-c", code).out.split() == ["False", "True"]
+    assert "has no attribute 'nothing'" in python("-c", "import exporter; exporter.nothing").err

@@ -1,0 +1,187 @@
+"""``from exporter import export_model, inspect_model, verify_bundle``: typed results, the same exceptions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import exporter
+from exporter import export_model, inspect_model, verify_bundle
+from exporter.inspection import Inspection
+from exporter.parity.report import ParityReport
+from exporter.parity.verify import VerifyOptions
+from exporter.pipeline import ExportResult
+from fixtures import path as fixture
+from signatures.errors import (
+    BundleError,
+    ExportModelError,
+    NotAPolicyError,
+    ParityError,
+    RuntimeUnavailableError,
+    SourceError,
+    UsageError,
+)
+from signatures.roles import Role
+from tests.commands import files_in
+from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
+
+BALL = fixture("continuous")
+
+
+def test_the_package_offers_three_functions_and_its_version() -> None:
+    assert set(exporter.__all__) == {"__version__", "export_model", "inspect_model", "verify_bundle"}
+    assert all(hasattr(exporter, name) for name in exporter.__all__)
+
+
+def test_an_export_gives_a_list_of_results(tmp_path: Path) -> None:
+    results = export_model(BALL, tmp_path, verify="none")
+    assert isinstance(results, list)
+    (result,) = results
+    assert isinstance(result, ExportResult)
+    assert (result.folder, result.passed, result.report) == (tmp_path / "continuous", None, None)
+    assert list(result.sizes) == ["bytes", "saved_model", "tfjs", "onnx"]
+    assert result.contract["name"] == result.policy.name == "continuous"
+    assert [s.name for s in result.policy.signature.inputs] == ["state", "epsilon"]
+    assert (tmp_path / "continuous" / "policy.json").is_file()
+
+
+def test_paths_may_be_strings_and_several(tmp_path: Path) -> None:
+    names = [r.policy.name for r in export_model(str(BALL), str(tmp_path), verify="none")]
+    assert names == ["continuous"]
+    several = export_model([BALL, str(fixture("twobrains"))], tmp_path, verify="none")
+    assert [r.policy.name for r in several] == ["continuous", "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2"]
+
+
+@pytest.mark.parametrize("to", ["onnx,bytes", ("onnx", "bytes"), ["onnx", "bytes"]])
+def test_formats_are_a_list_or_what_the_command_line_takes(to: str | list[str], tmp_path: Path) -> None:
+    (result,) = export_model(BALL, tmp_path, to=to, verify="none")
+    assert list(result.sizes) == ["onnx", "bytes"]
+
+
+def test_every_flag_is_a_parameter(tmp_path: Path) -> None:
+    (result,) = export_model(
+        fixture("twobrains"),
+        tmp_path,
+        to=["bytes"],
+        name="Striker",
+        brain="StrikerBrain",
+        names="source",
+        noise="zero",
+        inputs={"StrikerBrain/state": Role.VECTOR},
+        outputs={"StrikerBrain/action": "action"},
+        verify="none",
+    )
+    assert result.policy.name == "Striker"
+    assert [s.name for s in result.policy.signature.inputs] == ["StrikerBrain/state"]
+    (fixed,) = export_model(BALL, tmp_path, values={"epsilon": 0.5}, verify="none", opset=17, to="onnx")
+    assert [s.name for s in fixed.policy.signature.inputs] == ["state"]
+    (quiet,) = export_model(fixture("visual"), tmp_path, deterministic=True, verify="none", to="onnx")
+    assert quiet.policy.signature.outputs[0].role is Role.CONTINUOUS
+
+
+def test_an_inspection_is_typed() -> None:
+    found = inspect_model(fixture("twobrains"))
+    assert isinstance(found, Inspection)
+    assert found.path == fixture("twobrains")
+    assert found.size == fixture("twobrains").stat().st_size
+    assert [p.policy.name for p in found.policies] == ["twobrains-StrikerBrain", "twobrains-Goalie-Brain-2"]
+    assert [p.policy.signature.branches for p in found.policies] == [(), (4, 2)]
+    assert set(found.policies[0].targets.values()) == {None}
+    (one,) = inspect_model(str(fixture("twobrains")), brain="StrikerBrain").policies
+    assert one.policy.signature.algorithm == "PPO"
+    assert [s.name for s in inspect_model(BALL, values={"epsilon": 0}).policies[0].policy.signature.inputs] == ["state"]
+
+
+def test_what_the_command_line_refuses_is_raised(tmp_path: Path) -> None:
+    (tmp_path / "text.bytes").write_text("text\n")
+    with pytest.raises(SourceError, match="no such file"):
+        export_model(tmp_path / "nothing.bytes")
+    with pytest.raises(NotAPolicyError, match="a text file"):
+        inspect_model(tmp_path / "text.bytes")
+    with pytest.raises(UsageError, match="no source"):
+        export_model([])
+    with pytest.raises(BundleError, match="no bundle"):
+        verify_bundle(tmp_path)
+    with pytest.raises(UsageError, match="there is no runtime"):
+        export_model(BALL, tmp_path / "out", verify=["nothing"])
+    assert files_in(tmp_path) == {"text.bytes"}
+
+
+def test_errors_have_their_parts() -> None:
+    with pytest.raises(ExportModelError) as caught:
+        inspect_model("nothing.bytes")
+    error = caught.value
+    assert (error.what, error.where, error.why, error.exit_status) == ("no such file", "nothing.bytes", None, 2)
+    assert str(error) == error.message == "nothing.bytes: no such file\n  fix: check the path"
+
+
+def test_a_bundle_is_verified_again(tmp_path: Path) -> None:
+    (result,) = export_model(BALL, tmp_path, verify="none")
+    report = verify_bundle(result.folder, runtimes="numpy", options=VerifyOptions(samples=1), allow_unverified=True)
+    assert isinstance(report, ParityReport)
+    assert (report.passed, report.policy, report.reference) == (None, "continuous", "bytes/numpy")
+    assert any("the source was not given" in note for note in report.notes)
+    with pytest.raises(RuntimeUnavailableError, match="nothing was verified"):
+        verify_bundle(str(result.folder), runtimes=["numpy"])
+    with_source = verify_bundle(result.folder, source=str(BALL), runtimes="numpy", allow_unverified=True)
+    assert with_source.reference == "numpy"
+
+
+# ------------------------------------------------------------------ disagreement
+
+
+def _wrong(kind: str, runtime: str, answer: Tensors) -> Tensors:
+    return {n: a + 1 if kind == "onnx" and n == "action" else a for n, a in answer.items()}
+
+
+@pytest.fixture
+def disagreeing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Played runtimes, one of which is wrong."""
+    monkeypatch.setattr("exporter.pipeline.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+    monkeypatch.setattr("exporter.pipeline.RuntimePool", lambda: ActingPool(_wrong))
+
+
+@pytest.mark.usefixtures("disagreeing")
+def test_a_disagreement_is_raised_after_everything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ParityError, match="1 of 1 policies do not agree") as caught:
+        export_model(BALL, tmp_path)
+    assert caught.value.exit_status == 1
+    assert caught.value.where == str(tmp_path / "continuous.failed")
+    assert caught.value.report[0]["passed"] is False
+    assert (tmp_path / "continuous.failed" / "parity.json").is_file()
+
+
+@pytest.mark.usefixtures("disagreeing")
+def test_a_disagreement_is_a_result_when_nobody_is_strict(tmp_path: Path) -> None:
+    (result,) = export_model(BALL, tmp_path, strict=False)
+    assert (result.passed, result.folder.name) == (False, "continuous.failed")
+    assert result.report is not None
+    assert {c.format for c in result.report.failures} == {"onnx"}
+
+
+@pytest.mark.usefixtures("disagreeing")
+def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
+    from tests.commands import export_model as command
+
+    ran = command(BALL, "-o", tmp_path)
+    assert (ran.status, ran.err) == (1, "")
+    assert "FAILED: " in ran.out
+    assert "onnx in onnxruntime: action differs by 1" in ran.out
+    assert ran.out.splitlines()[-1].startswith(f"next: read {tmp_path / 'continuous.failed'}/parity.json")
+    as_json = command(BALL, "-o", tmp_path, "--json")
+    assert as_json.status == 1
+    assert (as_json.json["policies"][0]["passed"], as_json.json["policies"][0]["parity"]["passed"]) == (False, False)
+
+
+@pytest.mark.usefixtures("disagreeing")
+def test_verifying_again_ends_with_status_1_too(tmp_path: Path) -> None:
+    from tests.commands import export_model as command
+
+    command(BALL, "-o", tmp_path, "--verify", "none")
+    folder = tmp_path / "continuous.failed"
+    assert folder.is_dir()
+    ran = command("verify", folder, "--source", BALL)
+    assert (ran.status, ran.err) == (1, "")
+    assert "FAILED: " in ran.out
+    assert command("verify", folder, "--json").json["reports"][0]["passed"] is False

@@ -1,0 +1,216 @@
+"""An old bundle is whole or the new one is, whenever the process is killed; what is not a bundle is left alone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from exporter import bundle
+from fixtures import path as fixture
+from signatures.errors import BundleError, UsageError
+from tests.commands import Ran, export_model, files_in, python
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
+
+#: Runs an export that kills itself at a point of its way.
+SUICIDE = """
+import os, shutil, signal, sys
+from pathlib import Path
+from exporter import bundle
+from exporter.cli import main
+
+point, *arguments = sys.argv[1:]
+kind, _, number = point.partition(":")
+left = int(number or 0)
+write, rename, exchange, remove = Path.write_bytes, Path.rename, bundle._exchange, shutil.rmtree
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def dying_write(path, data):
+    global left
+    if left == 0:
+        write(path, data[: len(data) // 2])
+        die()
+    left -= 1
+    return write(path, data)
+
+def dying_rename(path, target):
+    global left
+    if left == 0:
+        die()
+    left -= 1
+    return rename(path, target)
+
+def dying_exchange(a, b):
+    if kind == "before exchange":
+        die()
+    done = exchange(a, b)
+    die()
+    return done
+
+if kind == "write":
+    Path.write_bytes = dying_write
+elif kind.endswith("exchange"):
+    bundle._exchange = dying_exchange
+else:  # a system without an exchange
+    bundle._exchange = lambda a, b: False
+    if kind == "rename":
+        Path.rename = dying_rename
+    else:
+        shutil.rmtree = lambda *a, **k: die()
+main(arguments)
+"""
+#: Files that an export of one policy to all formats writes.
+WRITES = 6
+
+
+def exported(out: Path, *flags: str) -> Ran:
+    return export_model(fixture("continuous"), "-o", out, "--verify", "none", *flags)
+
+
+def killed(point: str, out: Path) -> None:
+    """Export the deterministic variant over what is there, and die at ``point``."""
+    arguments = (fixture("continuous"), "-o", out, "--verify", "none", "--deterministic")
+    assert python("-c", SUICIDE, point, *arguments).status == -signal.SIGKILL
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether every file of a bundle is the one that its policy.json names."""
+    bundle.check_hashes(folder, bundle.read_policy_json(folder))
+    return True
+
+
+def is_deterministic(folder: Path) -> bool:
+    return [t["name"] for t in json.loads((folder / "policy.json").read_text())["inputs"]] == ["state"]
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """An output folder that has the bundle of ``continuous`` already."""
+    assert exported(tmp_path / "out").status == 0
+    return tmp_path / "out"
+
+
+@pytest.mark.parametrize("point", [*(f"write:{i}" for i in range(WRITES)), "before exchange"])
+def test_the_old_bundle_is_whole_when_a_run_is_killed_before_the_exchange(point: str, out: Path) -> None:
+    killed(point, out)
+    assert is_whole(out / "continuous")
+    assert not is_deterministic(out / "continuous")
+    assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {"continuous"}
+
+
+def test_the_new_bundle_is_whole_when_a_run_is_killed_after_the_exchange(out: Path) -> None:
+    killed("after exchange", out)
+    assert is_whole(out / "continuous")
+    assert is_deterministic(out / "continuous")
+
+
+@pytest.mark.parametrize("point", [f"write:{i}" for i in range(WRITES)])
+def test_nothing_is_in_the_place_when_the_first_run_is_killed(point: str, tmp_path: Path) -> None:
+    killed(point, tmp_path / "out")
+    assert not (tmp_path / "out" / "continuous").exists()
+    assert exported(tmp_path / "out").status == 0
+    assert is_whole(tmp_path / "out" / "continuous")
+
+
+def test_without_an_exchange_the_next_run_puts_the_old_bundle_back(out: Path) -> None:
+    """Killed between the two renames; the next run is refused, and the old bundle is in its place all the same."""
+    killed("rename:1", out)
+    assert not (out / "continuous").exists()
+    assert exported(out, "--opset", "99").status == 2
+    assert is_whole(out / "continuous")
+    assert not is_deterministic(out / "continuous")
+
+
+@pytest.mark.parametrize("point", ["rename:0", "remove"])
+def test_without_an_exchange_a_bundle_is_whole_at_the_other_points(point: str, out: Path) -> None:
+    killed(point, out)
+    assert is_whole(out / "continuous")
+    assert is_deterministic(out / "continuous") is (point == "remove")
+    assert exported(out).status == 0
+    assert is_whole(out / "continuous")
+
+
+def test_without_an_exchange_the_old_bundle_goes_away_in_the_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bundle, "_exchange", lambda a, b: False)
+    (out / ".continuous.old").mkdir()
+    assert exported(out, "--deterministic").status == 0
+    assert is_deterministic(out / "continuous")
+    assert {p.name for p in out.iterdir()} == {"continuous"}
+
+
+def test_without_an_exchange_a_rename_that_fails_puts_the_old_bundle_back(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bundle, "_exchange", lambda a, b: False)
+    rename = Path.rename
+
+    def failing(path: Path, target: Path) -> Path:
+        if ".old" not in path.name and ".old" not in target.name:
+            raise OSError(5, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    ran = exported(out, "--deterministic")
+    assert (ran.status, ran.out) == (2, "")
+    assert "Input/output error" in ran.err
+    assert is_whole(out / "continuous")
+    assert not is_deterministic(out / "continuous")
+    assert {p.name for p in out.iterdir()} == {"continuous"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux exchanges")
+def test_linux_exchanges_two_folders_in_one_step(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    assert bundle._exchange(tmp_path / "a", tmp_path / "b")
+    assert files_in(tmp_path) == {"a", "a/b", "b", "b/a"}
+    assert not bundle._exchange(tmp_path / "a", tmp_path / "nothing")
+
+
+def test_other_systems_do_not_try_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert not bundle._exchange(tmp_path, tmp_path)
+
+
+def test_a_libc_without_the_call_is_no_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("exporter.bundle.ctypes.CDLL", lambda *a, **k: object())
+    assert not bundle._exchange(tmp_path, tmp_path)
+
+
+def test_a_replaced_bundle_leaves_nothing_of_the_old_one(out: Path) -> None:
+    assert exported(out, "--to", "onnx").status == 0
+    assert files_in(out) == {"continuous", "continuous/policy.json", "continuous/continuous.onnx"}
+
+
+def test_only_a_bundle_or_an_empty_folder_is_replaced(tmp_path: Path) -> None:
+    stage, place = tmp_path / "stage", tmp_path / "place"
+    stage.mkdir()
+    (place / "policy.json").mkdir(parents=True)  # a folder of that name is no contract
+    with pytest.raises(BundleError, match="not a bundle"):
+        bundle.put_in_place(stage, place)
+    shutil.rmtree(place)
+    bundle.put_in_place(stage, place)
+    assert files_in(tmp_path) == {"place"}
+
+
+def test_names_that_fall_together_are_found() -> None:
+    bundle.distinct_names([("a", "x"), ("b", "y"), ("a", "x")])
+    with pytest.raises(UsageError, match="x and y"):
+        bundle.distinct_names([("Straße", "x"), ("STRASSE", "y")])
+
+
+@pytest.mark.parametrize(
+    ("given", "safe"),
+    [("3DBall", "3DBall"), ("a b/c\\d:e", "a-b-c-d-e"), ("", "policy"), ("...", "policy"), ("ä", "-")],
+)
+def test_names_are_made_safe(given: str, safe: str) -> None:
+    assert bundle.safe_name(given) == safe
+    assert bundle.safe_name(safe) == safe

@@ -1,0 +1,122 @@
+"""Which runtimes are chosen, and the processes that they run in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from converters.runner.process import RunFailedError
+from exporter.parity import pool as pools
+from exporter.parity.pool import INDEPENDENT, RuntimePool, chosen_runtimes
+from exporter.runtimes import RuntimeInfo
+from fixtures import path as fixture
+from signatures.errors import RuntimeUnavailableError, UsageError
+
+NAMES = ("numpy", "tensorflow", "tf1.4", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """The runtimes that are installed; a test takes some away."""
+    installed = set(NAMES) - {"tf1.4"}
+    monkeypatch.setattr(
+        pools, "available_runtimes", lambda: tuple(RuntimeInfo(n, n in installed, "1", f"get {n}") for n in NAMES)
+    )
+    return installed
+
+
+def names(wanted: str | list[str], *formats: str) -> tuple[str, ...]:
+    return chosen_runtimes(wanted, formats or ("bytes", "saved_model", "tfjs", "onnx"))[0]
+
+
+def test_what_is_installed_for_the_formats_is_chosen_by_itself(here: set[str]) -> None:
+    assert names("auto") == ("numpy", "tensorflow", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
+    assert names("auto", "onnx") == ("tensorflow", "onnxruntime")
+    here -= {"tensorflow", "tfjs-cpu"}
+    assert names("auto") == ("numpy", "onnxruntime", "tfjs-wasm")
+    assert names("none") == ()
+
+
+def test_full_is_everything_and_nothing_may_be_missing(here: set[str]) -> None:
+    assert set(names("full")) == {"numpy", *INDEPENDENT}
+    here -= {"onnxruntime"}
+    with pytest.raises(RuntimeUnavailableError, match="onnxruntime is not installed") as caught:
+        names("full")
+    assert caught.value.fix == "get onnxruntime"
+
+
+@pytest.mark.parametrize("wanted", ["tfjs-wasm,onnxruntime", ["tfjs-wasm", "onnxruntime"], "tfjs-wasm,,onnxruntime,"])
+def test_names_are_taken_in_their_order_and_numpy_is_always_there(here: set[str], wanted: str | list[str]) -> None:
+    assert names(wanted) == ("numpy", "tfjs-wasm", "onnxruntime")
+
+
+def test_names_that_are_none_or_not_installed_are_refused(here: set[str]) -> None:
+    with pytest.raises(UsageError, match="there is no runtime 'torch'") as caught:
+        names("torch")
+    assert caught.value.fix == f"the runtimes are {', '.join(NAMES)}"
+    with pytest.raises(RuntimeUnavailableError, match=r"tf1\.4 is not installed"):
+        names("numpy,tf1.4")
+
+
+def test_what_is_known_is_told_whatever_is_chosen(here: set[str]) -> None:
+    for wanted in ("none", "auto", "numpy"):
+        assert [info.name for info in chosen_runtimes(wanted, ["onnx"])[1]] == list(NAMES)
+
+
+# ------------------------------------------------------------------ processes
+
+
+def test_a_process_is_started_on_first_use_and_shared() -> None:
+    with RuntimePool() as pool:
+        assert pool.versions() == {}
+        first = pool.process("numpy")
+        assert pool.process("numpy") is first
+        assert pool.versions() == {"numpy": np.__version__}
+        model = first.load(str(fixture("continuous")))
+        feeds = {"state:0": np.zeros((3, 8), np.float32), "epsilon:0": np.zeros((3, 2), np.float32)}
+        assert model.run(feeds, ["action:0"])["action:0"].shape == (3, 2)
+        model.unload()
+    assert pool.versions() == {}
+
+
+def test_a_process_that_died_is_started_again() -> None:
+    with RuntimePool() as pool:
+        process = pool.process("numpy")
+        model = process.load(str(fixture("continuous")))
+        assert process._process is not None
+        process._process.kill()
+        with pytest.raises(RunFailedError, match="ended while it was working"):
+            model.run({}, ["action"])
+        assert pool.versions() == {}
+        again = pool.process("numpy").load(str(fixture("continuous")))
+        with pytest.raises(RunFailedError, match="'state' is not fed"):
+            again.run({}, ["action"])
+
+
+def test_a_runtime_that_does_not_start_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pools, "_command", lambda name: ["/nonexistent/python"])
+    with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="numpy did not start"):
+        pool.process("numpy")
+
+
+def test_a_runtime_that_ends_at_once_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setattr(pools, "_command", lambda name: [sys.executable, "-c", "raise SystemExit('no such module')"])
+    with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="no such module"):
+        pool.process("numpy")
+
+
+def test_without_node_tensorflow_js_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pools, "node_executable", lambda: None)
+    with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="Node is not installed"):
+        pool.process("tfjs-cpu")
+
+
+def test_tensorflow_js_runs_in_node_with_its_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pools, "node_executable", lambda: "node")
+    monkeypatch.setenv("EXPORT_MODEL_JS", "/packages")
+    command = pools._command("tfjs-wasm")
+    assert command[0] == "node"
+    assert command[1].endswith("runner.mjs")
+    assert command[2:] == ["--backend", "wasm", "--modules", "/packages"]

@@ -1,0 +1,260 @@
+"""Spellings of all TensorFlow generations: what normalise makes of them computes what TensorFlow computes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.frozen_graph.reader import from_graph_def
+from converters.graph.ops.table import TABLE
+from converters.graph.passes.normalise import DECOMPOSED, as_placeholder, normalise
+from converters.graph.run import run_graph
+from converters.graph.types import FLOAT32
+from signatures.errors import GraphError, UnsupportedOpError
+from signatures.graph import Graph, Node, TensorShape, topological
+from tests import handmade
+from tests.graph.harness import Array, Runtimes, difference
+from tests.graph.samples import INF, NAN, bools, f32, floats, ints
+from tests.handmade import constant, node, placeholder
+
+pytestmark = pytest.mark.xdist_group("graph-passes")
+
+#: What is read, what is fed, and what TensorFlow runs if that is not the same; the result is called "y".
+Case = tuple[Sequence[Any], Mapping[str, Array], Sequence[Any] | None]
+
+F32 = np.float32
+IMAGE, TURNED = floats(2, 7, 6, 3), np.ascontiguousarray(floats(2, 7, 6, 3).transpose(0, 3, 1, 2))
+KERNEL = floats(3, 2, 3, 4, seed=1)
+ODD = f32(NAN, INF, -INF, 0.5, 3, -3).reshape(2, 3)
+
+
+def unary(op: str, x: Array = ODD, **attrs: Any) -> Case:
+    return [placeholder("x", (None, *x.shape[1:]), x.dtype), node("y", op, "x", T=x.dtype, **attrs)], {"x": x}, None
+
+
+def binary(op: str, x: Array, second: Array, **attrs: Any) -> Case:
+    nodes = [placeholder("x", (None, *x.shape[1:]), x.dtype), constant("c", second, second.dtype)]
+    return [*nodes, node("y", op, "x", "c", **{"T": x.dtype, **attrs})], {"x": x}, None
+
+
+def select(condition: Array, a: Array, b: Array) -> Case:
+    nodes = [placeholder("c", (None, *condition.shape[1:]), np.bool_), placeholder("a", (None, *a.shape[1:]), a.dtype)]
+    made = node("y", "SelectV2", "c", "a", "b", T=a.dtype)
+    return [*nodes, constant("b", b, b.dtype), made], {"c": condition, "a": a}, None
+
+
+def batch_norm(op: str, image: Array, **attrs: Any) -> Case:
+    statistics = [constant(n, floats(3, seed=i, low=0.5)) for i, n in enumerate(("scale", "offset", "mean", "var"))]
+    if op != "FusedBatchNorm":
+        attrs["U"] = F32
+    made = node("y", op, "x", "scale", "offset", "mean", "var", **{"T": F32, "is_training": False, **attrs})
+    return [placeholder("x", (None, *image.shape[1:])), *statistics, made], {"x": image}, None
+
+
+def window(op: str, layout: str, *, kernel: Array | None = None, **attrs: Any) -> Case:
+    """NCHW, judged by the NHWC op between two transposes: TensorFlow's CPU kernels know no other."""
+    sizes = {key: value for key, value in attrs.items() if key in ("strides", "ksize", "dilations")}
+    attrs |= {"T": F32, "data_format": layout}
+    extra = [] if kernel is None else [constant("kernel", kernel)]
+    inputs = [n.name for n in extra]
+    fed = placeholder("x", (None, 3, 7, 6))
+    nchw = {key: (n, c, h, w) for key, (n, h, w, c) in sizes.items()}
+    read = [fed, *extra, node("y", op, "x", *inputs, **{**attrs, **nchw})]
+    oracle = [
+        fed,
+        *extra,
+        constant("to", np.array([0, 2, 3, 1], np.int32)),
+        constant("back", np.array([0, 3, 1, 2], np.int32)),
+        node("turned", "Transpose", "x", "to", T=F32, Tperm=np.int32),
+        node("inner", op, "turned", *inputs, **{**attrs, "data_format": "NHWC"}),
+        node("y", "Transpose", "inner", "back", T=F32, Tperm=np.int32),
+    ]
+    return read, {"x": TURNED}, oracle
+
+
+def explicit(op: str) -> Case:
+    attrs = {"strides": (1, 2, 2, 1), "padding": "EXPLICIT", "explicit_paddings": (0, 0, 1, 2, 0, 3, 0, 0)}
+    nodes = [placeholder("x", (None, 7, 6, 3)), constant("k", KERNEL)]
+    return [*nodes, node("y", op, "x", "k", T=F32, **attrs)], {"x": IMAGE}, None
+
+
+def concat() -> Case:
+    nodes = [placeholder("a", (None, 2)), placeholder("b", (None, 3)), constant("axis", 1)]
+    made = node("y", "Concat", "axis", "a", "b", T=F32, N=2)
+    return [*nodes, made], {"a": floats(2, 2), "b": floats(2, 3, seed=1)}, None
+
+
+def with_default() -> Case:
+    default = node("p", "PlaceholderWithDefault", "d", dtype=F32, shape=TensorShape((2,)))
+    made = node("y", "Mul", "p", "x", T=F32)
+    return [constant("d", f32(2, 3)), default, placeholder("x", (None, 2)), made], {"x": floats(3, 2)}, None
+
+
+def divided(x: Array, y: Array) -> Case:
+    nodes = [placeholder("a", (None, *x.shape[1:])), placeholder("b", (None, *y.shape[1:]))]
+    return [*nodes, node("y", "DivNoNan", "a", "b", T=F32)], {"a": x, "b": y}, None
+
+
+STRIDED = {"strides": (1, 1, 2, 1), "padding": "SAME"}
+POOLED = {**STRIDED, "ksize": (1, 3, 2, 1)}
+CASES: Mapping[str, Case] = {
+    "AddV2": binary("AddV2", floats(3, 4), floats(4, seed=1)),
+    "Div": binary("Div", floats(3, 4), f32(1, -2, 3, 0)),
+    "Inv": unary("Inv", floats(3, 4)),
+    "BatchMatMulV2": binary("BatchMatMulV2", floats(1, 3, 4), floats(1, 5, 4), adj_x=False, adj_y=True),
+    "BatchMatMulV3": binary("BatchMatMulV3", floats(1, 3, 4), floats(1, 4, 5), Ta=F32, Tb=F32, Tout=F32),
+    "ClipByValue": (
+        [placeholder("x", (None, 3)), constant("l", -1.0), constant("h", 1.0), node("y", "ClipByValue", *"xlh", T=F32)],
+        {"x": ODD},
+        None,
+    ),
+    "LeakyRelu": unary("LeakyRelu"),
+    "LeakyRelu, slope 0.01": unary("LeakyRelu", alpha=0.01),
+    "LeakyRelu, slope above 1": unary("LeakyRelu", alpha=1.5),
+    "LeakyRelu, negative slope": unary("LeakyRelu", floats(2, 3), alpha=-0.5),
+    "LeakyRelu, float64": unary("LeakyRelu", floats(2, 3).astype(np.float64)),
+    "SelectV2, column": select(bools(2, 1), ODD, f32(1, NAN, INF)),
+    "SelectV2, wider condition": select(bools(2, 3), floats(2, 1), floats(3)),
+    "SelectV2, int32": select(bools(2, 1), ints(2, 3), ints(3, seed=1)),
+    "SelectV2, int64": select(bools(2, 3), ints(2, 1, dtype=np.int64), ints(3, dtype=np.int64)),
+    "SelectV2, bool": select(bools(2, 1, seed=1), bools(2, 3), np.array([True, False, True])),
+    "SelectV2, float64": select(bools(2, 1), floats(2, 3).astype(np.float64), floats(3).astype(np.float64)),
+    "DivNoNan": divided(f32(1, 2, 0, -3).reshape(2, 2), f32(0, -4, 0, -0.0).reshape(2, 2)),
+    "DivNoNan, odd": divided(ODD, f32(0, 0, 0, NAN, INF, 2).reshape(2, 3)),
+    "DivNoNan, column": divided(floats(2, 3), f32(0, 2).reshape(2, 1)),
+    "DivNoNan, row": divided(floats(2, 1), f32(0, 2, 0, -1).reshape(2, 2)),
+    "FusedBatchNorm": batch_norm("FusedBatchNorm", IMAGE),
+    "FusedBatchNormV2": batch_norm("FusedBatchNormV2", IMAGE, epsilon=0.1),
+    "FusedBatchNormV3": batch_norm("FusedBatchNormV3", IMAGE, epsilon=0.01),
+    "FusedBatchNormV3, NCHW": batch_norm("FusedBatchNormV3", TURNED, epsilon=0.01, data_format="NCHW"),
+    "Concat": concat(),
+    "Conv2D, NCHW": window("Conv2D", "NCHW", kernel=KERNEL, **STRIDED),
+    "Conv2D, NCHW, dilated": window(
+        "Conv2D", "NCHW", kernel=KERNEL, strides=(1, 1, 1, 1), dilations=(1, 1, 2, 1), padding="VALID"
+    ),
+    "DepthwiseConv2dNative, NCHW": window(
+        "DepthwiseConv2dNative", "NCHW", kernel=KERNEL, strides=(1, 2, 2, 1), padding="SAME"
+    ),
+    "MaxPool, NCHW": window("MaxPool", "NCHW", **POOLED),
+    "AvgPool, NCHW": window("AvgPool", "NCHW", **POOLED),
+    "BiasAdd, NCHW": binary("BiasAdd", TURNED, f32(1, 2, 3), data_format="NCHW"),
+    "Conv2D, EXPLICIT": explicit("Conv2D"),
+    "DepthwiseConv2dNative, EXPLICIT": explicit("DepthwiseConv2dNative"),
+    "PlaceholderWithDefault": with_default(),
+}
+
+
+def normalised(nodes: Sequence[Any]) -> Graph:
+    """The nodes as the reader reads them, normalised, with their "y" behind a node that nothing redirects."""
+    read = from_graph_def(handmade.graph_def(nodes, producer=24))
+    return normalise(Graph((*read.nodes, Node("out", "Identity", ("y",)))))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_spelling_means_the_same(name: str, runtimes: Runtimes) -> None:
+    nodes, feeds, oracle = CASES[name]
+    (expected,) = runtimes.tensorflow_message(handmade.graph_def(oracle or nodes, producer=24), feeds, ["y"])
+    made = normalised(nodes)
+    assert difference(expected, run_graph(made, feeds, ["out"])["out"]) is None
+    # and in the words of TensorFlow 1.4
+    assert difference(expected, runtimes.tensorflow(made, feeds, ["out"])[0]) is None
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_spelling_is_left(name: str) -> None:
+    made = normalised(CASES[name][0])
+    for each in made.nodes:
+        assert each.op in TABLE
+        assert each.op not in DECOMPOSED
+        assert each.attrs.get("data_format", "NHWC") == "NHWC"
+        assert each.attrs.get("padding") != "EXPLICIT"
+        wanted = {a.name for a in TABLE[each.op].attrs if a.derive is None}
+        assert each.op == "Const" or each.attrs.keys() == wanted
+    again = normalise(made)
+    assert [(n.name, n.op, n.inputs) for n in again.nodes] == [(n.name, n.op, n.inputs) for n in made.nodes]
+
+
+def test_old_division_of_integers_cuts_off(runtimes: Runtimes) -> None:
+    nodes, feeds, _ = binary("Div", ints(3, 4), np.array([1, -2, 3, -4], np.int32))
+    (expected,) = runtimes.tensorflow_message(handmade.graph_def(nodes, producer=24), feeds, ["y"])
+    assert difference(expected, run_graph(normalised(nodes), feeds, ["out"])["out"]) is None
+
+
+def test_origins_follow_what_an_op_becomes() -> None:
+    nodes, _, _ = CASES["DivNoNan"]
+    made = normalised(nodes)
+    assert made.producer(made["out"].inputs[0]).origin == "y:0"
+
+
+def test_a_default_that_the_signature_names_becomes_a_placeholder() -> None:
+    attrs = {"dtype": FLOAT32, "shape": TensorShape((None, 2))}
+    made = as_placeholder(Node("p", "PlaceholderWithDefault", ("d",), attrs, origin="p:0"))
+    assert made == Node("p", "Placeholder", (), attrs, origin="p:0")
+
+
+# ------------------------------------------------------------------ refusals
+
+REFUSED: Mapping[str, Sequence[Any]] = {
+    "NHWC_VECT_C": binary("BiasAdd", IMAGE, f32(1, 2, 3), data_format="NHWC_VECT_C")[0],
+    "explicit padding": unary(
+        "MaxPool",
+        IMAGE,
+        padding="EXPLICIT",
+        explicit_paddings=(0, 0, 1, 1, 1, 1, 0, 0),
+        strides=(1, 2, 2, 1),
+        ksize=(1, 2, 2, 1),
+    )[0],
+    "Truncate": unary("Cast", floats(2, 3), SrcT=F32, DstT=np.int32, Truncate=True)[0],
+    "batch_dims": [
+        placeholder("x", (None, 3)),
+        constant("i", np.array([[0], [1]], np.int32)),
+        constant("axis", 1),
+        node("y", "GatherV2", "x", "i", "axis", batch_dims=1),
+    ],
+    "incompatible_shape_error": binary("Equal", floats(2, 3), f32(1, 2, 3), incompatible_shape_error=False)[0],
+    "training mode": batch_norm("FusedBatchNormV3", IMAGE, is_training=True)[0],
+}
+
+
+@pytest.mark.parametrize("said", REFUSED)
+def test_other_meanings_are_refused(said: str) -> None:
+    nodes = REFUSED[said]
+    with pytest.raises(UnsupportedOpError, match=said) as caught:
+        normalised(nodes)
+    assert caught.value.issues == (("y", nodes[-1].op),)
+
+
+def test_all_unknown_ops_are_named() -> None:
+    nodes = [placeholder("x"), node("a", "Cholesky", "x"), node("b", "Lu", "a"), node("y", "Neg", "b", T=F32)]
+    with pytest.raises(UnsupportedOpError, match=r"Cholesky \(node 'a'\), Lu \(node 'b'\)") as caught:
+        normalised(nodes)
+    assert caught.value.issues == (("a", "Cholesky"), ("b", "Lu"))
+
+
+def test_ops_that_reach_outside_are_refused_as_such() -> None:
+    with pytest.raises(UnsupportedOpError, match="reaches outside"):
+        normalised([constant("file", 1), node("y", "ReadFile", "file")])
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (node("y", "MaxPool", "x", strides=(1, 2, 2, 1), padding="SAME"), "lacks the attribute 'ksize'"),
+        (node("y", "Cast", "x", SrcT=F32, DstT=3), "DstT=3, which is no dtype"),
+    ],
+)
+def test_damaged_attributes_are_named(made: Any, said: str) -> None:
+    with pytest.raises(GraphError, match=said):
+        normalised([placeholder("x"), made])
+
+
+def test_a_graph_in_the_common_spelling_stays_as_it_is() -> None:
+    nodes = [placeholder("x"), *handmade.dense("d", "x", 3, 2), node("y", "Tanh", "d", T=F32)]
+    read = from_graph_def(handmade.graph_def(nodes, producer=24))
+    made = normalise(read)
+    assert [(n.name, n.op, n.inputs, n.origin) for n in made.nodes] == [
+        (n.name, n.op, n.inputs, n.origin) for n in topological(read.nodes)
+    ]

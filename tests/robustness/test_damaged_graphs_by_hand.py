@@ -1,0 +1,458 @@
+"""Graphs that decode but are wrong: each is refused with the file, the node and the reason, and nothing is written."""
+
+from __future__ import annotations
+
+import itertools
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters import schema
+from converters.frozen_graph.reader import read_graph
+from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
+from signatures.graph import TensorShape
+from tests.commands import export_model, files_in, is_refused
+from tests.handmade import (
+    NodeDef,
+    constant,
+    continuous_policy,
+    dense,
+    graph_bytes,
+    graph_def,
+    node,
+    placeholder,
+    sampled_policy,
+    weights,
+)
+
+#: What a file of a few hundred bytes may make the reader allocate.
+MODEST = 32 << 20
+
+
+def refused(nodes: list[NodeDef], folder: Path, *words: object) -> str:
+    """Export a graph; asserts the refusal, and that it names the file."""
+    file = folder / "policy.bytes"
+    file.write_bytes(graph_bytes(nodes))
+    message = is_refused(export_model(file, "-o", folder / "out", "--verify", "none"), file, *words)
+    assert files_in(folder) == {"policy.bytes"}
+    return message
+
+
+def tensor(nodes: list[NodeDef], name: str) -> Any:
+    """The TensorProto of a constant."""
+    return next(n for n in nodes if n.name == name).attr["value"].tensor
+
+
+def test_the_graphs_that_are_damaged_here_are_right_at_first(tmp_path: Path) -> None:
+    (tmp_path / "continuous.bytes").write_bytes(graph_bytes(continuous_policy()))
+    (tmp_path / "sampled.bytes").write_bytes(graph_bytes(sampled_policy()))
+    ran = export_model(
+        tmp_path / "continuous.bytes", tmp_path / "sampled.bytes", "-o", tmp_path, "--verify", "none", "--json"
+    )
+    assert [p["name"] for p in ran.json["policies"]] == ["continuous", "sampled"]
+
+
+# ------------------------------------------------------------------ no policy
+
+
+def test_a_graph_of_constants_is_no_policy(tmp_path: Path) -> None:
+    refused([constant("a", 1.0), node("action", "Identity", "a")], tmp_path, "no policy", "placeholder", "--output")
+
+
+def test_a_placeholder_alone_is_no_policy(tmp_path: Path) -> None:
+    refused([placeholder("action")], tmp_path, "action")
+
+
+def test_a_graph_without_nodes_is_no_policy() -> None:
+    with pytest.raises(NotAPolicyError, match="no nodes"):
+        read_graph(graph_def([], producer=24).SerializeToString())
+
+
+def test_a_graph_with_functions_says_how_to_freeze_it() -> None:
+    message = graph_def([placeholder("x"), node("y", "__inference_call_12", "x")])
+    message.library.function.add().signature.name = "__inference_call_12"
+    with pytest.raises(NotAPolicyError, match="convert_variables_to_constants_v2"):
+        read_graph(message.SerializeToString())
+    with pytest.raises(NotAPolicyError, match="calls the function 'PartitionedCall'"):
+        read_graph(graph_bytes([placeholder("x"), node("y", "PartitionedCall", "x")]))
+
+
+# ------------------------------------------------------------------ ops
+
+
+def test_an_unknown_op_is_named_with_its_node(tmp_path: Path) -> None:
+    nodes = [*continuous_policy(), node("odd/one", "FancyNewOp", "mu")]
+    nodes[-2].input[0] = "odd/one"
+    refused(nodes, tmp_path, "FancyNewOp", "'odd/one'")
+
+
+def test_all_unknown_ops_are_named_at_once(tmp_path: Path) -> None:
+    nodes = [
+        *continuous_policy(),
+        *(node(f"odd/{i}", f"FancyOp{i}", "mu" if i == 0 else f"odd/{i - 1}") for i in (0, 1)),
+    ]
+    nodes[5].input[0] = "odd/1"
+    assert nodes[5].name == "action"
+    refused(nodes, tmp_path, "FancyOp0", "FancyOp1")
+
+
+def test_an_unknown_op_beside_the_policy_does_not_matter(tmp_path: Path) -> None:
+    file = tmp_path / "policy.bytes"
+    file.write_bytes(graph_bytes([*continuous_policy(), node("train", "FancyNewOp", "mu")]))
+    assert export_model(file, "-o", tmp_path / "out", "--verify", "none").status == 0
+
+
+@pytest.mark.parametrize("op", ["ReadFile", "PyFunc", "WriteFile", "RestoreV2", "LoadLibrary", "EagerPyFunc"])
+def test_an_op_that_reaches_outside_is_refused_by_name(op: str, tmp_path: Path) -> None:
+    nodes = [*continuous_policy(), node("outside", op, "mu")]
+    nodes[-2].input[0] = "outside"
+    refused(nodes, tmp_path, op, "'outside'", "reaches outside the graph")
+
+
+# ------------------------------------------------------------------ structure
+
+
+def test_a_dangling_input_is_named(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[-1].input[0] = "mu/Relu"
+    refused(nodes, tmp_path, "'action' (Tanh) reads 'mu/Relu', which is not in the graph")
+
+
+@pytest.mark.parametrize("reference", ["", ":", ":0", "mu:²", f"mu:{'9' * 5000}", "mu:-1"])
+def test_a_reference_that_is_none_dangles(reference: str, tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[-1].input[0] = reference
+    refused(nodes, tmp_path, "which is not in the graph")
+
+
+def test_an_output_that_its_producer_does_not_have_is_named(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[-1].input[0] = "mu:1"
+    refused(nodes, tmp_path, "'mu:1'", "an output that its producer does not have")
+
+
+def test_two_nodes_with_one_name_are_refused(tmp_path: Path) -> None:
+    refused([*continuous_policy(), constant("mu/bias", [1.0, 2.0])], tmp_path, "two nodes are called 'mu/bias'")
+
+
+def test_a_cycle_is_refused(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[3].input[0] = "mu/add"
+    nodes.append(node("mu/add", "Add", "mu", "mu/MatMul"))
+    refused(nodes, tmp_path, "depends on itself", "cycle")
+
+
+def test_a_node_that_reads_itself_is_refused(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[-1].input[0] = "action"
+    refused(nodes, tmp_path, "'action' depends on itself")
+
+
+def test_a_node_without_a_name_or_op_is_refused(tmp_path: Path) -> None:
+    for broken in (node("", "Identity", "mu"), node("nameless", "", "mu")):
+        refused([*continuous_policy(), broken], tmp_path, "no name or no op")
+
+
+def test_a_chain_of_thousands_of_nodes_is_no_trouble(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    last = nodes.pop()
+    names = ["mu", *(f"chain/{i}" for i in range(3000))]
+    nodes += [node(name, "Identity", before) for before, name in itertools.pairwise(names)]
+    last.input[0] = names[-1]
+    (tmp_path / "long.bytes").write_bytes(graph_bytes([*nodes, last]))
+    assert export_model(tmp_path / "long.bytes", "-o", tmp_path / "out", "--verify", "none").status == 0
+
+
+def test_a_join_that_doubles_at_every_step_ends_soon(tmp_path: Path) -> None:
+    """Thirty joins of a tensor with itself have 2^30 parts."""
+    nodes = [placeholder("vector_observation"), *dense("mu", "vector_observation", 3, 1), constant("axis", 1)]
+    names = ["mu", *(f"join/{i}" for i in range(28)), "action"]
+    nodes += [node(name, "ConcatV2", b, b, "axis") for b, name in itertools.pairwise(names)]
+    (tmp_path / "joins.bytes").write_bytes(graph_bytes(nodes))
+    ran = export_model("inspect", tmp_path / "joins.bytes", "--json")
+    assert ran.status in (0, 2)
+    assert ran.status == 2 or ran.json["policies"][0]["outputs"][0]["shape"] == [None, 2**29]
+
+
+# ------------------------------------------------------------------ attributes, dtypes, shapes
+
+
+def test_an_attribute_of_the_wrong_dtype_is_refused(tmp_path: Path) -> None:
+    nodes = sampled_policy()
+    draw = next(n for n in nodes if n.name == "draw")
+    draw.attr["output_dtype"].type = 14  # bfloat16
+    refused(nodes, tmp_path, "node 'draw', attribute 'output_dtype'", "dtype number 14")
+
+
+@pytest.mark.parametrize("number", [0, 14, 99, -5, 2**30])
+def test_a_dtype_that_does_not_exist_is_refused(number: int, tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[0].attr["dtype"].type = number
+    refused(nodes, tmp_path, "node 'vector_observation', attribute 'dtype'")
+
+
+def _without_dtype(n: NodeDef) -> None:
+    del n.attr["dtype"]
+
+
+def _dtype_is_a_number(n: NodeDef) -> None:
+    n.attr["dtype"].i = 1
+
+
+def _shape_is_a_flag(n: NodeDef) -> None:
+    n.attr["shape"].b = True
+
+
+@pytest.mark.parametrize("damage", [_without_dtype, _dtype_is_a_number, _shape_is_a_flag])
+def test_a_placeholder_that_does_not_say_what_it_takes_is_refused(
+    damage: Callable[[NodeDef], None], tmp_path: Path
+) -> None:
+    nodes = continuous_policy()
+    damage(nodes[0])
+    refused(nodes, tmp_path, "the placeholder 'vector_observation' has")
+
+
+def test_a_product_of_matrices_that_do_not_fit_is_refused(tmp_path: Path) -> None:
+    nodes = [*continuous_policy(), constant("wrong", weights(5, 2))]
+    nodes[3].input[1] = "wrong"
+    refused(nodes, tmp_path, "'mu/MatMul' (MatMul)", "[5, 2]")
+
+
+def test_a_bias_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    nodes = [*continuous_policy(), constant("wrong", [1.0, 2.0, 3.0])]
+    nodes[4].input[1] = "wrong"
+    refused(nodes, tmp_path, "'mu' (BiasAdd)")
+
+
+@pytest.mark.parametrize("index", [3, 4], ids=["MatMul", "BiasAdd"])
+def test_an_op_with_too_few_inputs_is_refused(index: int, tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    del nodes[index].input[-1]
+    refused(nodes, tmp_path, f"node {nodes[index].name!r} ({nodes[index].op})")
+
+
+# ------------------------------------------------------------------ constants
+
+
+def test_a_constant_with_too_few_bytes_is_refused(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    tensor(nodes, "mu/kernel").tensor_content = bytes(23)
+    refused(nodes, tmp_path, "node 'mu/kernel'", "23 bytes for 6 elements of float32")
+
+
+def test_a_constant_without_a_value_is_refused(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    del nodes[1].attr["value"]
+    refused(nodes, tmp_path, "'mu/kernel' has no value")
+
+
+def _claimed(tensor: Any, *sizes: int) -> None:
+    del tensor.tensor_shape.dim[:]
+    for size in sizes:
+        tensor.tensor_shape.dim.add(size=size)
+
+
+def _absurd(t: Any) -> None:
+    _claimed(t, 1 << 20, 1 << 20)
+
+
+def _huge(t: Any) -> None:
+    t.tensor_content = b""
+    _claimed(t, 1 << 13, 1 << 13)
+
+
+def _overflowing(t: Any) -> None:
+    _claimed(t, *[1 << 40] * 4)
+
+
+def _overflowing_but_empty(t: Any) -> None:
+    t.tensor_content = b""
+    _claimed(t, 0, 1 << 62, 1 << 62)
+
+
+def _many_axes(t: Any) -> None:
+    t.tensor_content = b"\0\0\0\0"
+    _claimed(t, *[1] * 200)
+
+
+def _negative(t: Any) -> None:
+    _claimed(t, -1, 2)
+
+
+def _unknown_rank(t: Any) -> None:
+    t.tensor_shape.unknown_rank = True
+
+
+def _more_values_than_elements(t: Any) -> None:
+    t.tensor_content = b""
+    t.float_val.extend([1.0] * 7)
+
+
+def _a_resource(t: Any) -> None:
+    t.dtype = 20
+
+
+def _a_half_of_20_bits(t: Any) -> None:
+    t.tensor_content = b""
+    t.dtype = 19
+    t.half_val.append(1 << 20)
+
+
+def _wide_strings(t: Any) -> None:
+    t.tensor_content = b""
+    t.dtype = 7
+    t.string_val.extend([b"x" * 100_000, *[b""] * 10_000])
+
+
+DAMAGES = [
+    *(_absurd, _huge, _overflowing, _overflowing_but_empty, _many_axes, _negative, _unknown_rank),
+    *(_more_values_than_elements, _a_resource, _a_half_of_20_bits, _wide_strings),
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=[d.__name__.strip("_") for d in DAMAGES])
+def test_a_tensor_that_cannot_be_is_refused_before_it_takes_memory(
+    damage: Callable[[Any], None], tmp_path: Path
+) -> None:
+    nodes = continuous_policy()
+    damage(tensor(nodes, "mu/kernel"))
+    data = graph_bytes(nodes)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DamagedFileError, match="node 'mu/kernel', attribute 'value': the tensor cannot be read"):
+            read_graph(data)
+        assert tracemalloc.get_traced_memory()[1] < MODEST
+    finally:
+        tracemalloc.stop()
+    refused(nodes, tmp_path, "node 'mu/kernel'")
+
+
+def test_many_constants_together_may_not_claim_much_more_than_the_file_holds() -> None:
+    def filled(name: str, side: int) -> NodeDef:
+        made = constant(name, 1.0)
+        t = made.attr["value"].tensor
+        t.tensor_content = b""
+        t.float_val.append(0.5)
+        _claimed(t, side, side)
+        return made
+
+    single = read_graph(graph_bytes([filled("a", 1 << 11)]))["a"].value
+    assert single is not None
+    assert single.shape == (1 << 11, 1 << 11)
+    assert (single == 0.5).all()
+    tracemalloc.start()
+    try:
+        with pytest.raises(DamagedFileError, match="elements that the file does not hold"):
+            read_graph(graph_bytes([filled(f"a{i}", 1 << 11) for i in range(100)]))
+        assert tracemalloc.get_traced_memory()[1] < 100 << 20  # 64 MiB is what all may claim together
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_short_forms_of_a_tensor_are_read() -> None:
+    def read(dtype: Any, shape: tuple[int, ...], field: str, values: list[Any]) -> np.ndarray:
+        made = constant("a", 0.0)
+        t = made.attr["value"].tensor
+        t.tensor_content = b""
+        t.dtype = schema.dtype_number(np.dtype(dtype))
+        getattr(t, field).extend(values)
+        _claimed(t, *shape)
+        value = read_graph(graph_bytes([made]))["a"].value
+        assert value is not None
+        assert value.dtype == np.dtype(dtype)
+        return value
+
+    assert read(np.float32, (3,), "float_val", [1.5]).tolist() == [1.5, 1.5, 1.5]
+    assert read(np.float32, (2, 2), "float_val", [1, 2, 3]).tolist() == [[1, 2], [3, 3]]
+    assert read(np.int64, (2,), "int64_val", []).tolist() == [0, 0]
+    assert read(np.float16, (2,), "half_val", [0x3C00]).tolist() == [1, 1]
+    assert read(np.bool_, (2,), "bool_val", [True]).tolist() == [True, True]
+    assert read(np.int8, (), "int_val", [-7]).tolist() == -7
+    assert read(np.int32, (0, 3), "int_val", []).shape == (0, 3)
+    assert read(np.bytes_("ab").dtype, (), "string_val", [b"ab"]).tolist() == b"ab"
+
+
+def test_statistics_and_constants_that_are_not_finite_do_not_reach_the_contract(tmp_path: Path) -> None:
+    """JSON has no NaN: a version number that is none is left out."""
+    nodes = [
+        *continuous_policy(),
+        *(constant(n, np.float32(v)) for n, v in (("version_number", np.nan), ("memory_size", np.inf))),
+        constant("is_continuous_control", 1),
+    ]
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))
+    ran = export_model("inspect", tmp_path / "a.bytes", "--json")
+    assert ran.json["policies"][0]["constants"] == {"is_continuous_control": 1}
+
+
+def test_a_constant_that_is_read_through_nothing_is_none(tmp_path: Path) -> None:
+    nodes = [*continuous_policy(), node("memory_size", "Identity")]
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))
+    assert export_model("inspect", tmp_path / "a.bytes", "--json").json["policies"][0]["constants"] == {}
+
+
+# ------------------------------------------------------------------ names
+
+
+def test_two_brains_whose_names_become_one_are_refused(tmp_path: Path) -> None:
+    nodes = [*continuous_policy("Ball-A/B/"), *continuous_policy("Ball/A-B/")]
+    refused(nodes, tmp_path, "policy-Ball-A-B", "Ball-A/B", "Ball/A-B")
+
+
+def test_two_brains_that_differ_in_case_only_are_refused(tmp_path: Path) -> None:
+    nodes = [*continuous_policy("Ball/"), *continuous_policy("BALL/")]
+    refused(nodes, tmp_path, "policy-Ball", "policy-BALL")
+
+
+def test_names_of_nodes_may_be_anything(tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    for broken, name in ((nodes[1], "ünï/кириллица"), (nodes[2], 'quo"te\n')):
+        for reader in nodes:
+            reader.input[:] = [name if r == broken.name else r for r in reader.input]
+        broken.name = name
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))
+    assert export_model(tmp_path / "a.bytes", "-o", tmp_path / "out", "--verify", "none").status == 0
+
+
+# ------------------------------------------------------------------ what nobody foresaw
+
+
+@pytest.mark.parametrize("fault", [IndexError("x"), RecursionError("x"), MemoryError("x"), OverflowError("x")])
+def test_a_fault_of_a_pass_names_the_file_too(
+    fault: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise fault
+
+    monkeypatch.setattr("exporter.sources.compile_graph", failing)
+    message = refused(continuous_policy(), tmp_path, "cannot be understood", type(fault).__name__)
+    assert "\n  why: " in message
+
+
+def test_a_fault_of_a_writer_names_the_file_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise TypeError("x")
+
+    monkeypatch.setattr("converters.onnx.writer.write", failing)
+    refused(continuous_policy(), tmp_path, "cannot be understood", "TypeError")
+
+
+def test_the_errors_are_of_their_kinds() -> None:
+    def kind(nodes: list[NodeDef]) -> type[ExportModelError]:
+        with pytest.raises(ExportModelError) as caught:
+            read_graph(graph_bytes(nodes))
+        return type(caught.value)
+
+    assert kind([node("", "Identity")]) is DamagedFileError
+    assert kind([node("a", "Identity", "b")]) is GraphError
+    assert issubclass(UnsupportedOpError, GraphError)
+
+
+def test_old_placeholders_with_an_empty_shape_have_an_unknown_one() -> None:
+    """Before GraphDef version 24 ``shape {}`` meant unknown, not scalar."""
+    made = [placeholder("a", shape=())]
+    assert read_graph(graph_bytes(made))["a"].attrs["shape"] == TensorShape(None)
+    assert read_graph(graph_bytes(made, producer=24))["a"].attrs["shape"] == TensorShape(())

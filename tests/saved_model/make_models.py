@@ -1,0 +1,176 @@
+"""Writes SavedModels, checkpoints and Keras models with TensorFlow: ``python -m tests.saved_model.make_models FOLDER``.
+
+A program of its own, so that a test process need not load TensorFlow. Beside each model lies ``<name>.npz``: what was
+fed to it and what TensorFlow computed, by the keys of its signature.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISIBLE_DEVICES="-1")
+
+import tensorflow as tf
+
+RANDOM = np.random.default_rng(7)
+v1 = tf.compat.v1
+
+
+def keep(folder: Path, name: str, feeds: Mapping[str, np.ndarray], results: Mapping[str, Any]) -> None:
+    inputs = {f"in/{k}": np.asarray(v) for k, v in feeds.items()}
+    np.savez(folder / f"{name}.npz", **inputs, **{f"out/{k}": np.asarray(v) for k, v in results.items()})
+
+
+def draw(*shape: int) -> np.ndarray:
+    return RANDOM.standard_normal(shape).astype(np.float32)
+
+
+def masks(rows: int, width: int) -> np.ndarray:
+    array = (RANDOM.random((rows, width)) < 0.6).astype(np.float32)
+    array[:, 0] = 1
+    return array
+
+
+# ------------------------------------------------------------------ TensorFlow 1
+
+
+def dense(x: Any, width: int, name: str, *, resource: bool) -> Any:
+    with v1.variable_scope(name, use_resource=resource):
+        kernel = v1.get_variable("kernel", initializer=draw(int(x.shape[-1]), width))
+        bias = v1.get_variable("bias", initializer=draw(width))
+    return tf.matmul(x, kernel) + bias
+
+
+def tf1_policy(*, resource: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The continuous policy of the blog that patched the trainer: {in, epsilon} to {out}."""
+    observation = v1.placeholder(tf.float32, [None, 6], name="vector_observation")
+    noise = v1.placeholder(tf.float32, [None, 2], name="epsilon")
+    v1.placeholder(tf.float32, [None], name="advantages")
+    hidden = tf.nn.elu(dense(observation, 16, "hidden", resource=resource))
+    mu = dense(hidden, 2, "mu", resource=resource)
+    sigma = v1.get_variable("log_sigma", initializer=draw(2), use_resource=resource)
+    action = tf.identity(tf.clip_by_value(mu + tf.exp(sigma) * noise, -3, 3) / 3, name="action")
+    loss = tf.reduce_mean(tf.square(action), name="loss")
+    v1.train.AdamOptimizer().minimize(loss)
+    return {"in": observation, "epsilon": noise}, {"out": action}
+
+
+def tf1(folder: Path, name: str, *, resource: bool) -> None:
+    with tf.Graph().as_default(), v1.Session() as session:
+        inputs, outputs = tf1_policy(resource=resource)
+        session.run(v1.global_variables_initializer())
+        feeds = {"in": draw(3, 6), "epsilon": draw(3, 2)}
+        results = session.run(outputs, {inputs[k]: v for k, v in feeds.items()})
+        v1.saved_model.simple_save(session, str(folder / name), inputs, outputs)
+        keep(folder, name, feeds, results)
+
+
+def discrete_keys(folder: Path) -> None:
+    """Nothing in the graph is called as ML-Agents would: only the signature's keys say what is what."""
+    with tf.Graph().as_default(), v1.Session() as session:
+        x = v1.placeholder(tf.float32, [None, 4])
+        m = v1.placeholder(tf.float32, [None, 3])
+        logits = dense(x, 3, "a", resource=False)
+        allowed = (tf.nn.softmax(logits) + 1e-7) * m
+        scores = tf.math.log(allowed / tf.reduce_sum(allowed, 1, keepdims=True) + 1e-7)
+        value = dense(x, 1, "b", resource=False)
+        inputs, outputs = {"state": x, "action_masks": m}, {"action": scores, "value_estimate": value}
+        session.run(v1.global_variables_initializer())
+        feeds = {"state": draw(5, 4), "action_masks": masks(5, 3)}
+        results = session.run(outputs, {inputs[k]: v for k, v in feeds.items()})
+        v1.saved_model.simple_save(session, str(folder / "keys"), inputs, outputs)
+        keep(folder, "keys", feeds, results)
+
+
+def partitioned(folder: Path) -> None:
+    """A checkpoint with a variable in three parts, each of which the saver restores as a slice."""
+    target = folder / "partitioned"
+    target.mkdir()
+    with tf.Graph().as_default(), v1.Session() as session:
+        x = v1.placeholder(tf.float32, [None, 7], name="vector_observation")
+        kernel = v1.get_variable(
+            "kernel", shape=[7, 4], initializer=v1.random_normal_initializer(seed=3),
+            partitioner=v1.fixed_size_partitioner(3), use_resource=False,
+        )  # fmt: skip
+        whole = v1.get_variable("whole", initializer=draw(4), use_resource=False)
+        action = tf.identity(tf.tanh(tf.matmul(x, tf.convert_to_tensor(kernel)) + whole), name="action")
+        saver = v1.train.Saver()
+        session.run(v1.global_variables_initializer())
+        feeds = {"vector_observation": draw(3, 7)}
+        results = session.run({"action": action}, {x: feeds["vector_observation"]})
+        saver.save(session, str(target / "model-20.ckpt"))
+        keep(folder, "partitioned", feeds, results)
+
+
+def version_1(folder: Path) -> None:
+    target = folder / "version1"
+    target.mkdir()
+    with tf.Graph().as_default(), v1.Session() as session:
+        x = v1.placeholder(tf.float32, [None, 2], name="vector_observation")
+        tf.identity(dense(x, 2, "d", resource=False), name="action")
+        session.run(v1.global_variables_initializer())
+        v1.train.Saver(write_version=v1.train.SaverDef.V1).save(session, str(target / "model-5.ckpt"))
+        v1.train.write_graph(session.graph, str(target), "raw_graph_def.pb", as_text=False)
+
+
+# ------------------------------------------------------------------ TensorFlow 2
+
+
+class Policy(tf.Module):
+    """A discrete policy as people write them in TensorFlow 2."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kernel = tf.Variable(draw(5, 8))
+        self.head = tf.Variable(draw(8, 3))
+
+    @tf.function(input_signature=[tf.TensorSpec([None, 5], name="vector_observation"), tf.TensorSpec([None, 3], name="action_masks")])
+    def __call__(self, vector_observation: Any, action_masks: Any) -> dict[str, Any]:
+        logits = tf.nn.relu(vector_observation @ self.kernel) @ self.head
+        kept = (tf.nn.softmax(logits) + 1e-7) * action_masks
+        return {"action": tf.math.log(kept / tf.reduce_sum(kept, 1, keepdims=True) + 1e-7)}
+
+
+def tf2(folder: Path) -> None:
+    policy = Policy()
+    feeds = {"vector_observation": draw(4, 5), "action_masks": masks(4, 3)}
+    results = policy(**{k: tf.constant(v) for k, v in feeds.items()})
+    tf.saved_model.save(policy, str(folder / "function"), signatures=policy.__call__)
+    keep(folder, "function", feeds, results)
+    tf.train.Checkpoint(policy=policy).write(str(folder / "objects-3.ckpt"))
+
+
+def keras(folder: Path) -> None:
+    observation = tf.keras.Input([6], name="vector_observation")
+    image = tf.keras.Input([12, 12, 3], name="visual_observation_0")
+    seen = tf.keras.layers.Flatten()(tf.keras.layers.Conv2D(4, 3, strides=2, activation="relu")(image))
+    joined = tf.keras.layers.Concatenate()([seen, tf.keras.layers.Dense(8, activation="swish")(observation)])
+    action = tf.keras.layers.Dense(2, activation="tanh", name="action")(joined)
+    model = tf.keras.Model([observation, image], action)
+    feeds = {"vector_observation": draw(3, 6), "visual_observation_0": np.abs(draw(3, 12, 12, 3))}
+    results = {"action": model([feeds["vector_observation"], feeds["visual_observation_0"]])}
+    model.save(folder / "policy.keras")
+    model.save(folder / "policy.h5")
+    model.export(folder / "exported")
+    keep(folder, "keras", feeds, results)
+
+
+def main(folder: Path) -> None:
+    v1.disable_control_flow_v2()
+    tf1(folder, "references", resource=False)
+    tf1(folder, "resources", resource=True)
+    discrete_keys(folder)
+    partitioned(folder)
+    version_1(folder)
+    tf2(folder)
+    keras(folder)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,177 @@
+"""Inputs to try a policy on: seeded, around its own statistics, at the edges, masks that always allow an action."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from signatures.roles import Role
+from signatures.sampling import BATCHES, Case, draw_cases, draw_rollout
+from signatures.spec import Memory, PolicySignature, TensorSpec
+
+ACTION = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
+
+
+def signature(*inputs: TensorSpec, branches: tuple[int, ...] = (), memory: Memory | None = None) -> PolicySignature:
+    return PolicySignature(inputs, (ACTION,), "own model", "continuous", branches, memory=memory)
+
+
+def spec(name: str, role: Role, *shape: int | None, dtype: str = "float32", **distribution: Any) -> TensorSpec:
+    return TensorSpec(name, role, dtype, shape, None, distribution or None)
+
+
+EVERYTHING = signature(
+    spec("state", Role.VECTOR, None, 4, kind="normal", mean=[0.0, 100.0, -5.0, 0.5], std=[1.0, 10.0, 0.1, 2.0]),
+    spec("state_1", Role.VECTOR, None, 1, dtype="int32", kind="integer", low=0, high=6),
+    spec("observation_0", Role.VISUAL, None, 6, 5, 3),
+    spec("entities_0", Role.ENTITIES, None, None, 4),
+    spec("action_masks", Role.MASKS, None, 9),
+    spec("prev_action", Role.PREV_ACTION, None, 3, dtype="int32"),
+    spec("recurrent_in", Role.MEMORY_IN, None, 8),
+    spec("epsilon", Role.NOISE, None, 2),
+    spec("gain", Role.PARAMETER, 5),
+    spec("scale", Role.PARAMETER),
+    branches=(3, 2, 4),
+    memory=Memory(8, "recurrent_in", "recurrent_out"),
+)
+
+
+def same(a: list[Case], b: list[Case]) -> bool:
+    return all(
+        x.name == y.name and x.feeds.keys() == y.feeds.keys() and all((x.feeds[n] == y.feeds[n]).all() for n in x.feeds)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def test_the_same_seed_gives_the_same_cases() -> None:
+    assert same(draw_cases(EVERYTHING, seed=3), draw_cases(EVERYTHING, seed=3))
+    assert not same(draw_cases(EVERYTHING, seed=3), draw_cases(EVERYTHING, seed=4))
+
+
+def test_the_first_draw_is_the_same_on_every_machine() -> None:
+    """PCG64's stream is part of numpy's promise."""
+    first = draw_cases(signature(spec("state", Role.VECTOR, None, 3)), seed=0)[0].feeds["state"]
+    expected = np.random.Generator(np.random.PCG64(0)).standard_normal((1, 3))
+    np.testing.assert_array_equal(first, expected.astype(np.float32))
+
+
+def test_every_batch_size_is_tried() -> None:
+    cases = draw_cases(EVERYTHING, samples=3)
+    typical = [c for c in cases if c.name.startswith("typical")]
+    assert [c.batch for c in typical] == [b for b in BATCHES for _ in range(3)]
+    assert [c.name for c in cases[len(typical) :]] == [
+        *("zeros", "clip edges", "beyond the clip", "1e3"),
+        *("all but one action masked", "random masks"),
+    ]
+    assert len({c.name for c in cases}) == len(cases)
+
+
+def test_masks_are_tried_only_where_there_are_some() -> None:
+    names = [c.name for c in draw_cases(signature(spec("state", Role.VECTOR, None, 3)))]
+    assert not any("mask" in name for name in names)
+
+
+def test_arrays_have_the_dtypes_and_shapes_of_the_contract() -> None:
+    for case in draw_cases(EVERYTHING):
+        for each in EVERYTHING.inputs:
+            array = case.feeds[each.name]
+            assert array.dtype.name == each.dtype
+            assert array.ndim == len(each.shape)
+            for axis, (wanted, size) in enumerate(zip(each.shape, array.shape, strict=True)):
+                assert size == (wanted if wanted is not None else case.batch if axis == 0 else 8)
+
+
+def test_the_rows_are_those_of_the_observation_even_where_a_parameter_is_longer() -> None:
+    case = draw_cases(EVERYTHING)[0]
+    assert (case.batch, case.feeds["gain"].shape, EVERYTHING.rows(case.feeds)) == (1, (5,), 1)
+    assert EVERYTHING.rows(draw_cases(EVERYTHING)[-1].feeds) == 7
+    assert signature(spec("gain", Role.PARAMETER, 5)).rows({"gain": np.zeros(5)}) == 1
+
+
+def test_values_are_drawn_around_the_policys_own_statistics() -> None:
+    cases = {c.name: c for c in draw_cases(EVERYTHING, samples=400)}
+    rows = np.concatenate([c.feeds["state"] for n, c in cases.items() if n.startswith("typical")])
+    np.testing.assert_allclose(rows.mean(axis=0), [0, 100, -5, 0.5], atol=0.6)
+    np.testing.assert_allclose(rows.std(axis=0), [1, 10, 0.1, 2], rtol=0.1)
+    assert not cases["zeros"].feeds["state"].any()
+    np.testing.assert_allclose(np.abs(cases["clip edges"].feeds["state"][:, 1] - 100), 50)
+    np.testing.assert_allclose(np.abs(cases["beyond the clip"].feeds["state"][:, 3] - 0.5), 16)
+    assert (np.abs(cases["1e3"].feeds["state"]) == 1e3).all()
+
+
+def test_each_input_is_in_its_range() -> None:
+    for case in draw_cases(EVERYTHING, samples=20):
+        assert ((case.feeds["state_1"] >= 0) & (case.feeds["state_1"] <= 6)).all()
+        assert ((case.feeds["observation_0"] >= 0) & (case.feeds["observation_0"] <= 1)).all()
+        previous = case.feeds["prev_action"]
+        assert ((previous >= 0) & (previous < np.array([3, 2, 4]))).all()
+
+
+def test_every_integer_of_a_discrete_state_turns_up() -> None:
+    seen = np.concatenate([c.feeds["state_1"].ravel() for c in draw_cases(EVERYTHING, samples=40)])
+    assert set(seen.tolist()) == set(range(7))
+
+
+def test_a_discrete_state_without_a_known_range_is_zero_or_one() -> None:
+    plain = signature(spec("state", Role.VECTOR, None, 1, dtype="int32"))
+    seen = np.concatenate([c.feeds["state"].ravel() for c in draw_cases(plain, samples=10)])
+    assert set(seen.tolist()) == {0, 1}
+
+
+def test_the_previous_action_may_be_a_vector_and_its_branches_unknown() -> None:
+    one = signature(spec("prev_action", Role.PREV_ACTION, None, dtype="int32"), branches=(5,))
+    assert {int(v) for c in draw_cases(one, samples=30) for v in c.feeds["prev_action"]} == set(range(5))
+    unknown = signature(spec("prev_action", Role.PREV_ACTION, None, 2, dtype="int32"))
+    assert {int(v) for c in draw_cases(unknown, samples=9) for v in c.feeds["prev_action"].ravel()} == {0, 1}
+
+
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=4), st.integers(0, 2**32))
+@settings(max_examples=50, deadline=None)
+def test_masks_always_allow_an_action_of_every_branch(branches: list[int], seed: int) -> None:
+    masked = signature(
+        spec("state", Role.VECTOR, None, 2), spec("m", Role.MASKS, None, sum(branches)), branches=tuple(branches)
+    )
+    edges = np.cumsum(branches)[:-1]
+    for case in draw_cases(masked, seed=seed):
+        mask = case.feeds["m"]
+        assert set(np.unique(mask)) <= {0.0, 1.0}
+        parts = np.split(mask, edges, axis=1)
+        assert all((part.sum(axis=1) >= 1).all() for part in parts)
+        if case.name == "all but one action masked":
+            assert all((part.sum(axis=1) == 1).all() for part in parts)
+        elif case.name != "random masks":
+            assert mask.all()
+
+
+def test_masks_without_known_branches_are_one_branch() -> None:
+    odd = signature(spec("m", Role.MASKS, None, 5), branches=(2, 2))
+    case = next(c for c in draw_cases(odd) if c.name == "all but one action masked")
+    assert (case.feeds["m"].sum(axis=1) == 1).all()
+
+
+# ------------------------------------------------------------------ rollouts
+
+
+def test_an_episode_begins_with_an_empty_memory() -> None:
+    steps = draw_rollout(EVERYTHING, seed=1, steps=5)
+    assert len(steps) == 5
+    assert not steps[0]["recurrent_in"].any()
+    assert all(step["recurrent_in"].any() for step in steps[1:])
+    assert {step["state"].shape for step in steps} == {(2, 4)}
+    assert not (steps[1]["state"] == steps[2]["state"]).any()
+
+
+def test_an_episode_depends_on_its_seed_and_not_on_its_length() -> None:
+    long, short, other = (draw_rollout(EVERYTHING, seed=s, steps=n) for s, n in ((1, 5), (1, 2), (2, 2)))
+    np.testing.assert_array_equal(long[1]["state"], short[1]["state"])
+    assert not (other[1]["state"] == short[1]["state"]).any()
+
+
+@pytest.mark.parametrize("memory", [None, Memory(8, None, "recurrent_out")])
+def test_an_episode_without_a_memory_to_feed_is_just_steps(memory: Memory | None) -> None:
+    plain = signature(spec("state", Role.VECTOR, None, 3), memory=memory)
+    assert [set(step) for step in draw_rollout(plain, seed=0, steps=3, batch=4)] == [{"state"}] * 3
