@@ -28,14 +28,28 @@ _EXACT = frozenset(
         "Relu",
     )
 )
+#: Ops that add up many products: a runtime rounds each, in an order of its own, so each term is moved.
+_SUMS = frozenset(("MatMul", "BatchMatMul", "_FusedMatMul", "Conv2D", "_FusedConv2D", "DepthwiseConv2dNative", "Sum"))
 
 
-def _moved(array: np.ndarray, jitter: np.random.Generator) -> np.ndarray:
+#: Functions that runtimes approximate, each in its own way, to a few units in the last place (Eigen's tanh: 3 to 4).
+_APPROXIMATED = frozenset(
+    (
+        *("Exp", "Expm1", "Log", "Log1p", "Pow", "Tanh", "Sigmoid", "Softmax", "LogSoftmax", "Elu", "Selu", "Softplus"),
+        *("Erf", "Sin", "Cos", "Tan", "Rsqrt"),
+    )
+)
+_APPROXIMATION_ULPS = 4
+
+
+def _moved(array: np.ndarray, jitter: np.random.Generator, ulps: int = 1) -> np.ndarray:
+    """Every float moved up or down by ``ulps`` units in its last place; zeros stay."""
     if array.dtype.kind != "f":
         return array
-    towards = np.where(jitter.random(array.shape) < 0.5, -np.inf, np.inf).astype(array.dtype)
     with np.errstate(all="ignore"):
-        return np.asarray(np.where(array == 0, array, np.nextafter(array, towards)))
+        step = np.where(np.isfinite(array), np.spacing(np.abs(array)), 0) * ulps
+        sign = np.where(jitter.random(array.shape) < 0.5, -1, 1)
+        return np.asarray(np.where(array == 0, array, array + sign * step)).astype(array.dtype)
 
 
 def run_graph(
@@ -49,8 +63,9 @@ def run_graph(
     ``feeds`` may name any tensor, not only placeholders: a recorded draw can stand for a sampler's output. Raises
     GraphError when a placeholder is not fed or a kernel fails.
 
-    With ``jitter`` every float that an op computes is moved by one unit in its last place, up or down at random (Monte
-    Carlo arithmetic): how far the outputs then move is what rounding explains.
+    With ``jitter`` every float that an op computes, and every term of a sum of products, is moved by one unit in its
+    last place, up or down at random (Monte Carlo arithmetic); the results of functions that runtimes approximate by
+    four. How far the outputs then move is what rounding explains.
     """
     values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
     needed = graph.ancestors(fetch, stop=frozenset(split_ref(name)[0] for name in values))
@@ -66,9 +81,13 @@ def run_graph(
             values[node.name] = node.value
             continue
         entry = op_of(node)
-        results = run_kernel(entry, node, [values[r] for r in node.inputs])
+        arguments = [values[r] for r in node.inputs]
+        if jitter is not None and node.op in _SUMS:
+            arguments = [_moved(a, jitter) for a in arguments]
+        results = run_kernel(entry, node, arguments)
         if jitter is not None and not entry.structural and node.op not in _EXACT:
-            results = tuple(_moved(r, jitter) for r in results)
+            ulps = _APPROXIMATION_ULPS if node.op in _APPROXIMATED else 1
+            results = tuple(_moved(r, jitter, ulps) for r in results)
         for index, result in enumerate(results):
             values.setdefault(ref(node.name, index), result)
     return {name: values[normal_ref(name)] for name in fetch}

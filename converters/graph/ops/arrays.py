@@ -1,4 +1,7 @@
-"""Ops that make, move and reshape arrays. Most kernels are structural: they also work on symbolic shape vectors."""
+"""Constants, placeholders and pass-throughs; shapes of things; joining and cutting.
+
+Most kernels are structural: they also work on symbolic shape vectors.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
-from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, broadcast, of_array, product
+from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
 from signatures.graph import Node, TensorShape
 
 T = type_attr()
@@ -100,7 +103,7 @@ def _infer_rank(node: Node, args: Sequence[TensorType], symbols: Symbols) -> lis
     return [TensorType(INT32, (), None if rank is None else np.array(rank, np.int32))]
 
 
-def _target_dims(value: np.ndarray | None, kind: TensorType, symbols: Symbols) -> list[Dim] | None:
+def target_dims(value: np.ndarray | None, kind: TensorType, symbols: Symbols) -> list[Dim] | None:
     """The dims that a shape operand stands for; fresh symbols where it is not known."""
     if value is not None:
         return [d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist()]
@@ -110,7 +113,7 @@ def _target_dims(value: np.ndarray | None, kind: TensorType, symbols: Symbols) -
 
 
 def _infer_reshape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    target = _target_dims(args[1].value, args[1], symbols)
+    target = target_dims(args[1].value, args[1], symbols)
     if target is None:
         return [TensorType(args[0].dtype, None)]
     if target.count(-1) > 1:
@@ -360,270 +363,8 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     )
 
 
-# ------------------------------------------------------------------ slices
-
-
-def _slice(node: Node, x: np.ndarray, begin: np.ndarray, size: np.ndarray) -> np.ndarray:
-    index = tuple(slice(int(b), None if s == -1 else int(b) + int(s)) for b, s in zip(begin, size, strict=True))
-    return x[index]
-
-
-def _infer_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape, begin, size = args[0].shape, args[1].constant, args[2].constant
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
-    dims: list[Dim] = []
-    for i, length in enumerate(shape):
-        start = None if begin is None else int(begin[i])
-        wanted = None if size is None else int(size[i])
-        if wanted is not None and wanted >= 0:
-            dims.append(wanted)
-        elif wanted == -1 and start is not None and isinstance(length, int):
-            dims.append(length - start)
-        else:
-            dims.append(length if wanted == -1 and start == 0 else symbols.fresh())
-    return [TensorType(args[0].dtype, tuple(dims))]
-
-
-def _lower_slice(node: Node, builder: OnnxBuilder) -> Any:
-    rank = builder.type_of(node.inputs[0]).rank
-    begin = constant_input(node, builder, 1, "the beginning of a slice").astype(np.int64)
-    size = constant_input(node, builder, 2, "the size of a slice").astype(np.int64)
-    ends = np.where(size == -1, np.int64(2**31 - 1), begin + size)
-    axes = builder.const(np.arange(rank or 0, dtype=np.int64), "axes")
-    return builder.emit(
-        "Slice", [builder.value(node.inputs[0]), builder.const(begin, "starts"), builder.const(ends, "ends"), axes]
-    )
-
-
-#: One entry of a strided slice: ("slice", begin, end, stride) | ("take", index) | ("new",)
-SliceStep = tuple[Any, ...]
-
-
-def strided_steps(
-    node: Node, rank: int, begin: Sequence[int], end: Sequence[int], strides: Sequence[int]
-) -> list[SliceStep]:
-    """TensorFlow's five masks resolved to one step per axis (plus "new" steps that insert an axis).
-
-    Source of the rules: the documentation of ``tf.strided_slice``: an ellipsis stands for as many whole axes as are
-    missing; a set bit of begin/end mask means "from the start"/"to the end"; shrink takes one element and drops the
-    axis; new axis inserts one.
-    """
-    masks = {k: int(node.attrs[f"{k}_mask"]) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis")}
-    steps: list[SliceStep] = []
-    covered = sum(1 for i in range(len(begin)) if not (masks["ellipsis"] | masks["new_axis"]) >> i & 1)
-    for i in range(len(begin)):
-        if masks["ellipsis"] >> i & 1:
-            steps.extend([("slice", None, None, 1)] * (rank - covered))
-        elif masks["new_axis"] >> i & 1:
-            steps.append(("new",))
-        elif masks["shrink_axis"] >> i & 1:
-            steps.append(("take", int(begin[i])))
-        else:
-            first = None if masks["begin"] >> i & 1 else int(begin[i])
-            last = None if masks["end"] >> i & 1 else int(end[i])
-            steps.append(("slice", first, last, int(strides[i])))
-    used = sum(1 for s in steps if s[0] != "new")
-    steps.extend([("slice", None, None, 1)] * (rank - used))
-    return steps
-
-
-def _strided_slice(node: Node, x: np.ndarray, begin: np.ndarray, end: np.ndarray, strides: np.ndarray) -> np.ndarray:
-    index: list[Any] = []
-    for step in strided_steps(node, x.ndim, begin.tolist(), end.tolist(), strides.tolist()):
-        if step[0] == "new":
-            index.append(None)
-        elif step[0] == "take":
-            index.append(step[1])
-        else:
-            index.append(slice(step[1], step[2], step[3]))
-    return np.asarray(x[tuple(index)])
-
-
-def _strided_operands(node: Node, args: Sequence[TensorType]) -> tuple[list[int], list[int], list[int]] | None:
-    values = [a.constant for a in args[1:4]]
-    if any(v is None for v in values):
-        return None
-    begin, end, strides = (v.tolist() for v in values if v is not None)
-    return begin, end, strides
-
-
-def _infer_strided_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    operands = _strided_operands(node, args)
-    if shape is None or operands is None:
-        return [TensorType(args[0].dtype, None)]
-    steps = strided_steps(node, len(shape), *operands)
-    if sum(1 for s in steps if s[0] != "new") != len(shape):
-        raise shape_error(node, args, "the slice has more axes than the tensor")
-    dims: list[Dim] = []
-    lengths = iter(shape)
-    for step in steps:
-        if step[0] == "new":
-            dims.append(1)
-            continue
-        length = next(lengths)
-        if step[0] == "take":
-            if isinstance(length, int) and not -length <= step[1] < length:
-                raise shape_error(node, args, f"index {step[1]} is outside of {length}")
-            continue
-        if isinstance(length, int):
-            dims.append(len(range(*slice(step[1], step[2], step[3]).indices(length))))
-        else:
-            dims.append(length if step[1:] in ((None, None, 1), (0, None, 1)) else symbols.fresh())
-    return [TensorType(args[0].dtype, tuple(dims))]
-
-
-def _lower_strided_slice(node: Node, builder: OnnxBuilder) -> Any:
-    kind = builder.type_of(node.inputs[0])
-    operands = _strided_operands(node, [builder.type_of(r) for r in node.inputs])
-    if operands is None or kind.shape is None:
-        raise not_constant(node, "the bounds of a slice")
-    steps = strided_steps(node, len(kind.shape), *operands)
-    limit = 2**31 - 1
-    starts, ends, axes, strides = [], [], [], []
-    drop, insert = [], []
-    axis = 0
-    for step in steps:
-        if step[0] == "new":
-            continue
-        if step[0] == "take":
-            bounds = (step[1], step[1] + 1 if step[1] != -1 else limit, 1)
-            drop.append(axis)
-        else:
-            first = step[1] if step[1] is not None else (0 if step[3] > 0 else limit)
-            bounds = (first, step[2] if step[2] is not None else (limit if step[3] > 0 else -limit), step[3])
-            length = kind.shape[axis]
-            if isinstance(length, int) and not range(*slice(*step[1:]).indices(length)):
-                bounds = (0, 0, 1)  # backwards from before the start: ONNX would begin at element 0
-        if bounds != (0, limit, 1):
-            starts.append(bounds[0])
-            ends.append(bounds[1])
-            strides.append(bounds[2])
-            axes.append(axis)
-        axis += 1
-    position = 0
-    for step in steps:
-        if step[0] == "new":
-            insert.append(position)
-        position += step[0] != "take"
-    value = builder.value(node.inputs[0])
-    if axes:
-        operand = [builder.const(np.array(v, np.int64), "slice") for v in (starts, ends, axes, strides)]
-        value = builder.emit("Slice", [value, *operand])
-    return unsqueezed(builder, squeezed(builder, value, drop), insert)
-
-
-def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
-    return np.take(x, indices, axis=0 if axis is None else int(axis))
-
-
-def _infer_gather(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    if args[0].shape is None or args[1].shape is None:
-        return [TensorType(args[0].dtype, None)]
-    axis = 0 if len(args) < 3 else int(require_constant(node, args, 2, "an axis")) % len(args[0].shape)
-    return [TensorType(args[0].dtype, args[0].shape[:axis] + args[1].shape + args[0].shape[axis + 1 :])]
-
-
-def _lower_gather(node: Node, builder: OnnxBuilder) -> Any:
-    axis = 0 if len(node.inputs) < 3 else int(constant_input(node, builder, 2, "an axis"))
-    return builder.emit("Gather", [builder.value(r) for r in node.inputs[:2]], axis=axis)
-
-
-# ------------------------------------------------------------------ filling
-
-
-def _fill(node: Node, dims: np.ndarray, value: np.ndarray) -> np.ndarray:
-    return np.full([int(d) for d in dims], value, value.dtype)
-
-
-def _infer_fill(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    dims = _target_dims(args[0].value, args[0], symbols)
-    return [TensorType(args[1].dtype, None if dims is None else tuple(dims))]
-
-
-def _lower_fill(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Expand", [builder.value(node.inputs[1]), as_int64(node, builder, 0)])
-
-
-def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
-    return np.asarray(np.broadcast_to(x, [int(d) for d in dims]), order="C")
-
-
-def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    dims = _target_dims(args[1].value, args[1], symbols)
-    return [TensorType(args[0].dtype, None if dims is None else broadcast(args[0].shape, tuple(dims), symbols))]
-
-
-def _lower_broadcast_to(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Expand", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
-
-
-def _tile(node: Node, x: np.ndarray, multiples: np.ndarray) -> np.ndarray:
-    return np.tile(x, [int(m) for m in multiples])
-
-
-def _infer_tile(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
-    multiples = _target_dims(args[1].value, args[1], symbols) or [symbols.fresh()] * len(shape)
-    return [TensorType(args[0].dtype, tuple(product((d, m), symbols) for d, m in zip(shape, multiples, strict=True)))]
-
-
-def _lower_tile(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Tile", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
-
-
-def _range(node: Node, start: np.ndarray, limit: np.ndarray, delta: np.ndarray) -> np.ndarray:
-    return np.asarray(np.arange(start.item(), limit.item(), delta.item())).astype(start.dtype)
-
-
-def _infer_range(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    values = [a.constant for a in args]
-    if any(v is None for v in values):
-        return [TensorType(args[0].dtype, (symbols.fresh(),))]
-    return [of_array(_range(node, *(v for v in values if v is not None)))]
-
-
-def _lower_range(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Range", [builder.value(r) for r in node.inputs])
-
-
-def _one_hot(node: Node, indices: np.ndarray, depth: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
-    axis = int(node.attrs["axis"])
-    hot = indices[..., None] == np.arange(int(depth))
-    return np.moveaxis(np.where(hot, on, off).astype(on.dtype), -1, axis if axis >= 0 else -1)
-
-
-def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    if shape is None:
-        return [TensorType(args[2].dtype, None)]
-    depth = int(require_constant(node, args, 1, "a depth"))
-    axis = int(node.attrs["axis"])
-    dims = list(shape)
-    dims.insert(len(dims) if axis < 0 else axis, depth)
-    return [TensorType(args[2].dtype, tuple(dims))]
-
-
-def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
-    """ONNX's OneHot wraps negative indices round where TensorFlow gives a row of off-values: compare instead."""
-    depth = int(constant_input(node, builder, 1, "a depth"))
-    kind = builder.type_of(node.inputs[0])
-    if kind.rank is None:
-        raise not_constant(node, "the rank of its indices")
-    axis = int(node.attrs["axis"])
-    axis = kind.rank if axis < 0 else axis
-    classes = np.arange(depth, dtype=kind.dtype).reshape([depth if i == axis else 1 for i in range(kind.rank + 1)])
-    index = unsqueezed(builder, builder.value(node.inputs[0]), [axis])
-    hot = builder.emit("Equal", [index, builder.const(classes, "classes")])
-    return builder.emit("Where", [hot, builder.value(node.inputs[2]), builder.value(node.inputs[3])])
-
-
 _PASS = ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
 _SHAPE_OF = (T, Attr("out_type", "type", INT32))
-_MASKS = tuple(Attr(f"{k}_mask", "int", 0) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis"))
 
 OPS = (
     OpDef("Const", _infer_const, lambda node: node.value, attrs=(Attr("dtype", "type", derive="out:0"),)),
@@ -691,52 +432,5 @@ OPS = (
         _lower_split,
         (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
         outputs=-1,
-    ),
-    OpDef("Slice", _infer_slice, _slice, _lower_slice, (T, type_attr("Index", "in:1")), structural=True),
-    OpDef(
-        "StridedSlice",
-        _infer_strided_slice,
-        _strided_slice,
-        _lower_strided_slice,
-        (T, type_attr("Index", "in:1"), *_MASKS),
-        structural=True,
-    ),
-    OpDef(
-        "Gather",
-        _infer_gather,
-        _gather,
-        _lower_gather,
-        (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
-        structural=True,
-    ),
-    OpDef(
-        "GatherV2",
-        _infer_gather,
-        _gather,
-        _lower_gather,
-        (
-            type_attr("Tparams"),
-            type_attr("Tindices", "in:1"),
-            type_attr("Taxis", "in:2"),
-            Attr("batch_dims", "int", 0, since="1.14", supported=False),
-        ),
-        structural=True,
-    ),
-    OpDef(
-        "Fill",
-        _infer_fill,
-        _fill,
-        _lower_fill,
-        (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
-    ),
-    OpDef("BroadcastTo", _infer_broadcast_to, _broadcast_to, _lower_broadcast_to, (T, type_attr("Tidx", "in:1"))),
-    OpDef("Tile", _infer_tile, _tile, _lower_tile, (T, type_attr("Tmultiples", "in:1"))),
-    OpDef("Range", _infer_range, _range, _lower_range, (type_attr("Tidx"),)),
-    OpDef(
-        "OneHot",
-        _infer_one_hot,
-        _one_hot,
-        _lower_one_hot,
-        (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
     ),
 )

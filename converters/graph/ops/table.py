@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from converters.graph.ops import arrays, chance, convolution, elementwise, linear
+from converters.graph.ops import arrays, chance, convolution, elementwise, filling, linear, slicing
 from converters.graph.ops.base import OpDef
 from signatures.errors import UnsupportedOpError
 from signatures.graph import Node
@@ -32,7 +32,7 @@ FORBIDDEN = frozenset(
 
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
-    for module in (elementwise, linear, convolution, arrays, chance):
+    for module in (elementwise, linear, convolution, arrays, slicing, filling, chance):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from converters.graph.editor import Editor
-from converters.graph.ops.arrays import strided_steps
+from converters.graph.ops.slicing import strided_steps
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import INT32
 from signatures.graph import Graph, Node

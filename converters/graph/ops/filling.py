@@ -1,0 +1,134 @@
+"""Making arrays by rule: fill, broadcast, tile, range, one-hot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.arrays import target_dims
+from converters.graph.ops.base import (
+    Attr,
+    OnnxBuilder,
+    OpDef,
+    as_int64,
+    constant_input,
+    not_constant,
+    require_constant,
+    type_attr,
+    unsqueezed,
+)
+from converters.graph.types import INT32, Symbols, TensorType, broadcast, of_array, product
+from signatures.graph import Node
+
+T = type_attr()
+
+
+def _fill(node: Node, dims: np.ndarray, value: np.ndarray) -> np.ndarray:
+    return np.full([int(d) for d in dims], value, value.dtype)
+
+
+def _infer_fill(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    dims = target_dims(args[0].value, args[0], symbols)
+    return [TensorType(args[1].dtype, None if dims is None else tuple(dims))]
+
+
+def _lower_fill(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Expand", [builder.value(node.inputs[1]), as_int64(node, builder, 0)])
+
+
+def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
+    return np.asarray(np.broadcast_to(x, [int(d) for d in dims]), order="C")
+
+
+def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    dims = target_dims(args[1].value, args[1], symbols)
+    return [TensorType(args[0].dtype, None if dims is None else broadcast(args[0].shape, tuple(dims), symbols))]
+
+
+def _lower_broadcast_to(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Expand", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
+
+
+def _tile(node: Node, x: np.ndarray, multiples: np.ndarray) -> np.ndarray:
+    return np.tile(x, [int(m) for m in multiples])
+
+
+def _infer_tile(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[0].dtype, None)]
+    multiples = target_dims(args[1].value, args[1], symbols) or [symbols.fresh()] * len(shape)
+    return [TensorType(args[0].dtype, tuple(product((d, m), symbols) for d, m in zip(shape, multiples, strict=True)))]
+
+
+def _lower_tile(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Tile", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
+
+
+def _range(node: Node, start: np.ndarray, limit: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    return np.asarray(np.arange(start.item(), limit.item(), delta.item())).astype(start.dtype)
+
+
+def _infer_range(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    values = [a.constant for a in args]
+    if any(v is None for v in values):
+        return [TensorType(args[0].dtype, (symbols.fresh(),))]
+    return [of_array(_range(node, *(v for v in values if v is not None)))]
+
+
+def _lower_range(node: Node, builder: OnnxBuilder) -> Any:
+    return builder.emit("Range", [builder.value(r) for r in node.inputs])
+
+
+def _one_hot(node: Node, indices: np.ndarray, depth: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
+    axis = int(node.attrs["axis"])
+    hot = indices[..., None] == np.arange(int(depth))
+    return np.moveaxis(np.where(hot, on, off).astype(on.dtype), -1, axis if axis >= 0 else -1)
+
+
+def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    shape = args[0].shape
+    if shape is None:
+        return [TensorType(args[2].dtype, None)]
+    depth = int(require_constant(node, args, 1, "a depth"))
+    axis = int(node.attrs["axis"])
+    dims = list(shape)
+    dims.insert(len(dims) if axis < 0 else axis, depth)
+    return [TensorType(args[2].dtype, tuple(dims))]
+
+
+def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
+    """ONNX's OneHot wraps negative indices round where TensorFlow gives a row of off-values: compare instead."""
+    depth = int(constant_input(node, builder, 1, "a depth"))
+    kind = builder.type_of(node.inputs[0])
+    if kind.rank is None:
+        raise not_constant(node, "the rank of its indices")
+    axis = int(node.attrs["axis"])
+    axis = kind.rank if axis < 0 else axis
+    classes = np.arange(depth, dtype=kind.dtype).reshape([depth if i == axis else 1 for i in range(kind.rank + 1)])
+    index = unsqueezed(builder, builder.value(node.inputs[0]), [axis])
+    hot = builder.emit("Equal", [index, builder.const(classes, "classes")])
+    return builder.emit("Where", [hot, builder.value(node.inputs[2]), builder.value(node.inputs[3])])
+
+
+OPS = (
+    OpDef(
+        "Fill",
+        _infer_fill,
+        _fill,
+        _lower_fill,
+        (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
+    ),
+    OpDef("BroadcastTo", _infer_broadcast_to, _broadcast_to, _lower_broadcast_to, (T, type_attr("Tidx", "in:1"))),
+    OpDef("Tile", _infer_tile, _tile, _lower_tile, (T, type_attr("Tmultiples", "in:1"))),
+    OpDef("Range", _infer_range, _range, _lower_range, (type_attr("Tidx"),)),
+    OpDef(
+        "OneHot",
+        _infer_one_hot,
+        _one_hot,
+        _lower_one_hot,
+        (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
+    ),
+)
