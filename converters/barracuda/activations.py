@@ -20,7 +20,6 @@ _OPS = MappingProxyType(
         Activation.SIGMOID: "Sigmoid",
         Activation.RELU6: "Relu6",
         Activation.SOFTPLUS: "Softplus",
-        Activation.SOFTSIGN: "Softsign",
         Activation.ABS: "Abs",
         Activation.NEG: "Neg",
         Activation.CEIL: "Ceil",
@@ -134,6 +133,11 @@ def _swish(b: Builder, x: str, alpha: float, beta: float) -> str:
     return b.op("Mul", [x, b.op("Sigmoid", [x])])
 
 
+def _softsign(b: Builder, x: str, alpha: float, beta: float) -> str:
+    """The number over 1 + |x|; TensorFlow has an op for it, TensorFlow.js has not."""
+    return b.op("RealDiv", [x, b.op("Add", [b.op("Abs", [x]), b.const(1, "one")])])
+
+
 def _between(b: Builder, x: str, low: float, high: float) -> str:
     return b.op("Maximum", [b.op("Minimum", [x, b.const(high, "high")]), b.const(low, "low")])
 
@@ -218,6 +222,7 @@ _FORMULAS: MappingProxyType[int, _Formula] = MappingProxyType(
         Activation.LEAKY_RELU: _leaky_relu,
         Activation.SELU: _selu,
         Activation.SWISH: _swish,
+        Activation.SOFTSIGN: _softsign,
         Activation.HARD_SIGMOID: _hard_sigmoid,
         Activation.CLIP: lambda b, x, low, high: _between(b, x, low, high),
         Activation.POW: _pow,

@@ -124,7 +124,7 @@ class Builder:
         """A Const of the current layer."""
         return self._editor.const(np.asarray(array, dtype), f"{self._label}/{label}")
 
-    def ints(self, values: Sequence[int] | int, label: str) -> str:
+    def ints(self, values: npt.ArrayLike, label: str) -> str:
         """An int32 Const: a shape, axes, bounds."""
         return self.const(values, label, INT32)
 
@@ -224,6 +224,14 @@ class Builder:
             return four_axes(tuple(values), self.where)
         raise self.damaged(f"it holds {list(values)}", "that is no shape of four or eight axes")
 
+    def whole(self, array: npt.NDArray[np.float32]) -> list[int]:
+        """Numbers that stand for lengths or indices, in order; a ``.nn`` holds them as floats."""
+        with np.errstate(invalid="ignore"):
+            fit = bool(np.all(np.abs(array) < MAX_ELEMENTS))
+        if not fit:
+            raise self.damaged("an index or length in it is no number of that size", "its dataset is damaged")
+        return [int(v) for v in array.reshape(-1)]
+
     def sized(self, *lengths: int) -> None:
         """Refuse a tensor of more elements per row than any policy has, before anything is made for it."""
         if math.prod(lengths) > MAX_ELEMENTS:
@@ -242,11 +250,11 @@ class Builder:
             fix="convert the model again: the frozen_graph_def.pb beside the .nn is exported in its place",
         )
 
-    def unsupported(self, what: str, why: str, fix: str | None = None) -> UnsupportedOpError:
+    def unsupported(self, what: str, why: str) -> UnsupportedOpError:
         """The error for a layer, or a variant of one, that is not translated."""
         return UnsupportedOpError(
             f"{self.where}: {what}",
             issues=[(self.layer.name, layer_label(self.layer.type))],
             why=why,
-            fix=fix or "export the frozen_graph_def.pb or the .onnx that the model was converted from",
+            fix="export the frozen_graph_def.pb or the .onnx that the model was converted from",
         )

@@ -25,9 +25,15 @@ def dense(b: Builder, args: Sequence[Value]) -> Value:
 
 def biased(b: Builder, product: str, bias: Value) -> str:
     """``product`` plus a bias along its last axis; the zeros that ML-Agents' converter makes up are left out."""
-    if bias.constant is not None and not bias.constant.any():
+    if _all(bias, 0):
         return product
     return b.op("BiasAdd", [product, b.vector(bias)])
+
+
+def _all(value: Value, number: float) -> bool:
+    """Whether a tensor is known to hold nothing but ``number``."""
+    with np.errstate(invalid="ignore"):
+        return value.constant is not None and bool(np.all(value.constant == number))
 
 
 def matmul(b: Builder, args: Sequence[Value]) -> Value:
@@ -101,7 +107,7 @@ def scale_bias(b: Builder, args: Sequence[Value]) -> Value:
     if scale.size != x.c or bias.size != x.c:
         raise b.damaged(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
     result = x.reference
-    if scale.constant is None or not np.all(scale.constant == 1):
+    if not _all(scale, 1):
         result = b.op("Mul", [result, b.vector(scale)])
     if x.rank == 1:
         return Value(b.op("Add", [result, b.vector(bias)]), x.shape)

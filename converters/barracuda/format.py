@@ -113,6 +113,14 @@ class NnModel:
         """Whether ML-Agents' converter wrote it (and not Unity): nothing stands behind the weights."""
         return self.version < EIGHT_AXES and self.trailer is None
 
+    def number(self, name: str) -> float | None:
+        """The one number of a dataset called ``name`` (``version_number``), None where there is none."""
+        for layer in self.layers:
+            for dataset in layer.datasets:
+                if dataset.name == name and dataset.length == 1:
+                    return float(self.weights[dataset.offset])
+        return None
+
     def array(self, dataset: Dataset) -> npt.NDArray[np.float32]:
         """A dataset's numbers as [N, H, W, C]. Raises DamagedFileError for a shape of more axes."""
         values = self.weights[dataset.offset : dataset.offset + dataset.length]
@@ -220,7 +228,8 @@ class _Parser:
         self._what = "the weights"
         size = 2 if half else 4
         stream = np.frombuffer(self._take(total * size), "<f2" if half else "<f4")
-        return stream.astype(np.float32)
+        with np.errstate(invalid="ignore"):  # signalling NaNs
+            return stream.astype(np.float32)
 
     def _trailer(self, version: int) -> Trailer:
         self._what = "the importer's report after the weights"

@@ -72,6 +72,7 @@ class _Reader:
             else:
                 self._attempt(layer.name, partial(self._layer, layer))
         self._memory_out()
+        self._check_action()
         return Reading(self.builder.graph(), tuple(self.builder.notes))
 
     def _attempt(self, name: str, make: Callable[[], Value]) -> None:
@@ -82,6 +83,21 @@ class _Reader:
             if name in self.needed:
                 raise
             self.failed[name] = error
+
+    def _check_action(self) -> None:
+        """Raise DamagedFileError where the action is not as wide as the file says that it is.
+
+        The converter of some 0.7 previews bypassed slices: every branch then holds the numbers of all branches.
+        """
+        wanted, action = self.model.number("action_output_shape"), self.values.get("action")
+        if not self.model.from_python or wanted is None or action is None or action.size == wanted:
+            return
+        raise DamagedFileError(
+            f"'action' has {action.size} numbers, and the file's own action_output_shape says {wanted:g}",
+            why="the converter of a preview of ML-Agents 0.7 left out the slices that cut the action into branches, so "
+            "this .nn computes something else than was trained, in Unity too",
+            fix="export the frozen_graph_def.pb from the same run",
+        )
 
     # ------------------------------------------------------------------ inputs
 

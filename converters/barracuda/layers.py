@@ -89,7 +89,7 @@ _LAYERS: MappingProxyType[int, tuple[int, int, Translate]] = MappingProxyType(
 
 _WHY = MappingProxyType(
     {
-        LayerType.LRN: "no op of the four targets computes local response normalisation",
+        LayerType.LRN: "local response normalisation is not in the op table, and no model of ML-Agents has it",
         LayerType.LSTM: "it takes and gives its state beside the graph; the converters of ML-Agents never wrote it",
         LayerType.RESAMPLE2D: "which pixel is nearest is rounded differently by Unity's backends",
     }
@@ -112,6 +112,7 @@ def translate(b: Builder, layer: Layer, args: Sequence[Value], version: int) -> 
         wanted = fewest if fewest == most else f"{fewest} to {most}" if most < _ANY else f"{fewest} or more"
         raise b.damaged(f"it has {len(args)} inputs and datasets", f"it takes {wanted}")
     result = function(b, args, version)
+    b.sized(*result.shape[1:])
     if layer.type != LayerType.ACTIVATION and layer.activation != Activation.NONE:
         result = activations.activate(b, layer.activation, result, version, fused=True)
     return result

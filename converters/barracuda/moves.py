@@ -25,7 +25,7 @@ def axis_of(b: Builder, axis: int, version: int) -> int:
     """An axis of the file as a position in N, H, W, C; −1 is C."""
     if -4 <= axis < 0:
         return axis + 4
-    if version < EIGHT_AXES and axis < 4:
+    if version < EIGHT_AXES and 0 <= axis < 4:
         return axis
     if version >= EIGHT_AXES and axis in EIGHT:
         return EIGHT.index(axis)
@@ -47,7 +47,7 @@ def reshape(b: Builder, args: Sequence[Value]) -> Value:
     if b.layer.pool:
         target = list(b.four(b.layer.pool))
     elif len(args) == 2 and b.layer.axis == 1 and args[1].constant is not None:
-        numbers = [int(v) for v in args[1].constant.reshape(-1)]
+        numbers = b.whole(args[1].constant)
         if len(numbers) > 4:
             raise b.unsupported(f"the target is {numbers}", "more than four axes are not translated")
         target = [*numbers, *[1] * (4 - len(numbers))]
@@ -201,7 +201,7 @@ def gather(b: Builder, args: Sequence[Value], version: int) -> Value:
     if tuple(b.layer.pool)[1:] not in ((), (0,), (1,)):
         raise b.unsupported(f"indices of rank {b.layer.pool[1]}", "only a list of indices is translated")
     if index.constant is not None and axis != N:
-        chosen = [int(v) for v in index.constant.reshape(-1)]
+        chosen = b.whole(index.constant)
         if not chosen or min(chosen) < 0 or max(chosen) >= int(x.shape[axis] or 0):
             raise b.damaged(f"the indices are {chosen}", f"there are {x.shape[axis]} elements along {_NAMES[axis]}")
         return b.shaped(taken(b, b.image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))

@@ -12,8 +12,8 @@ from signatures.roles import ACTION_NAMES
 
 #: Suffixes that ML-Agents' converter gives to memories: the cell state and the hidden state of an LSTM; a GRU has h.
 _PARTS = ("_c", "_h")
-#: What the previews of 0.7 wrote is older; their constant ``version_number`` is still that of 0.6.
-_FIRST_RELEASED = 16
+#: The ``version_number`` of 0.6, which wrote no ``.nn``; the previews of 0.7 still had it.
+_BEFORE_NN = 1
 
 
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:
@@ -21,7 +21,7 @@ def read(path: Path, options: ReadOptions) -> list[SourceModel]:
     model = parse(path.read_bytes())
     reading = to_graph(model)
     facts = SourceFacts(
-        family="ML-Agents 0.7 (preview)" if model.version < _FIRST_RELEASED else None,
+        family="ML-Agents 0.7 (preview)" if model.number("version_number") == _BEFORE_NN else None,
         memory_layout=_memory_layout(model),
         notes=(*_notes(model), *reading.notes),
     )

@@ -79,7 +79,7 @@ def _slide(b: Builder, op: str, x: Value, window: _Window, kernel: str | None, f
 
 def padded(b: Builder, x: str, pads: Sequence[Sequence[int]], fill: float) -> str:
     """``x`` with ``pads`` (a pair per axis) of ``fill`` around it."""
-    operand = b.ints(pads, "pads")  # type: ignore[arg-type]
+    operand = b.ints(pads, "pads")
     return b.op("Pad", [x, operand]) if fill == 0 else b.op("PadV2", [x, operand, b.const(fill, "fill")])
 
 
@@ -291,8 +291,8 @@ def upsample(b: Builder, args: Sequence[Value]) -> Value:
     """Every pixel ``pool`` = [width, height] times; the factors may come as a constant [N, H, W, C] instead."""
     factors: Sequence[int] = b.layer.pool
     if not factors and len(args) == 2 and args[1].constant is not None and args[1].constant.size == 4:
-        scale = args[1].constant.reshape(-1)
-        factors = (int(scale[2]), int(scale[1]))
+        _, down, across, _ = b.whole(args[1].constant)
+        factors = (across, down)
     if len(factors) != 2 or min(factors) < 1:
         raise b.unsupported(
             f"the factors are {list(factors)}",

@@ -187,31 +187,31 @@ def _arithmetic() -> Iterator[Case]:
     for kind in (100, 101, 102, 103, 104, 110, 111, 112):
 
         def two(m: Maker, kind: int = kind) -> str:
-            return m.layer("y", kind, X1, "action_masks")
+            return m.layer("y", kind, X1, "vector_observation_1")
 
         def three(m: Maker, kind: int = kind) -> str:
-            return m.layer("y", kind, X1, "action_masks", m.load("c", _draw(1, 1, 1, 6, low=0.5)))
+            return m.layer("y", kind, X1, "vector_observation_1", m.load("c", _draw(1, 1, 1, 6, low=0.5)))
 
         def with_image(m: Maker, kind: int = kind) -> str:
             return m.layer("y", kind, X4, X1 if kind == 99 else "row", m.load("c", _draw(1, 1, 1, 4, low=0.5)))
 
-        yield _case(f"binary-{kind}", two, positive, action_masks=other)
-        yield _case(f"n-ary-{kind}", three, positive, 17, action_masks=other)
+        yield _case(f"binary-{kind}", two, positive, vector_observation_1=other)
+        yield _case(f"n-ary-{kind}", three, positive, 17, vector_observation_1=other)
         row = _draw(BATCH, 1, 1, 4, low=0.5, high=2)
         yield _case(f"image-and-row-{kind}", with_image, np.abs(IMAGE) + 0.1, 17, row=row)
     rounded = np.round(VECTOR)
     for kind in (140, 141, 142, 143, 144, 145, 146, 148):
 
         def compare(m: Maker, kind: int = kind) -> str:
-            return m.layer("y", kind, X1, "action_masks")
+            return m.layer("y", kind, X1, "vector_observation_1")
 
-        yield _case(f"logic-{kind}", compare, rounded, action_masks=np.round(other - 1.5))
+        yield _case(f"logic-{kind}", compare, rounded, vector_observation_1=np.round(other - 1.5))
     yield _case("logic-147", lambda m: m.layer("y", 147, X1), rounded)
 
     def choose(m: Maker) -> str:
-        return m.layer("y", 149, X1, "action_masks", m.load("c", _draw(1, 1, 1, 6)))
+        return m.layer("y", 149, X1, "vector_observation_1", m.load("c", _draw(1, 1, 1, 6)))
 
-    yield _case("where", choose, rounded, action_masks=other)
+    yield _case("where", choose, rounded, vector_observation_1=other)
 
     def choose_pixels(m: Maker) -> str:
         bright = m.layer("bright", 140, X4, m.load("zero", 0.0))

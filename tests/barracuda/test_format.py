@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from converters.barracuda.format import VERSIONS, Dataset, Layer, NnInput, NnMemory, NnModel, Trailer, parse
 from converters.barracuda.graph import to_graph
 from signatures.errors import DamagedFileError, ExportModelError
+from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import public_files
 from tests.barracuda.nn_files import Maker, write_nn
 
@@ -124,6 +125,20 @@ def test_a_changed_byte_is_read_or_refused(data: st.DataObject) -> None:
     file = bytearray(write_nn(small()))
     for _ in range(data.draw(st.integers(1, 4))):
         file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        to_graph(parse(bytes(file)))
+    except ExportModelError as error:
+        assert str(error)
+
+
+@given(st.sampled_from(all_cases()), st.data())
+@settings(max_examples=400, deadline=None)
+def test_changed_numbers_in_any_kind_of_layer_are_read_or_refused(case: Case, data: st.DataObject) -> None:
+    file = bytearray(write_nn(case.model))
+    numbers = st.sampled_from((-(2**31), -5, -1, 0, 1, 2, 3, 4, 8, 255, 1 << 24, 2**31 - 1))
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, min(len(file), 800) - 4))
+        file[at : at + 4] = struct.pack("<i", data.draw(numbers))
     try:
         to_graph(parse(bytes(file)))
     except ExportModelError as error:

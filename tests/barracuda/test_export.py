@@ -1,0 +1,70 @@
+"""``.nn`` files through the whole pipeline: four formats, compared in the real runtimes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.artifact import WriteOptions
+from converters.registry import writer
+from exporter.parity.pool import RuntimePool
+from exporter.pipeline import ExportOptions, export
+from exporter.summary import failure_lines
+from tests.barracuda.cases import Case, all_cases
+from tests.barracuda.conftest import BROKEN, NEEDED, UNSLICED, genuine_files, params, public_files
+from tests.barracuda.test_layers import expected_of, feeds_of, policy_of
+
+pytestmark = pytest.mark.slow
+
+SOURCES = [
+    *(p for p in public_files() if p.name != UNSLICED),
+    *(nn for nn, _, case in genuine_files() if nn.parent.name != BROKEN),
+]
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize("path", params(SOURCES, lambda p: f"{p.parent.name}-{p.name}"[:90]))
+def test_a_nn_exports_to_four_formats_that_agree(path: Path, shared: Path, tmp_path: Path, pool: RuntimePool) -> None:
+    (result,) = export([path], ExportOptions(tmp_path), pool=pool)
+    assert result.report is not None
+    assert result.report.passed is True, "\n".join(failure_lines(result.report))
+    ran = {c.runtime for c in result.report.comparisons}
+    assert ran == {"numpy", *NEEDED}
+    assert {c.format for c in result.report.comparisons} >= {"bytes", "saved_model", "tfjs", "onnx"}
+    assert not result.report.reference.startswith("source/")
+
+
+# ------------------------------------------------------------------ every kind of layer in every runtime
+
+
+def groups(cases: list[Case], size: int = 20) -> Iterator[list[Case]]:
+    for start in range(0, len(cases), size):
+        yield cases[start : start + size]
+
+
+@pytest.mark.parametrize("cases", [pytest.param(g, id=f"{g[0].name}-to-{g[-1].name}") for g in groups(all_cases())])
+def test_every_layer_computes_the_same_in_every_runtime(cases: list[Case], tmp_path: Path, pool: RuntimePool) -> None:
+    for case in cases:
+        policy = policy_of(case)
+        feeds, expected = feeds_of(case, policy), expected_of(case)
+        for target, runtime in (
+            ("bytes", "tensorflow"),
+            ("onnx", "onnxruntime"),
+            ("tfjs", "tfjs-cpu"),
+            ("tfjs", "tfjs-wasm"),
+        ):
+            artifact = writer(target)(policy, WriteOptions("{}"))
+            folder = tmp_path / case.name / runtime
+            for name, data in artifact.files.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_bytes(data)
+            model = pool.process(runtime).load(str(folder / artifact.main), kind="graph")
+            got: Any = model.run(feeds, ["action"])["action"]
+            model.unload()
+            np.testing.assert_allclose(
+                got, expected, atol=5e-5, rtol=5e-5, err_msg=f"{case.name}: {target} in {runtime}"
+            )
