@@ -6,6 +6,7 @@ Only a folder that holds a policy.json of ours is ever replaced.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
@@ -13,6 +14,7 @@ import re
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +28,7 @@ from signatures.spec import Policy, PolicySignature, SourceMap
 
 POLICY, PARITY = "policy.json", "parity.json"
 SCHEMA = 1
+_STALE_SECONDS = 24 * 3600.0
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
@@ -88,6 +91,7 @@ def write_staged(parent: Path, content: Mapping[str, Any], artifacts: Sequence[A
     body = {**{k: v for k, v in content.items() if k != "tool"}, "files": hashes, "tool": tool}
     with writing(parent, "the output folder cannot be written"):
         parent.mkdir(parents=True, exist_ok=True)
+        _sweep(parent, content["name"])
         stage = Path(tempfile.mkdtemp(prefix=f".{content['name']}.", dir=parent))
         try:
             for relative, data in files.items():
@@ -100,6 +104,14 @@ def write_staged(parent: Path, content: Mapping[str, Any], artifacts: Sequence[A
             shutil.rmtree(stage, ignore_errors=True)
             raise
     return stage
+
+
+def _sweep(parent: Path, name: str) -> None:
+    """Remove what killed runs left of this policy, a day later: before that, it may be a run that is still going."""
+    for left in parent.glob(f".{name}.*"):
+        with contextlib.suppress(OSError):  # its own process may just have renamed or removed it
+            if left != _aside(parent / name) and time.time() - left.stat().st_mtime > _STALE_SECONDS:
+                shutil.rmtree(left)
 
 
 def check_replaceable(place: Path) -> None:

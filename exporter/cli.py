@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -252,13 +253,13 @@ def _print_next(results: Sequence[ExportResult], names: str, targets: Sequence[s
     """What to do next, in a line or two."""
     if not results:
         return
-    last = results[-1]
-    if last.passed is False:
-        click.echo(f"next: read {last.folder}/parity.json; the bundle was kept apart because its formats disagree")
+    failed = next((r for r in results if r.passed is False), None)
+    if failed is not None:
+        click.echo(f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree")
         return
     if "bytes" in targets and names == "canonical":
         click.echo("note: Unity looks nodes up by the trainer's names: export with --names source for Unity")
-    click.echo(f"next: export-model verify {last.folder}    (policy.json there says what to feed)")
+    click.echo(f"next: export-model verify {results[-1].folder}    (policy.json there says what to feed)")
 
 
 def _result_dict(result: ExportResult) -> dict[str, Any]:
@@ -379,6 +380,8 @@ def install_command(name: str) -> None:
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point: runs a command and turns errors into one message and an exit status."""
     wants_json = "--json" in (sys.argv[1:] if args is None else args)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a Windows console, or a pipe there, has no Δ
     try:
         app.main(args=None if args is None else list(args), prog_name="export-model", standalone_mode=False)
     except click.exceptions.Exit as stop:
@@ -396,6 +399,9 @@ def main(args: Sequence[str] | None = None) -> None:
             click.echo(json.dumps(error.to_dict(), indent=1))
         click.echo(f"error: {error.message}", err=True)
         sys.exit(error.exit_status)
+    except OSError as error:  # of the terminal or the pipe; files have errors of their own
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)
 
 
 if __name__ == "__main__":

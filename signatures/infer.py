@@ -181,9 +181,7 @@ def _depends_on_input(graph: Graph) -> set[str]:
     return fed
 
 
-def _chosen(
-    graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None
-) -> tuple[Brain, ...]:
+def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None) -> tuple[Brain, ...]:
     outputs: list[tuple[str, Role, str]] = []
     for name, role in wanted.items():
         node_name, _ = split_ref(name)

@@ -163,7 +163,7 @@ class SourceMap:
     - ``fixed``: placeholders that the policy no longer has, with the value they take.
     - ``batch_sizes``: placeholders that take the number of rows, with their rank (0, or 1 for a vector of one).
     - ``noise``: tensors that carry N(0, 1) draws, with their shapes; one that is not among ``feeds`` is fed zeros, or
-      left to draw if ``noise_kept``.
+      draws if ``noise_kept``.
     - ``branches``: the tensors that the draws of a sampled action are made from, in branch order (None where the
       source cannot be asked for one).
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.

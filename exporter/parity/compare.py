@@ -11,6 +11,8 @@ from exporter.parity.tolerances import Tolerance
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
 NARROWED = {("int64", "int32")}
+#: Logarithm of the smallest float32 that has all its digits.
+_UNDERFLOW = float(np.log(np.finfo(np.float32).tiny))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,20 @@ def compare(
 
 def _wrong(reason: str) -> Difference:
     return Difference(float("inf"), float("inf"), False, reason)
+
+
+def floored(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
+    """Log-probabilities with those that say "never" brought to one value: 2⁻¹²⁶ of the likeliest class of the branch.
+
+    Below it a float32 probability is denormal or zero: its logarithm has few digits left, is −∞ where it is flushed to
+    zero, and is −10⁸ where a runtime takes log(softmax(x)) as one function (TensorFlow's grappler does).
+    """
+    sizes = branches if sum(branches) == log_probs.shape[-1] else (log_probs.shape[-1],)
+    parts = []
+    for part in np.split(log_probs, np.cumsum(sizes)[:-1], axis=-1):
+        best = part.max(axis=-1, keepdims=True, initial=-np.inf)
+        parts.append(np.maximum(part, best + part.dtype.type(_UNDERFLOW)))
+    return np.concatenate(parts, axis=-1)
 
 
 def ties(scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance) -> np.ndarray:

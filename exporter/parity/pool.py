@@ -14,7 +14,7 @@ from signatures.errors import RuntimeUnavailableError, UsageError
 #: Format → the runtimes that run it. "source" is the original file, read by a runtime of its own.
 RUNTIMES_OF = MappingProxyType(
     {
-        "source": ("tensorflow",),
+        "source": ("tensorflow", "onnxruntime"),
         "bytes": ("numpy", "tensorflow"),
         "saved_model": ("tensorflow",),
         "tfjs": ("tfjs-cpu", "tfjs-wasm"),

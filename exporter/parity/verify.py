@@ -13,7 +13,7 @@ import numpy as np
 from converters.graph.ops.chance import SAMPLERS
 from converters.runner.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun
-from exporter.parity.compare import Difference, compare, ties
+from exporter.parity.compare import Difference, compare, floored, ties
 from exporter.parity.original import Original
 from exporter.parity.pool import INDEPENDENT, RUNTIMES_OF, RuntimePool
 from exporter.parity.report import Comparison, ParityReport
@@ -225,10 +225,11 @@ class _Verification:
         """Per output, what rounding explains, element by element (the largest of a row counts for all of it)."""
         if case.name not in self._floors:
             names = [s.name for s in self.signature.outputs if s.name not in self.random and s.dtype == "float32"]
-            exact = self.numpy_model.run(case.feeds, names)
+            exact = self._settled(self.numpy_model.run(case.feeds, names))
             floors = {name: np.zeros(exact[name].shape) for name in names}
             for run in range(_ROUNDING_RUNS):
-                moved = self.numpy_model.run(case.feeds, names, jitter=self.options.seed * _ROUNDING_RUNS + run)
+                jitter = self.options.seed * _ROUNDING_RUNS + run
+                moved = self._settled(self.numpy_model.run(case.feeds, names, jitter=jitter))
                 for name in names:
                     step = np.abs(moved[name].astype(np.float64) - exact[name])
                     row = step.max(axis=tuple(range(1, step.ndim)), keepdims=True)
@@ -240,18 +241,26 @@ class _Verification:
         self, name: str, expected: Feeds, got: np.ndarray, entrant: _Entrant, rounding: np.ndarray | None = None
     ) -> Difference:
         return compare(
-            expected[name],
-            got,
+            self._settled(expected)[name],
+            self._settled({name: got})[name],
             self._tolerance(name),
             free=self._ties(name, expected),
             narrowed=entrant.format == "tfjs",
             rounding=rounding,
         )
 
+    def _settled(self, values: Feeds) -> dict[str, np.ndarray]:
+        """Values as they are compared: log-probabilities that say "never" are all the same."""
+        scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
+        return {
+            n: floored(a, self.signature.branches) if n in scores and a.dtype.kind == "f" and a.ndim else a
+            for n, a in values.items()
+        }
+
     def _ties(self, name: str, expected: Feeds) -> np.ndarray | None:
         """Where an argmax is not decided, because the scores of the reference are too close."""
         spec = self.signature.output(name)
-        if spec.role is not Role.DETERMINISTIC or not self.signature.branches:
+        if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
             return None
         scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
         if scores is None or scores not in expected:
@@ -303,7 +312,8 @@ class _Verification:
 
     def _draws(self, entrant: _Entrant) -> None:
         """Draw many times for one input and test the counts against the reference's log-probabilities."""
-        action = self.signature.outputs[0]
+        drawn_outputs = [s for s in self.signature.outputs if s.role is Role.SAMPLED]
+        action = drawn_outputs[0] if drawn_outputs else self.signature.outputs[0]
         scores = next((s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS), None)
         if action.role is not Role.SAMPLED or action.name not in entrant.outputs or scores is None:
             return
@@ -319,7 +329,8 @@ class _Verification:
             drawn = entrant.run({n: np.repeat(a, DRAWS, axis=0) for n, a in row.items()}, [action.name])[action.name]
         edges = np.cumsum(self.signature.branches)[:-1]
         parts = np.split(expected[0], edges)
-        p_values = [fit(drawn[:, i], part) for i, part in enumerate(parts)]
+        columns = drawn.reshape(len(drawn), -1)
+        p_values = [fit(columns[:, i], part) for i, part in enumerate(parts)]
         lowest = min(p_values)
         reason = (
             "" if lowest >= FALSE_ALARM else f"the draws do not have the distribution they should (p = {lowest:.1e})"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -210,8 +211,6 @@ def test_no_artefact_says_where_or_when_it_was_made(name: str, bundles: Path) ->
 @pytest.fixture
 def ball(bundles: Path, tmp_path: Path) -> Path:
     """A bundle to spoil."""
-    import shutil
-
     return Path(shutil.copytree(bundles / "continuous", tmp_path / "continuous"))
 
 
@@ -351,6 +350,21 @@ def test_a_bundle_without_bytes_has_no_reference(tmp_path: Path) -> None:
 def test_another_source_is_refused(ball: Path) -> None:
     ran = export_model("verify", ball, "--source", fixture("discrete"), "--runtimes", "numpy")
     is_refused(ran, fixture("discrete"), "is not the source of this bundle", "continuous.bytes")
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[]", b"\xff", b"[" * 100_000])
+def test_a_graph_that_embeds_no_contract_is_refused(text: bytes, bundles: Path, tmp_path: Path) -> None:
+    content = contract_of(bundles / "continuous")
+    with pytest.raises(BundleError, match="has been changed"):
+        bundle.check_contract(tmp_path, content, text.decode("utf-8", "replace"))
+
+
+def test_a_graph_that_is_not_ours_is_no_reference(ball: Path) -> None:
+    data = fixture("continuous").read_bytes()
+    (ball / "continuous.bytes").write_bytes(data)
+    entry = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+    rewrite(ball, lambda c: c["files"].update({"continuous.bytes": entry}))
+    is_no_bundle(ball, ball / "policy.json", "has been changed since it was exported", "embeds")
 
 
 def test_a_signature_that_is_not_complete_is_a_bundle_error(bundles: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from converters.registry import TARGETS
 from exporter import cli
 from exporter.cli import app
 from fixtures import path as fixture
-from tests.commands import export_model, files_in, is_refused, python
+from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
 
 BALL = fixture("continuous")
@@ -301,6 +303,47 @@ def test_installing_tfjs_reports_its_steps(monkeypatch: pytest.MonkeyPatch) -> N
     assert (ran.status, ran.out, ran.err) == (0, "done\n", "")
 
 
+# ------------------------------------------------------------------ terminals that cannot show everything
+
+
+def test_a_console_without_greek_letters_shows_the_rest(tmp_path: Path) -> None:
+    """The table's head has a Δ; a pipe on Windows is often cp1252."""
+    ran = python(
+        *("-m", "exporter", BALL, "-o", tmp_path, "--verify", "numpy"), environment={"PYTHONIOENCODING": "cp1252"}
+    )
+    assert (ran.status, ran.err) == (0, "")
+    assert "max |?| per output" in ran.out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="names are text there")
+def test_a_file_name_that_is_no_text_is_no_trouble(tmp_path: Path) -> None:
+    name = tmp_path / os.fsdecode(b"b\xff.bytes")
+    name.write_bytes(BALL.read_bytes())
+    ran = python("-m", "exporter", name, "-o", tmp_path / "out", *UNVERIFIED)
+    assert (ran.status, ran.err) == (0, "")
+    assert "out/b-/policy.json" in files_in(tmp_path)
+    assert json.loads((tmp_path / "out" / "b-" / "policy.json").read_text())["source"]["path"] == name.name
+    assert python("-m", "exporter", "inspect", name).status == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize("command", [["inspect"], ["-o", "{out}", *UNVERIFIED], ["inspect", "--json"]])
+def test_output_that_cannot_be_written_is_an_error(command: list[str], tmp_path: Path) -> None:
+    arguments = [a.format(out=tmp_path) for a in command]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "exporter", *arguments, str(BALL)],
+            cwd=ROOT,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: [Errno 28]")
+    assert "Traceback" not in done.stderr
+
+
 # ------------------------------------------------------------------ ends that are neither success nor error
 
 
@@ -315,17 +358,33 @@ def test_an_interrupted_run_says_stopped(tmp_path: Path, monkeypatch: pytest.Mon
     assert files_in(tmp_path) == set()
 
 
-def test_progress_is_shown_on_a_terminal_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
+class Terminal(io.StringIO):
+    """A stderr that people look at."""
 
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_is_shown_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = Terminal()
     monkeypatch.setattr(sys, "stderr", shown)
     cli._progress(quiet=False)("working")
     assert "working" in shown.getvalue()
     cli._progress(quiet=True)("hidden")
     assert "hidden" not in shown.getvalue()
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    cli._progress(quiet=False)("hidden")
+    assert sys.stderr.getvalue() == ""
+
+
+def test_a_terminal_is_cleared_of_progress_before_a_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
+    cli.app.main([str(BALL), "-o", str(tmp_path), *UNVERIFIED], standalone_mode=False)
+    assert shown.getvalue() == "\r\x1b[2K"
+    assert capsys.readouterr().out.startswith("continuous: ")
 
 
 def test_the_same_source_twice_is_written_once_more_and_not_refused(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.parity.compare import compare, ties
+from exporter.parity.compare import compare, floored, ties
 from exporter.parity.statistics import FALSE_ALARM, chi_square_survival, fit
 from exporter.parity.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from signatures.roles import Role
@@ -122,6 +122,29 @@ def test_a_branch_of_one_has_no_tie() -> None:
 def test_scores_that_are_not_finite_decide_nothing() -> None:
     scores = np.array([[math.nan, 1.0], [math.inf, math.inf], [-math.inf, 0.0]])
     assert ties(scores, (2,), PLAIN).tolist() == [[True], [True], [False]]
+
+
+# ------------------------------------------------------------------ logarithms of next to nothing
+
+
+def test_log_probabilities_that_say_never_are_all_the_same() -> None:
+    """2^-126 of the likeliest class of the branch is the least that float32 has with all digits."""
+    scores = np.array([[0.0, -1e8, -5.0, -5.0 - 88], [-3.0, -np.inf, -5.0, -80.0]], np.float32)
+    never = math.log(2) * -126
+    expected = np.array([[0, never, -5, -5 + never], [-3, -3 + never, -5, -80]], np.float32)
+    np.testing.assert_allclose(floored(scores, (2, 2)), expected, rtol=1e-6, strict=True)
+
+
+def test_log_probabilities_that_do_not_fit_the_branches_are_one_branch() -> None:
+    scores = np.array([[0.0, -200.0, -1.0]], np.float32)
+    assert floored(scores, (2, 2))[0, 1] == pytest.approx(-126 * math.log(2))
+    assert floored(np.zeros((0, 3), np.float32), (3,)).shape == (0, 3)
+
+
+def test_what_is_not_a_number_stays_so() -> None:
+    result = floored(np.array([[math.nan, 0.0], [-math.inf, -math.inf]], np.float32), (2,))
+    assert np.isnan(result[0]).any()
+    assert (result[1] == -math.inf).all()
 
 
 # ------------------------------------------------------------------ tolerances

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import exporter
@@ -23,6 +24,7 @@ from signatures.errors import (
     UsageError,
 )
 from signatures.roles import Role
+from tests.commands import export_model as command
 from tests.commands import files_in
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
 
@@ -132,7 +134,9 @@ def test_a_bundle_is_verified_again(tmp_path: Path) -> None:
 
 
 def _wrong(kind: str, runtime: str, answer: Tensors) -> Tensors:
-    return {n: a + 1 if kind == "onnx" and n == "action" else a for n, a in answer.items()}
+    """onnxruntime is off by one, for continuous actions of two numbers."""
+    wrong = kind == "onnx" and answer.get("action", np.zeros(1)).shape[-1] == 2
+    return {n: a + 1 if wrong and n == "action" else a for n, a in answer.items()}
 
 
 @pytest.fixture
@@ -162,13 +166,15 @@ def test_a_disagreement_is_a_result_when_nobody_is_strict(tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("disagreeing")
 def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
-    from tests.commands import export_model as command
-
     ran = command(BALL, "-o", tmp_path)
     assert (ran.status, ran.err) == (1, "")
     assert "FAILED: " in ran.out
     assert "onnx in onnxruntime: action differs by 1" in ran.out
     assert ran.out.splitlines()[-1].startswith(f"next: read {tmp_path / 'continuous.failed'}/parity.json")
+    several = command(BALL, fixture("discrete"), "-o", tmp_path)
+    assert several.status == 1
+    assert "PASSED: " in several.out
+    assert several.out.splitlines()[-1] == ran.out.splitlines()[-1]
     as_json = command(BALL, "-o", tmp_path, "--json")
     assert as_json.status == 1
     assert (as_json.json["policies"][0]["passed"], as_json.json["policies"][0]["parity"]["passed"]) == (False, False)
@@ -176,8 +182,6 @@ def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("disagreeing")
 def test_verifying_again_ends_with_status_1_too(tmp_path: Path) -> None:
-    from tests.commands import export_model as command
-
     command(BALL, "-o", tmp_path, "--verify", "none")
     folder = tmp_path / "continuous.failed"
     assert folder.is_dir()

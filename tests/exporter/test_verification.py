@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from converters.graph.options import CompileOptions
+from exporter.parity.original import Original
 from exporter.parity.report import Comparison, ParityReport
 from exporter.parity.tolerances import Tolerance
 from exporter.parity.verify import VerifyOptions
@@ -17,8 +18,10 @@ from exporter.pipeline import ExportResult
 from exporter.summary import failure_lines, not_run_lines, parity_table, verdict
 from fixtures import FIXTURES
 from fixtures import path as fixture
+from signatures.roles import Role
+from signatures.spec import PolicySignature, SourceMap, TensorSpec
 from tests.exporter.rehearsal import ActingPool, Array, Spoil, Tensors, export, honest
-from tests.handmade import constant, continuous_policy, dense, graph_bytes, node, placeholder
+from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder
 
 Exporting = Callable[..., ExportResult]
 
@@ -427,3 +430,70 @@ def test_a_policy_without_noise_has_one_deterministic_signature(exporting: Expor
     report = report_of(exporting(tmp_path / "plain.bytes"))
     assert report.passed is True
     assert {c.format for c in report.comparisons} >= {"saved_model", "saved_model:deterministic"}
+
+
+# ------------------------------------------------------------------ what the source has no tensor for
+
+
+def _head(kind: str) -> list[NodeDef]:
+    """The end of a discrete policy, from ``logits`` on."""
+    ends = {
+        "probabilities": [node("action", "Softmax", "logits")],
+        "log-probabilities": [node("p", "Softmax", "logits"), node("action", "Log", "p")],
+        "log-softmax": [node("action", "LogSoftmax", "logits")],
+        "argmax": [constant("axis", 1), node("action", "ArgMax", "logits", "axis", output_type=np.int64)],
+        "narrow argmax": [constant("axis", 1), node("action", "ArgMax", "logits", "axis", output_type=np.int32)],
+        "rounded": [node("action", "Cast", "logits", SrcT=np.float32, DstT=np.int32)],
+        "draw": [constant("one", 1), node("action", "Multinomial", "logits", "one", output_dtype=np.int64)],
+    }
+    return ends[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "role", "companions"),
+    [
+        ("probabilities", "probs", {"deterministic_action"}),
+        ("log-probabilities", "log_probs", {"deterministic_action"}),
+        ("log-softmax", "log_probs", {"deterministic_action"}),
+        ("argmax", "deterministic", {"deterministic_action"}),
+        ("narrow argmax", "deterministic", {"deterministic_action"}),
+        ("rounded", "deterministic", {"deterministic_action"}),
+        ("draw", "sampled", {"deterministic_action", "action_log_probs"}),
+    ],
+)
+def test_companions_are_what_follows_from_the_sources_own_numbers(
+    kind: str, role: str, companions: set[str], exporting: Exporting, tmp_path: Path
+) -> None:
+    nodes = [placeholder("vector_observation"), *dense("logits", "vector_observation", 3, 4), *_head(kind)]
+    (tmp_path / "own.bytes").write_bytes(graph_bytes(nodes))
+    result = exporting(tmp_path / "own.bytes")
+    action, *others = result.policy.signature.outputs
+    assert (action.role, {s.name for s in others}) == (role, companions)
+    assert result.passed is True
+    compared = {c.output for c in report_of(result).comparisons if c.format == "bytes" and c.kind == "numbers"}
+    assert compared >= companions
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_source_that_takes_some_rows_only_is_asked_in_parts(rows: int) -> None:
+    """Old LSTM exports are right at batch 1 only."""
+    signature = PolicySignature(
+        (
+            TensorSpec("state", Role.VECTOR, "float32", (None, 3), "x:0"),
+            TensorSpec("gain", Role.PARAMETER, "float32", (2,)),
+        ),
+        (TensorSpec("action", Role.CONTINUOUS, "float32", (None, 3), "y:0"),),
+        *("own model", "continuous"),
+    )
+    asked: list[int] = []
+
+    class Model:
+        def run(self, feeds: Tensors, fetch: list[str]) -> Tensors:
+            asked.append(len(feeds["x:0"]))
+            return {"y:0": 2 * feeds["x:0"]}
+
+    source = SourceMap({"state": "x:0"}, {"action": "y:0"}, rows=rows)
+    original = Original(Model(), signature, source)  # type: ignore[arg-type]
+    state = np.arange(21, dtype=np.float32).reshape(7, 3)
+    np.testing.assert_array_equal(original.run({"state": state, "gain": np.ones(2)})["action"], 2 * state)
+    assert asked == [rows] * -(-7 // rows)

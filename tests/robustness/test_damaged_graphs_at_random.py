@@ -145,7 +145,7 @@ def with_damaged_bytes(draw: st.DrawFn) -> bytes:
     return Damaged(data)
 
 
-@examples(300)
+@examples(200)
 @given(with_damaged_bytes())
 def test_damaged_bytes_give_a_policy_or_an_error(data: bytes) -> None:
     stands(data)
@@ -269,7 +269,7 @@ def with_damaged_fields(draw: st.DrawFn) -> bytes:
     return Damaged(schema.serialise(graph))
 
 
-@examples(500)
+@examples(250)
 @given(with_damaged_fields())
 def test_damaged_fields_give_a_policy_or_an_error(data: bytes) -> None:
     stands(data)
@@ -279,7 +279,7 @@ def test_damage_is_not_all_fatal_nor_all_harmless() -> None:
     """What the tests above try would say little if every graph were refused at the door."""
     outcomes = []
 
-    @examples(60)
+    @examples(40)
     @given(with_damaged_fields())
     def collect(data: bytes) -> None:
         outcomes.append(stands(data))
@@ -310,7 +310,7 @@ def with_strange_options(draw: st.DrawFn) -> tuple[bytes, CompileOptions]:
     return Damaged(graph), options
 
 
-@examples(400)
+@examples(200)
 @given(with_strange_options())
 def test_any_roles_give_a_policy_or_an_error(given_: tuple[bytes, CompileOptions]) -> None:
     data, options = given_

@@ -388,6 +388,23 @@ def test_statistics_and_constants_that_are_not_finite_do_not_reach_the_contract(
     assert ran.json["policies"][0]["constants"] == {"is_continuous_control": 1}
 
 
+def test_a_normaliser_that_is_not_finite_is_not_told(tmp_path: Path) -> None:
+    """Training that diverged leaves NaN; JSON has none, and nobody can draw around it."""
+    nodes = [
+        placeholder("vector_observation"),
+        constant("mean", np.array([0, np.nan, 1], np.float32)),
+        constant("deviation", np.array([1, 1, 1], np.float32)),
+        node("centred", "Sub", "vector_observation", "mean"),
+        node("normalised", "RealDiv", "centred", "deviation"),
+        *dense("mu", "normalised", 3, 2),
+        node("action", "Tanh", "mu"),
+    ]
+    (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))
+    ran = export_model("inspect", tmp_path / "a.bytes", "--json")
+    assert "NaN" not in ran.out
+    assert export_model(tmp_path / "a.bytes", "-o", tmp_path / "out", "--verify", "none").status == 0
+
+
 def test_a_constant_that_is_read_through_nothing_is_none(tmp_path: Path) -> None:
     nodes = [*continuous_policy(), node("memory_size", "Identity")]
     (tmp_path / "a.bytes").write_bytes(graph_bytes(nodes))

@@ -84,7 +84,13 @@ def test_a_file_that_is_something_else_is_named_for_what_it_is(what: str, tmp_pa
     assert files_in(tmp_path) == {name}
 
 
-@pytest.mark.parametrize("what", STUBS)
+#: The ones that TensorFlow is asked to freeze, in a process of its own.
+FROZEN_FIRST = ("a Keras model", "HDF5")
+
+
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=[pytest.mark.slow] if what in FROZEN_FIRST else []) for what in STUBS]
+)
 def test_too_little_of_another_format_is_refused(what: str, tmp_path: Path) -> None:
     name, content, kind = STUBS[what]
     (tmp_path / name).write_bytes(content)

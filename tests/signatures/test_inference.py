@@ -227,6 +227,22 @@ def test_a_graph_that_computes_nothing_from_an_input_is_no_policy(nodes: list[No
         find_brains(graph(*nodes))
 
 
+def test_outputs_that_the_format_declares_go_before_names() -> None:
+    g = graph(
+        placeholder("obs"),
+        op("net/action", "Tanh", "obs"),
+        op("left", "Neg", "net/action"),
+        op("right", "Abs", "net/action"),
+    )
+    (brain,) = find_brains(g, declared={"left": Role.ACTION, "right": None})
+    assert brain.outputs == (("left", Role.ACTION, "left"),)
+    assert brain.left_out == ("right",)
+    (only,) = find_brains(g, declared={"left": None})
+    assert only.outputs == (("left", Role.ACTION, "left"),)
+    with pytest.raises(SignatureError, match=r"left \(Neg\), right \(Abs\)"):
+        find_brains(g, declared={"left": None, "right": None})
+
+
 def test_outputs_can_be_named() -> None:
     g = graph(placeholder("obs"), op("net/left", "Tanh", "obs"), op("net/right", "Neg", "obs"))
     assert outputs(g, {"net/left": Role.ACTION, "net/right:0": Role.VALUE}) == [

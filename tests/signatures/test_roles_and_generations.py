@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import pytest
 
-from signatures.eras import generation
+from signatures.digest import sha256_hex
+from signatures.eras import generation, torch_generation
 from signatures.errors import (
     BundleError,
     ExportModelError,
@@ -86,6 +89,33 @@ def test_the_generation_is_told_from_constants_names_and_samplers(
     constants: dict[str, float], placeholders: list[str], ops: list[str], label: str
 ) -> None:
     assert generation(constants, placeholders, ops) == label
+
+
+DETERMINISTIC = "deterministic_continuous_actions"
+
+
+@pytest.mark.parametrize(
+    ("version", "inputs", "outputs", "span"),
+    [
+        (2, ["vector_observation"], ["action"], "0.20-0.22"),
+        (2, ["vector_observation"], ["action", "continuous_actions"], "0.23-0.25"),
+        (2, ["vector_observation", "memories"], ["continuous_actions"], "0.23-0.24"),
+        (2, ["obs_1"], ["discrete_actions"], "0.24-0.25"),
+        (2, ["obs_1", "recurrent_in"], ["discrete_actions"], "0.25"),
+        (2, ["obs_1"], ["discrete_actions", "recurrent_out"], "0.25"),
+        (3, ["obs_0"], ["continuous_actions"], "0.26-0.27"),
+        (3, ["obs_0"], ["continuous_actions", DETERMINISTIC], "0.28-1.1"),
+    ],
+)
+def test_the_generation_of_a_torch_export_is_told_from_its_names(
+    version: int, inputs: list[str], outputs: list[str], span: str
+) -> None:
+    assert torch_generation(version, inputs, outputs) == f"ML-Agents {span} (PyTorch)"
+
+
+def test_hashes_are_sha256() -> None:
+    assert sha256_hex(b"abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert all(sha256_hex(data) == hashlib.sha256(data).hexdigest() for data in (b"", b"a" * 1_000_000))
 
 
 # ------------------------------------------------------------------ errors
