@@ -93,16 +93,15 @@ def write_staged(parent: Path, content: Mapping[str, Any], artifacts: Sequence[A
         parent.mkdir(parents=True, exist_ok=True)
         _sweep(parent, content["name"])
         stage = Path(tempfile.mkdtemp(prefix=f".{content['name']}.", dir=parent))
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(shutil.rmtree, stage, ignore_errors=True)
             for relative, data in files.items():
                 target = stage / relative
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(data)
             (stage / POLICY).write_bytes(dumps(body))
             stage.chmod(0o755)
-        except BaseException:
-            shutil.rmtree(stage, ignore_errors=True)
-            raise
+            undo.pop_all()  # it is whole: the caller has it from here on
     return stage
 
 

@@ -18,6 +18,7 @@ from converters.graph.passes.noise import lift_noise, samplers
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.straighten import straighten
+from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.shapes import Types, infer_types
 from converters.graph.signature import Compiled, build_signature
 from converters.graph.types import static_shape
@@ -95,7 +96,7 @@ class _Compiler:
 
         work = straighten(complete_shapes(normalise(settle_inputs(pinned, roles)), roles))
         work, fetches = drop_identities(fold(work).pruned(fetches.values()), fetches)
-        work, fetches = collapse_views(work, fetches)
+        work, fetches = cancel_transposes(*collapse_views(work, fetches))
 
         types = infer_types(work)
         masked = Role.MASKS in roles.values()
@@ -147,10 +148,11 @@ class _Compiler:
         """``--deterministic``: the actions are the ones without chance. A discrete one is then made here."""
         for head in self.brain.heads:
             meaning = self.meanings[head.name]
+            if meaning.role is Role.DETERMINISTIC:
+                continue
             fetches = {**fetches, head.name: fetches[head.deterministic]}
-            role = Role.CONTINUOUS if meaning.role is Role.CONTINUOUS else Role.DETERMINISTIC
-            self.meanings[head.name] = ActionMeaning(role, meaning.branches)
-            if role is Role.DETERMINISTIC and meaning.role is not role:
+            if meaning.role is not Role.CONTINUOUS:
+                self.meanings[head.name] = ActionMeaning(Role.DETERMINISTIC, meaning.branches)
                 sources[head.name] = None
         return {n: r for n, r in fetches.items() if n != LOG_PROBS}
 

@@ -118,7 +118,8 @@ def _output_name(compiled: Compiled, name: str) -> str:
     """The output's name in the artefacts: canonical, or what the trainer called it."""
     if compiled.options.names == "canonical":
         return name
-    own = {canonical: base for base, canonical in compiled.brain.canonical.items()}
+    # A number is no trainer's name but PyTorch's way of counting, and TensorFlow.js sorts such keys.
+    own = {canonical: base for base, canonical in compiled.brain.canonical.items() if not base.isdigit()}
     return compiled.brain.scope + own[name] if name in own else name
 
 
@@ -162,7 +163,7 @@ def _inputs(compiled: Compiled, types: Types, notes: list[str]) -> tuple[dict[st
         number = counts.get(role, 0)
         counts[role] = number + 1
         name = canonical_name(role, number, node.name.removeprefix(scope))
-        if compiled.options.names == "source" and node.name not in compiled.draws:
+        if compiled.options.names == "source" and node.name not in compiled.draws and not node.name.isdigit():
             name = node.name
         if name in feeds:
             raise SignatureError(

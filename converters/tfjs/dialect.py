@@ -4,38 +4,106 @@
   then Cast.
 - Select (TF 1) with a vector condition: broadcasts over the last axis instead of the first. SelectV2 of a reshaped
   condition.
+- Softsign does not exist. Cast from float to bool cuts (0.6 is false on wasm). A stride beside a shrunk axis of a
+  StridedSlice gives other elements. A SAME convolution whose windows leave a rest is all zeros on wasm.
 - A seed other than 0 on a sampler makes *every* run draw the same numbers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from converters.graph.editor import Editor
 from converters.graph.ops.chance import SAMPLERS
+from converters.graph.ops.convolution import window_padding
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import INT32
+from converters.graph.types import BOOL, INT32
 from signatures.graph import Graph, Node
 
 
 def for_tfjs(graph: Graph) -> Graph:
     """See the module; names of the nodes that stay are kept."""
-    if not any(n.op in ("OneHot", "Select", *SAMPLERS) for n in graph.nodes):
+    if not any(n.op in _REWRITES or n.op in SAMPLERS for n in graph.nodes):
         return graph
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
-        if node.op == "OneHot":
-            _one_hot(editor, node, types)
-        elif node.op == "Select":
-            _select(editor, node, types)
-        elif node.op in SAMPLERS:
+        if node.op in SAMPLERS:
             editor.keep(replace(node, attrs={**node.attrs, "seed": 0, "seed2": 0}))
+        elif node.op in _REWRITES:
+            _REWRITES[node.op](editor, node, types)
         else:
             editor.keep(node)
     return editor.graph()
+
+
+def _softsign(editor: Editor, node: Node, types: Types) -> None:
+    size = editor.add("Abs", [node.inputs[0]], f"{node.name}/abs")
+    one = editor.const(np.ones((), types[node.name].dtype), f"{node.name}/one")
+    below = editor.add("Add", [size, one], f"{node.name}/below")
+    editor.keep(Node(node.name, "RealDiv", (node.inputs[0], below), origin=node.origin))
+
+
+def _cast(editor: Editor, node: Node, types: Types) -> None:
+    source = types[node.inputs[0]].dtype
+    if node.attrs["DstT"] != BOOL or source.kind != "f":
+        editor.keep(node)
+        return
+    zero = editor.const(np.zeros((), source), f"{node.name}/zero")
+    editor.keep(Node(node.name, "NotEqual", (node.inputs[0], zero), origin=node.origin))
+
+
+def _strided_slice(editor: Editor, node: Node, types: Types) -> None:
+    """A stride other than 1 beside a shrunk axis: the slice with its axes kept, then a Squeeze."""
+    operands = [types[r].constant for r in node.inputs[1:4]]
+    attrs = node.attrs
+    shrunk = [i for i in range(32) if int(attrs["shrink_axis_mask"]) >> i & 1]
+    plain = not (attrs["ellipsis_mask"] or attrs["new_axis_mask"])
+    if not shrunk or not plain or any(o is None for o in operands):
+        editor.keep(node)
+        return
+    begin, end, strides = (np.array(o) for o in operands)
+    if (strides == 1).all():
+        editor.keep(node)
+        return
+    end_mask = int(attrs["end_mask"])
+    for axis in shrunk:
+        end[axis], strides[axis] = begin[axis] + 1, 1
+        end_mask = end_mask | 1 << axis if begin[axis] == -1 else end_mask & ~(1 << axis)
+    begin_mask = int(attrs["begin_mask"]) & ~sum(1 << axis for axis in shrunk)
+    bounds = [editor.const(v, f"{node.name}/{k}") for k, v in (("begin", begin), ("end", end), ("strides", strides))]
+    kept = editor.add(
+        "StridedSlice", [node.inputs[0], *bounds], f"{node.name}/kept", begin_mask=begin_mask, end_mask=end_mask
+    )
+    editor.keep(Node(node.name, "Squeeze", (kept,), {"squeeze_dims": tuple(shrunk)}, origin=node.origin))
+
+
+def _convolution(editor: Editor, node: Node, types: Types) -> None:
+    """SAME whose windows leave a rest (so that there is less than nothing to pad) as Pad and VALID."""
+    image, kernel = types[node.inputs[0]].shape, types[node.inputs[1]].shape
+    if node.attrs["padding"] != "SAME" or image is None or kernel is None:
+        editor.keep(node)
+        return
+    pads, rest = [(0, 0)], False
+    for size, span, stride, dilation in zip(
+        image[1:3], kernel[:2], node.attrs["strides"][1:3], node.attrs["dilations"][1:3], strict=True
+    ):
+        if not isinstance(size, int) or not isinstance(span, int):
+            editor.keep(node)
+            return
+        window = (span - 1) * dilation + 1
+        count, before, after = window_padding(size, window, stride, "SAME")
+        rest |= (count - 1) * stride + window < size
+        pads.append((before, after))
+    if not rest:
+        editor.keep(node)
+        return
+    amounts = editor.const(np.array([*pads, (0, 0)], INT32), f"{node.name}/pads")
+    padded = editor.add("Pad", [node.inputs[0], amounts], f"{node.name}/pad")
+    editor.keep(replace(node, inputs=(padded, *node.inputs[1:]), attrs={**node.attrs, "padding": "VALID"}))
 
 
 def _one_hot(editor: Editor, node: Node, types: Types) -> None:
@@ -77,3 +145,14 @@ def _select(editor: Editor, node: Node, types: Types) -> None:
         shape = editor.const(np.array([-1] + [1] * (wide - 1), INT32), f"{node.name}/rows")
         condition = editor.add("Reshape", [condition, shape], f"{node.name}/condition")
     editor.keep(Node(node.name, "SelectV2", (condition, a, b), origin=node.origin))
+
+
+_REWRITES: dict[str, Callable[[Editor, Node, Types], None]] = {
+    "OneHot": _one_hot,
+    "Select": _select,
+    "Softsign": _softsign,
+    "Cast": _cast,
+    "StridedSlice": _strided_slice,
+    "Conv2D": _convolution,
+    "DepthwiseConv2dNative": _convolution,
+}

@@ -55,7 +55,8 @@ def _narrowed(node: Node) -> np.ndarray:
             why="TensorFlow.js has no int64",
             fix="write the other formats: --to bytes,saved_model,onnx",
         )
-    return np.ascontiguousarray(value.astype(target, copy=False))
+    # not ascontiguousarray, which makes a vector of a scalar
+    return np.asarray(value.astype(target, copy=False), order="C")
 
 
 # ------------------------------------------------------------------ GraphDef as JSON

@@ -29,9 +29,10 @@ def fold(graph: Graph) -> Graph:
         if all(c is not None for c in constants):
             for i, constant in enumerate(constants):
                 assert constant is not None
-                name = node.name if i == 0 else f"{node.name}/{i}"
-                made = editor.replace_const(name, np.asarray(constant), node.origin if i == 0 else None)
-                editor.redirect(ref(node.name, i), made)
+                if i == 0:
+                    editor.replace_const(node.name, np.asarray(constant), node.origin)
+                else:
+                    editor.redirect(ref(node.name, i), editor.const(np.asarray(constant), f"{node.name}/{i}"))
         elif node.op == "Reshape" and (target := types[node.inputs[1]].value) is not None and target.dtype == object:
             cells = target.reshape(-1).tolist()
             open_axes = [c for c in cells if isinstance(c, str)]

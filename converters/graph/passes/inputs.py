@@ -17,6 +17,8 @@ from signatures.infer import placeholder_rank
 from signatures.roles import OBSERVATIONS, Role
 
 _LARGEST_IMAGE = 512
+_POOLS = ("MaxPool", "AvgPool")
+_WINDOWS = ("Conv2D", "DepthwiseConv2dNative", *_POOLS)
 
 
 def set_values(graph: Graph, values: Mapping[str, float]) -> Graph:
@@ -170,9 +172,7 @@ def _next(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], ops: tu
 def _window_chain(graph: Graph, first: Node, consumers: Mapping[str, list[Node]]) -> tuple[list[Node], Node]:
     """Convolutions and pools in a row from ``first`` on."""
     chain, node = [first], first
-    while (following := _next(graph, node, consumers, ("Conv2D", "DepthwiseConv2dNative", "MaxPool", "MatMul"))) and (
-        following.op != "MatMul"
-    ):
+    while (following := _next(graph, node, consumers, (*_WINDOWS, "MatMul"))) and following.op != "MatMul":
         chain.append(following)
         node = following
     return chain, node
@@ -181,7 +181,7 @@ def _window_chain(graph: Graph, first: Node, consumers: Mapping[str, list[Node]]
 def _flattened(layers: list[Node], graph: Graph, height: int, width: int) -> int:
     channels = 0
     for layer in layers:
-        kernel = None if layer.op == "MaxPool" else graph.constant(layer.inputs[1])
+        kernel = None if layer.op in _POOLS else graph.constant(layer.inputs[1])
         window = layer.attrs["ksize"][1:3] if kernel is None else kernel.shape[:2]
         if kernel is not None:
             channels = int(kernel.shape[3]) * (int(kernel.shape[2]) if layer.op == "DepthwiseConv2dNative" else 1)
