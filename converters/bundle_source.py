@@ -87,6 +87,7 @@ def facts_of(graph: Graph, contract: Contract | None) -> SourceFacts:
         image_layout=next((text for text in layouts if isinstance(text, str)), "NHWC"),
         memory_layout=() if signature.memory is None else signature.memory.layout,
         constants=signature.constants,
+        distributions={s.name: s.distribution for s in signature.inputs if s.distribution and s.name in graph},
     )
     return replace(facts, notes=_own_notes(graph, contract, facts))
 

@@ -172,7 +172,11 @@ class TrainingGraph:
         texts = [(slices or {}).get(n, "").encode() for n in self.variables]
         self.const("save/RestoreV2/shape_and_slices", np.array(texts))
         self.node(
-            "save/RestoreV2", "RestoreV2", "save/Const", "save/RestoreV2/tensor_names", "save/RestoreV2/shape_and_slices"
+            "save/RestoreV2",
+            "RestoreV2",
+            "save/Const",
+            "save/RestoreV2/tensor_names",
+            "save/RestoreV2/shape_and_slices",
         )
         for number, name in enumerate(self.variables):
             value = f"save/RestoreV2:{number}" if number else "save/RestoreV2"

@@ -71,6 +71,19 @@ def tf1(folder: Path, name: str, *, resource: bool) -> None:
         keep(folder, name, feeds, results)
 
 
+def bare(folder: Path, name: str, *, resource: bool) -> None:
+    """A checkpoint beside a graph that was written before it had a saver."""
+    target = folder / name
+    with tf.Graph().as_default(), v1.Session() as session:
+        inputs, outputs = tf1_policy(resource=resource)
+        v1.train.write_graph(session.graph, str(target), "raw_graph_def.pb", as_text=False)
+        session.run(v1.global_variables_initializer())
+        feeds = {"in": draw(3, 6), "epsilon": draw(3, 2)}
+        results = session.run(outputs, {inputs[k]: v for k, v in feeds.items()})
+        v1.train.Saver().save(session, str(target / "model-1.ckpt"), write_meta_graph=False)
+        keep(folder, name, feeds, results)
+
+
 def discrete_keys(folder: Path) -> None:
     """Nothing in the graph is called as ML-Agents would: only the signature's keys say what is what."""
     with tf.Graph().as_default(), v1.Session() as session:
@@ -130,7 +143,12 @@ class Policy(tf.Module):
         self.kernel = tf.Variable(draw(5, 8))
         self.head = tf.Variable(draw(8, 3))
 
-    @tf.function(input_signature=[tf.TensorSpec([None, 5], name="vector_observation"), tf.TensorSpec([None, 3], name="action_masks")])
+    @tf.function(
+        input_signature=[
+            tf.TensorSpec([None, 5], name="vector_observation"),
+            tf.TensorSpec([None, 3], name="action_masks"),
+        ]
+    )
     def __call__(self, vector_observation: Any, action_masks: Any) -> dict[str, Any]:
         logits = tf.nn.relu(vector_observation @ self.kernel) @ self.head
         kept = (tf.nn.softmax(logits) + 1e-7) * action_masks
@@ -149,9 +167,13 @@ def tf2(folder: Path) -> None:
 def keras(folder: Path) -> None:
     observation = tf.keras.Input([6], name="vector_observation")
     image = tf.keras.Input([12, 12, 3], name="visual_observation_0")
-    seen = tf.keras.layers.Flatten()(tf.keras.layers.Conv2D(4, 3, strides=2, activation="relu")(image))
-    joined = tf.keras.layers.Concatenate()([seen, tf.keras.layers.Dense(8, activation="swish")(observation)])
-    action = tf.keras.layers.Dense(2, activation="tanh", name="action")(joined)
+    how = {"bias_initializer": tf.keras.initializers.RandomNormal(seed=5)}
+    seen = tf.keras.layers.Conv2D(4, 3, strides=2, activation="relu", **how)(image)
+    seen = tf.keras.layers.DepthwiseConv2D(3, activation="relu6", **how)(seen)
+    joined = [tf.keras.layers.Flatten()(seen), tf.keras.layers.Dense(8, activation="swish", **how)(observation)]
+    hidden = tf.keras.layers.Dense(8, activation="elu", **how)(tf.keras.layers.Concatenate()(joined))
+    hidden = tf.keras.layers.PReLU(alpha_initializer=tf.keras.initializers.RandomNormal(seed=6))(hidden)
+    action = tf.keras.layers.Dense(2, activation="tanh", name="action", **how)(hidden)
     model = tf.keras.Model([observation, image], action)
     feeds = {"vector_observation": draw(3, 6), "visual_observation_0": np.abs(draw(3, 12, 12, 3))}
     results = {"action": model([feeds["vector_observation"], feeds["visual_observation_0"]])}
@@ -165,6 +187,8 @@ def main(folder: Path) -> None:
     v1.disable_control_flow_v2()
     tf1(folder, "references", resource=False)
     tf1(folder, "resources", resource=True)
+    bare(folder, "bare", resource=False)
+    bare(folder, "bare-resources", resource=True)
     discrete_keys(folder)
     partitioned(folder)
     version_1(folder)

@@ -1,0 +1,201 @@
+"""What this tool wrote is read back as what it was: bundles, their .bytes, SavedModels and TensorFlow.js models."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters import schema
+from converters.graph.compile import CONTRACT_NODE
+from converters.graph.run import run_graph
+from exporter.bundle import compact, contract
+from exporter.parity.pool import RuntimePool
+from exporter.pipeline import ExportOptions, ExportResult, export
+from exporter.sources import read_source
+from exporter.summary import failure_lines
+from fixtures import FIXTURES
+from fixtures import path as fixture
+from signatures.errors import BundleError, DamagedFileError, ExportModelError
+from signatures.roles import Role
+from signatures.sampling import draw_cases
+from signatures.spec import Policy
+from tests.corpus.conftest import frozen_corpus, genuine_cases
+
+FORMS = ("", "{name}.bytes", "saved_model", "saved_model/saved_model.pb", "tfjs", "tfjs/model.json")
+WITHOUT_ONNX = ("bytes", "saved_model", "tfjs")
+
+
+def told(policy: Policy) -> dict[str, Any]:
+    """The contract, but for the source's names of the tensors: the artefact is the source now."""
+    content = policy.signature.to_dict()
+    for entry in (*content["inputs"], *content["outputs"]):
+        del entry["source"]
+    return {"name": policy.name, **content}
+
+
+def assert_same(got: Policy, wanted: Policy, *, told_too: bool = True) -> None:
+    if told_too:
+        assert told(got) == told(wanted)
+    names = [s.name for s in wanted.signature.outputs if s.role is not Role.SAMPLED]
+    for case in draw_cases(wanted.signature, seed=1, samples=1):
+        one, two = (run_graph(p.graph, case.feeds, names) for p in (got, wanted))
+        for name in names:
+            assert one[name].dtype == two[name].dtype
+            np.testing.assert_allclose(one[name], two[name], rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def exported(name: str, out: Path) -> list[ExportResult]:
+    return list(export([fixture(f"{name}.bytes")], ExportOptions(out, verify="none")))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("name", FIXTURES)
+def test_the_contract_is_kept(name: str, form: str, tmp_path: Path) -> None:
+    for result in exported(name, tmp_path):
+        place = result.folder / form.format(name=result.policy.name)
+        (policy,) = read_source(place).policies()
+        assert_same(policy, result.policy)
+        assert policy.source.feeds.keys() == result.policy.source.feeds.keys()
+        assert set(policy.source.feeds.values()) == {f"{s.name}:0" for s in policy.signature.inputs}
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("target", WITHOUT_ONNX)
+def test_the_contract_of_every_public_and_genuine_graph_is_kept(target: str, tmp_path: Path) -> None:
+    from converters.artifact import WriteOptions
+    from converters.registry import writer
+
+    sources = frozen_corpus() + [f / c["frozen"]["file"] for f, c in genuine_cases()]
+    if not sources:
+        pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
+    read = 0
+    for number, source in enumerate(sources):
+        for policy in read_source(source).policies():
+            folder = tmp_path / f"{number}-{policy.name}"
+            text = compact(contract(policy, {"path": source.name, "sha256": "0"}))
+            artifact = writer(target)(policy, WriteOptions(text))
+            for relative, data in artifact.files.items():
+                (folder / relative).parent.mkdir(parents=True, exist_ok=True)
+                (folder / relative).write_bytes(data)
+            (again,) = read_source(folder / artifact.main).policies()
+            # In TensorFlow.js a one-hot of depth 1 is a comparison, from which no range of the input follows.
+            assert_same(again, policy, told_too=not (target == "tfjs" and source.name.endswith("__Basic.bytes")))
+            read += 1
+    assert read >= 125
+
+
+@pytest.mark.parametrize("first", [*WITHOUT_ONNX])
+@pytest.mark.parametrize("second", [*WITHOUT_ONNX])
+@pytest.mark.parametrize("name", ["sampled", "recurrent", "visual"])
+def test_chains_of_formats_end_where_they_began(name: str, first: str, second: str, tmp_path: Path) -> None:
+    (start,) = exported(name, tmp_path / "0")
+    place = {"bytes": f"{name}.bytes", "saved_model": "saved_model", "tfjs": "tfjs"}
+    options = ExportOptions(tmp_path / "1", verify="none")
+    (middle,) = export([start.folder / place[first]], options)
+    (end,) = export([middle.folder / place[second]], ExportOptions(tmp_path / "2", verify="none"))
+    assert_same(end.policy, start.policy)
+
+
+def test_other_options_still_apply(tmp_path: Path) -> None:
+    from converters.graph.options import CompileOptions
+
+    (start,) = exported("continuous", tmp_path / "0")
+    options = CompileOptions(deterministic=True)
+    (end,) = export([start.folder], ExportOptions(tmp_path / "1", verify="none", compile=options))
+    assert [s.name for s in end.policy.signature.inputs] == ["state"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMS)
+def test_verifies_against_itself(form: str, tmp_path: Path, pool: RuntimePool) -> None:
+    for name in ("recurrent", "sampled", "twobrains"):
+        for start in exported(name, tmp_path / "0"):
+            place = start.folder / form.format(name=start.policy.name)
+            (result,) = export([place], ExportOptions(tmp_path / "1"), pool=pool)
+            assert result.report is not None
+            assert result.report.passed is True, "\n".join(failure_lines(result.report))
+            if "tfjs" not in form:
+                assert result.report.reference == "source/tensorflow"
+
+
+# ------------------------------------------------------------------ what may be wrong
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    return exported("continuous", tmp_path)[0].folder
+
+
+def test_a_bundle_gives_what_it_has(bundle: Path) -> None:
+    content = json.loads((bundle / "policy.json").read_text())
+    for gone, read in (("continuous.bytes", "saved_model.pb"), ("saved_model", "model.json")):
+        for path in [p for p in content["files"] if p.startswith(gone)]:
+            del content["files"][path]
+        (bundle / "policy.json").write_text(json.dumps(content))
+        source = read_source(bundle)
+        assert read in {f.name for f in source.models[0].files}
+        assert source.policies()[0].name == "continuous"
+
+
+def test_a_changed_bundle_is_refused(bundle: Path) -> None:
+    file = bundle / "continuous.bytes"
+    file.write_bytes(file.read_bytes() + b"\0")
+    with pytest.raises(BundleError, match=r"continuous\.bytes: has been changed"):
+        read_source(bundle)
+    file.unlink()
+    with pytest.raises(BundleError, match=r"continuous\.bytes: is missing"):
+        read_source(bundle)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{",
+        "[]",
+        "{}",
+        '{"name": "a"}',
+        '{"name": "../x", "files": {}}',
+        '{"name": "a", "files": {}}',
+        '{"name": "a", "files": {"a.bytes": 3}}',
+        '{"name": "continuous", "files": {"continuous.bytes": {"sha256": "0"}}}',
+    ],
+)
+def test_a_policy_json_that_is_none(bundle: Path, content: str) -> None:
+    (bundle / "policy.json").write_text(content)
+    with pytest.raises(BundleError) as caught:
+        read_source(bundle)
+    assert str(bundle) in str(caught.value)
+
+
+def test_a_contract_that_cannot_be_read(bundle: Path) -> None:
+    graph = schema.parse(schema.GraphDef, (bundle / "continuous.bytes").read_bytes(), "graph")
+    for text in ("{", "{}", "3", '{"name": 3, "inputs": [], "outputs": []}'):
+        for node in graph.node:
+            if node.name == CONTRACT_NODE:
+                node.attr["value"].tensor.string_val[:] = [text.encode()]
+        file = bundle / "other.bytes"
+        file.write_bytes(schema.serialise(graph))
+        with pytest.raises(DamagedFileError, match="contract that it embeds cannot be read"):
+            read_source(file)
+
+
+def test_damage_of_every_file_leaves_nothing_behind(bundle: Path, tmp_path: Path) -> None:
+    out, broken = tmp_path / "out", tmp_path / "broken"
+    for relative in ("saved_model/saved_model.pb", "tfjs/model.json", "tfjs/group1-shard1of1.bin", "policy.json"):
+        content = (bundle / relative).read_bytes()
+        place = broken if relative == "policy.json" else broken / relative.split("/")[0]
+        for position in range(0, len(content), max(len(content) // 25, 1)):
+            shutil.rmtree(broken, ignore_errors=True)
+            shutil.copytree(bundle, broken)
+            (broken / relative).write_bytes(content[:position])
+            try:
+                list(export([place], ExportOptions(out, verify="none")))
+            except ExportModelError as error:
+                assert error.exit_status == 2
+            assert not out.exists() or {p.name for p in out.iterdir()} <= {"continuous"}

@@ -1,0 +1,163 @@
+"""Signatures of models put into their graphs: which output is which, whatever the keys and nodes are called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters import schema
+from converters.frozen_graph.reader import read_graph
+from converters.graph.run import run_graph
+from converters.saved_model.reader import read_saved_model
+from converters.saved_model.signature import ModelSignature, Tensor, expose
+from exporter.pipeline import ExportOptions, export
+from exporter.sources import read_source
+from fixtures import path as fixture
+from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
+from signatures.graph import Graph, Node, TensorShape
+from signatures.roles import Role
+
+F32 = np.dtype(np.float32)
+X = np.array([[1, -2]], np.float32)
+
+
+def graph(*names: str) -> Graph:
+    """x → names[0] = x + 1 → names[1] = that + 1 …"""
+    nodes = [
+        Node("x", "Placeholder", (), {"dtype": F32, "shape": TensorShape((None, 2))}, origin="x:0"),
+        Node("one", "Const", value=np.array(1, np.float32)),
+    ]
+    for name in names:
+        nodes.append(Node(name, "Add", (nodes[-1].name if len(nodes) > 2 else "x", "one"), origin=f"{name}:0"))
+    return Graph(tuple(nodes))
+
+
+def exposed(base: Graph, inputs: dict[str, str], outputs: dict[str, str]) -> tuple[Graph, dict[str, Role]]:
+    sides = [{k: Tensor(v, F32) for k, v in side.items()} for side in (inputs, outputs)]
+    return expose(base, ModelSignature(*sides))
+
+
+def value(base: Graph, name: str) -> float:
+    return float(run_graph(base, {"x": X}, [name])[name][0, 0])
+
+
+def test_one_output_is_the_action() -> None:
+    made, roles = exposed(graph("a", "b"), {"in": "x:0"}, {"out": "b:0"})
+    assert value(made, "action") == 3
+    assert made["action"].origin == "b:0"
+    assert roles == {}
+    made, _ = exposed(graph("a", "recurrent_out"), {}, {"out": "a:0", "memory": "recurrent_out:0"})
+    assert (value(made, "action"), value(made, "recurrent_out")) == (2, 3)
+
+
+def test_keys_go_before_nodes_names() -> None:
+    made, roles = exposed(
+        graph("action", "value_estimate"),
+        {"state": "x:0"},
+        {"action": "value_estimate:0", "value_estimate": "action:0"},
+    )
+    assert (value(made, "action"), value(made, "value_estimate")) == (3, 2)
+    assert made["action"].origin == "value_estimate:0"
+    assert roles == {"x": Role.VECTOR}
+
+
+def test_an_inner_node_of_that_name_gives_way() -> None:
+    made, _ = exposed(graph("action", "b"), {}, {"action": "b:0"})
+    assert value(made, "action") == 3
+    assert made["action"].origin == "b:0"
+    assert any(n.origin == "action:0" for n in made.nodes)
+
+
+def test_several_unknown_outputs_keep_their_keys() -> None:
+    made, _ = exposed(graph("a", "b"), {}, {"left out": "a:0", "right/out": "b:0"})
+    assert (value(made, "left_out"), value(made, "right/out")) == (2, 3)
+    assert "action" not in made
+
+
+def test_what_the_signature_does_not_name_is_gone() -> None:
+    made, _ = exposed(graph("action", "value_estimate"), {}, {"out": "action:0"})
+    assert "value_estimate" not in made
+
+
+def test_an_input_in_the_middle_becomes_the_placeholder() -> None:
+    made, roles = exposed(graph("a", "b"), {"vector_observation": "a:0"}, {"out": "b:0"})
+    assert made["a"].op == "Placeholder"
+    assert "x" not in made
+    assert roles == {"a": Role.VECTOR}
+
+
+def test_bundled_identities_are_taken_apart() -> None:
+    base = graph("a", "b")
+    both = Node("both", "IdentityN", ("a", "b"))
+    last = Node("last", "Add", ("both", "both:1"))
+    made, _ = exposed(Graph((*base.nodes, both, last)), {}, {"out": "last:0", "second": "both:1"})
+    assert all(n.op != "IdentityN" for n in made.nodes)
+    assert value(made, "out") == 5
+    assert value(made, "second") == 3
+
+
+def test_a_signature_of_another_graph() -> None:
+    with pytest.raises(DamagedFileError, match=r"'out' is the tensor 'gone:0', which is not in the graph"):
+        exposed(graph("a"), {}, {"out": "gone:0"})
+
+
+# ------------------------------------------------------------------ files
+
+
+def saved(keys: dict[str, tuple[str, ...]], tags: tuple[str, ...] = ("serve",)) -> bytes:
+    """A SavedModel with these signatures, key → outputs; the graph is that of a fixture."""
+    message = schema.SavedModel(saved_model_schema_version=1)
+    meta = message.meta_graphs.add()
+    meta.meta_info_def.tags.extend(tags)
+    meta.graph_def.ParseFromString(fixture("continuous.bytes").read_bytes())
+    for key, outputs in keys.items():
+        for name in outputs:
+            meta.signature_def[key].outputs[name].name = f"{name}:0"
+            meta.signature_def[key].outputs[name].dtype = 1
+    return schema.serialise(message)
+
+
+def test_the_serving_signature_goes_first() -> None:
+    assert (
+        read_saved_model(saved({"a": ("action",), "serving_default": ("action",)})).signature.key == "serving_default"
+    )
+    found = read_saved_model(saved({"b": ("action",), "a": ("action",), "__saved_model_init_op": ("x",), "c": ()}))
+    assert (found.signature.key, found.keys) == ("a", ("a", "b"))
+
+
+def test_a_saved_model_without_signatures_goes_by_names(tmp_path: Path) -> None:
+    (tmp_path / "saved_model.pb").write_bytes(saved({}))
+    (policy,) = read_source(tmp_path).policies()
+    assert policy.name == tmp_path.name
+    (frozen,) = read_source(fixture("continuous.bytes")).policies()
+    assert policy.signature == frozen.signature
+
+
+def test_a_saved_model_without_a_graph() -> None:
+    with pytest.raises(NotAPolicyError, match="no graph"):
+        read_saved_model(b"\x08\x01")
+
+
+def test_damage_leaves_nothing_behind(tmp_path: Path) -> None:
+    content, out = saved({"serving_default": ("action",)}), tmp_path / "out"
+    file = tmp_path / "model/saved_model.pb"
+    file.parent.mkdir()
+    for position in range(3, len(content), max(len(content) // 80, 1)):
+        for damaged in (
+            content[:position],
+            content[:position] + bytes([content[position] ^ 0xAA]) + content[position + 1 :],
+        ):
+            file.write_bytes(damaged)
+            try:
+                list(export([file.parent], ExportOptions(out, verify="none")))
+            except ExportModelError as error:
+                assert error.exit_status == 2
+            assert not out.exists() or {p.name for p in out.iterdir()} <= {"model"}
+
+
+def test_a_frozen_graph_and_its_saved_model_are_one() -> None:
+    base = read_graph(fixture("recurrent.bytes").read_bytes())
+    made, _ = exposed(base, {}, {"action": "action:0", "recurrent_out": "recurrent_out:0"})
+    assert {n.name for n in made.nodes} <= {n.name for n in base.nodes}

@@ -1,0 +1,111 @@
+"""SavedModels, checkpoints and Keras models that TensorFlow wrote: read, exported, compared in the real runtimes."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.checkpoint.bundle import Checkpoint
+from exporter.parity.pool import RuntimePool
+from exporter.pipeline import ExportOptions, export
+from exporter.sources import read_source
+from exporter.summary import failure_lines
+from signatures.errors import NotAPolicyError, RuntimeUnavailableError, SourceError
+from tests.saved_model.models import assert_agrees, roles, sources
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("written_by_tensorflow")]
+
+FLAT = {name: name for name in ("references", "resources", "bare", "bare-resources", "keys", "partitioned")}
+THROUGH_TENSORFLOW = {"function": "function", "exported": "keras", "policy.keras": "keras", "policy.h5": "keras"}
+
+
+@pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *THROUGH_TENSORFLOW.items()])
+def test_reads_what_tensorflow_computes(models: Path, name: str, archive: str) -> None:
+    (policy,) = read_source(models / name).policies()
+    assert policy.name == Path(name).stem
+    assert_agrees(policy, models / f"{archive}.npz")
+
+
+@pytest.mark.parametrize("name", [*FLAT, *THROUGH_TENSORFLOW])
+def test_agrees_in_all_runtimes_with_the_original(models: Path, name: str, tmp_path: Path, pool: RuntimePool) -> None:
+    (result,) = export([models / name], ExportOptions(tmp_path), pool=pool)
+    assert result.report is not None
+    assert result.report.passed is True, "\n".join(failure_lines(result.report))
+    assert result.report.reference == "source/tensorflow"
+
+
+@pytest.mark.parametrize("name", ["references", "resources"])
+def test_names_of_ml_agents_behind_other_keys(models: Path, name: str) -> None:
+    """The recipe of 2019: {in, epsilon} to {out}; the training part is left out."""
+    source = read_source(models / name)
+    (policy,) = source.policies()
+    assert roles(policy) == {"state": "vector_observation", "epsilon": "noise", "action": "continuous"}
+    assert sources(policy) == {"state": "vector_observation", "epsilon": "epsilon", "action": "action"}
+    assert {f.name for f in source.models[0].files} == {
+        *("saved_model.pb", "variables.index", "variables.data-00000-of-00001"),
+    }
+    assert read_source(models / name / "saved_model.pb").policies()[0].name == name
+
+
+def test_keys_of_ml_agents_on_other_names(models: Path) -> None:
+    (policy,) = read_source(models / "keys").policies()
+    assert roles(policy) == {
+        "state": "vector_observation",
+        "action_masks": "masks",
+        "action": "log_probs",
+        "value_estimate": "value_estimate",
+    }
+    assert sources(policy)["state"] == "Placeholder"
+    assert policy.signature.branches == (3,)
+
+
+def test_a_partitioned_variable_is_joined(models: Path) -> None:
+    checkpoint = Checkpoint(models / "partitioned/model-20.ckpt")
+    assert checkpoint.names == ["kernel", "whole"]
+    kernel = checkpoint.read("kernel")
+    assert kernel.shape == (7, 4)
+    np.testing.assert_array_equal(checkpoint.read("kernel", ((3, 2), (0, 4))), kernel[3:5])
+
+
+def test_further_signatures_are_said(models: Path) -> None:
+    (policy,) = read_source(models / "exported").policies()
+    assert "the signature serving_default was read; there are also serve" in policy.signature.notes
+
+
+@pytest.mark.parametrize("name", ["version1", "version1/model-5.ckpt", "version1/model-5.ckpt.meta"])
+def test_the_first_format_is_refused_with_the_remedy(models: Path, name: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        read_source(models / name)
+    if not name.endswith(".meta"):
+        assert isinstance(caught.value, NotAPolicyError)
+        assert "V1" in str(caught.value)
+
+
+def test_a_checkpoint_of_objects_is_refused_with_the_remedy(models: Path) -> None:
+    with pytest.raises(NotAPolicyError, match="checkpoint of Python objects") as caught:
+        read_source(models / "objects-3.ckpt")
+    assert "SavedModel" in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("name", THROUGH_TENSORFLOW)
+def test_without_tensorflow_it_says_so(models: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "tensorflow" else real(n, *a))
+    with pytest.raises(RuntimeUnavailableError, match=r"export-model\[tensorflow\]") as caught:
+        read_source(models / name)
+    assert caught.value.exit_status == 3
+    assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["policy.keras", "policy.h5"])
+def test_damage_is_an_error_of_the_source(models: Path, name: str, tmp_path: Path) -> None:
+    content = (models / name).read_bytes()
+    file = tmp_path / name
+    file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(SourceError) as caught:
+        read_source(file)
+    assert name in str(caught.value)
+    assert "Traceback" not in str(caught.value)
