@@ -7,7 +7,6 @@ own: it is the source now, and the original that the result is compared with.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from converters.graph.compile import CONTRACT_NODE, compile_graph
 from converters.registry import reader
 from converters.renaming import renamed
 from converters.source import ReadOptions, SourceModel
+from signatures.digest import sha256_hex
 from signatures.errors import BundleError, DamagedFileError, ExportModelError
 from signatures.graph import Graph, NameScope, Node, topological
 from signatures.infer import SourceFacts
@@ -200,7 +200,7 @@ def _check(folder: Path, main: str, files: Mapping[str, Any]) -> None:
         if not file.is_file():
             raise BundleError("is missing", where=relative, why=f"{POLICY} names it", fix=_FIX)
         wanted = entry.get("sha256") if isinstance(entry, dict) else None
-        if hashlib.sha256(file.read_bytes()).hexdigest() != wanted:
+        if sha256_hex(file.read_bytes()) != wanted:
             raise BundleError(
                 "has been changed since it was exported",
                 where=relative,

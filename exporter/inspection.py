@@ -20,7 +20,7 @@ from signatures.spec import Policy, TensorSpec
 
 _FEED = {
     Role.VECTOR: "the agent's vector observation, as the environment gives it (normalised inside the policy)",
-    Role.VISUAL: "camera image, NHWC, colours from 0 to 1 (divide bytes by 255), first row at the top",
+    Role.VISUAL: "camera image, {layout}, colours from 0 to 1 (divide bytes by 255), first row at the top",
     Role.ENTITIES: "variable-length observation",
     Role.NOISE: "N(0, 1) draws, or zeros for the action without chance",
     Role.MASKS: "1 = allowed, 0 = forbidden; branches side by side",
@@ -132,7 +132,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
         layout = f" [{'|'.join(signature.memory.layout)}]" if signature.memory.layout else ""
         facts.append(f"memory {signature.memory.size}{layout}")
     lines = [f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}", ""]
-    rows = [_row(s, _feed(s)) for s in signature.inputs]
+    rows = [_row(s, _feed(s, signature.preprocess.get(s.name, {}))) for s in signature.inputs]
     lines.append(table(("input", "dtype", "shape", "in the source", "what to feed"), rows))
     lines.append("")
     rows = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
@@ -147,11 +147,11 @@ def _policy_text(inspected: PolicyInspection) -> str:
     return "\n".join(lines)
 
 
-def _feed(spec: TensorSpec) -> str:
+def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
     known = spec.distribution or {}
     if spec.role is Role.VECTOR and known.get("kind") == "integer":
         return f"the discrete state, an integer from {known['low']} to {known['high']}"
-    return _FEED.get(spec.role, spec.role.value)
+    return _FEED.get(spec.role, spec.role.value).format(layout=preprocess.get("layout", "NHWC"))
 
 
 def _row(spec: TensorSpec, text: str) -> list[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,7 @@ class SourceFacts:
     - ``image_layout``: NHWC, or NCHW for torch exports.
     - ``memory_layout``: the memory's parts in order; empty: found from the graph.
     - ``constants``: the ones that are no nodes of the graph.
+    - ``distributions``: placeholder → what it is fed, where the format says it.
     - ``outputs``: the nodes that the format declares as outputs, with their roles where it says them; empty: it
       declares none, and any node may be an output.
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
@@ -55,6 +57,7 @@ class SourceFacts:
     image_layout: str = "NHWC"
     memory_layout: tuple[str, ...] = ()
     constants: Mapping[str, int | float] = field(default_factory=dict)
+    distributions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     outputs: Mapping[str, Role | None] = field(default_factory=dict)
     rows: int | None = None
     notes: tuple[str, ...] = ()

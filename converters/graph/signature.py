@@ -171,7 +171,7 @@ def _inputs(compiled: Compiled, types: Types, notes: list[str]) -> tuple[dict[st
                 fix="give one of them another role: --input NAME=ROLE",
             )
         feeds[name] = node.name
-        distribution = _distribution(graph, types, node, role)
+        distribution = compiled.facts.distributions.get(node.name) or _distribution(graph, types, node, role)
         specs.append(TensorSpec(name, role, node.attrs["dtype"].name, _known_shape(node), node.origin, distribution))
         if node.name in compiled.draws:
             notes.append(f"the noise drawn inside the graph ({node.origin}) is now the input {name}; feed N(0, 1)")

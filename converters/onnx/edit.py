@@ -62,6 +62,7 @@ def _repair_seed(node: Any) -> None:
     for attribute in node.attribute:
         if attribute.name == "seed" and attribute.type == _INT:
             attribute.f, attribute.type = float(attribute.i), _FLOAT
+            attribute.ClearField("i")
 
 
 def _rename_reads(nodes: Iterable[Any], old: str, new: str) -> None:
@@ -82,7 +83,7 @@ def cut(model: Any, fetch: Sequence[str]) -> bytes:
     part = onnx.ModelProto()
     part.CopyFrom(model)
     graph = part.graph
-    makers = {output: node for node in graph.node for output in node.output if output}
+    makers = {output: index for index, node in enumerate(graph.node) for output in node.output if output}
     needed: set[str] = set()
     kept: set[int] = set()
     stack = list(fetch)
@@ -93,9 +94,9 @@ def cut(model: Any, fetch: Sequence[str]) -> bytes:
         needed.add(name)
         maker = makers.get(name)
         if maker is not None:
-            kept.add(id(maker))
-            stack.extend(_reads(maker))
-    nodes = [n for n in graph.node if id(n) in kept]
+            kept.add(maker)
+            stack.extend(_reads(graph.node[maker]))
+    nodes = [n for i, n in enumerate(graph.node) if i in kept]
     inputs = [v for v in graph.input if v.name in needed]
     constants = [t for t in graph.initializer if t.name in needed]
     outputs = [onnx.ValueInfoProto(name=name) for name in dict.fromkeys(fetch)]

@@ -37,7 +37,7 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
         return redrawn(model.graph, contract), replace(facts, outputs=_roles_of_contract(model, contract))
     version = model.graph.constant("version_number") if "version_number" in model.graph else None
     number = 0 if version is None or version.size != 1 else int(version.reshape(()))
-    graph, notes = _with_rows_of_memory(model)
+    graph, notes = _with_rows_first(model)
     rows = 1 if model.one_row or notes else model.batch
     facts = SourceFacts(image_layout=_image_layout(model), rows=rows, outputs=dict.fromkeys(model.outputs.values()))
     if model.producer.startswith("tf2onnx"):
@@ -126,24 +126,31 @@ def _squashed(graph: Graph, name: str) -> bool:
     return node.op == "Tanh"
 
 
-def _with_rows_of_memory(model: OnnxModel) -> tuple[Graph, list[str]]:
-    """ML-Agents 0.25 joined the LSTM's states [1, B, H] to recurrent_out without turning them to [B, 1, H].
+def _with_rows_first(model: OnnxModel) -> tuple[Graph, list[str]]:
+    """Memories that come out as an LSTM has them, [1, B, n], as [B, 1, n]: at batch 1 that is the same.
 
-    At batch 1 that is the same, beyond it TF Serving and Unity would find no batch axis; so it is turned here.
+    ML-Agents 0.25 joined the LSTM's states to recurrent_out without turning them; models that were exported for one
+    row need not turn them. TF Serving asks for the batch axis first.
     """
-    name = model.outputs.get("recurrent_out")
-    shape = None if name is None else model.shapes.get(name)
-    if name is None or shape is None or len(shape) != 3 or shape[0] != 1 or not isinstance(shape[1], str):
-        return model.graph, []
-    names = NameScope(n.name for n in model.graph.nodes)
-    inner, target = names.fresh(f"{name}/time_first"), names.fresh(f"{name}/shape")
-    graph = renamed(model.graph, {name: inner})
-    rows = Node(target, "Const", value=np.array([-1, 1, int(shape[2])], np.int32))
-    turned = Node(name, "Reshape", (inner, target), origin=model.graph[name].origin)
-    return Graph(topological([*graph.nodes, rows, turned])), [
-        "the memory is handled rightly for one row only in the source (a fault of ML-Agents 0.25); the export takes any "
-        "number of rows and is compared with the source row by row"
-    ]
+    graph, notes = model.graph, []
+    names = NameScope(n.name for n in graph.nodes)
+    for value, name in model.outputs.items():
+        shape = model.shapes.get(name)
+        if shape is None or len(shape) != 3 or shape[0] != 1 or not isinstance(shape[1], str):
+            continue
+        if value != "recurrent_out" and model.batch != 1:
+            continue
+        inner, target = names.fresh(f"{name}/time_first"), names.fresh(f"{name}/shape")
+        graph = renamed(graph, {name: inner})
+        rows = Node(target, "Const", value=np.array([-1, 1, int(shape[2])], np.int32))
+        turned = Node(name, "Reshape", (inner, target), origin=graph[inner].origin)
+        graph = Graph(topological([*graph.nodes, rows, turned]))
+        if model.batch is None:
+            notes.append(
+                "the source handles its memory rightly for one row only (a fault of ML-Agents 0.25); the export takes "
+                "any number of rows and is compared with the source row by row"
+            )
+    return graph, notes
 
 
 # ------------------------------------------------------------------ other trainers
@@ -151,11 +158,9 @@ def _with_rows_of_memory(model: OnnxModel) -> tuple[Graph, list[str]]:
 
 def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
     """Output node → role, by the names that other trainers use; by position where no name says anything."""
-    roles: dict[str, Role | None] = {}
     if _positional(model):
-        for node, role in zip(model.outputs.values(), (Role.ACTION, Role.VALUE, None), strict=False):
-            roles[node] = role
-        return roles
+        return dict(zip(model.outputs.values(), (Role.ACTION, Role.VALUE, None), strict=False))
+    roles: dict[str, Role | None] = {}
     for name, node in model.outputs.items():
         base = node.rpartition("/")[2].lower()
         known = OUTPUT_NAMES.get(base)

@@ -53,6 +53,7 @@ def array_of(tensor: Any) -> np.ndarray:
     count = math.prod(shape)
     if len(shape) > _MAX_AXES or any(d < 0 for d in shape):
         raise _damaged(name, f"its shape is {list(shape[:8])}")
+    array: np.ndarray
     if tensor.HasField("raw_data"):
         size = count * np.dtype(dtype).itemsize
         if len(tensor.raw_data) != size:

@@ -120,9 +120,7 @@ def _inlined(model: Any) -> Any:
     known = {kind for domain, kind in TABLE if not domain}
     used = {n.op_type for n in _all_nodes(model.graph) if n.domain in STANDARD}
     defined = [
-        ("", kind)
-        for kind in sorted(used - known)
-        if onnx.defs.has(kind) and _is_function(onnx.defs.get_schema(kind))
+        ("", kind) for kind in sorted(used - known) if onnx.defs.has(kind) and _is_function(onnx.defs.get_schema(kind))
     ]
     if not model.functions and not defined:
         return model
@@ -132,6 +130,8 @@ def _inlined(model: Any) -> Any:
         if defined:
             model = onnx.inliner.inline_selected_functions(model, defined, inline_schema_functions=True)
     except (RuntimeError, ValueError, onnx.checker.ValidationError) as error:
+        if not model.functions:
+            return model  # an op whose definition needs more than is known stays, and is refused by its name
         raise DamagedFileError(
             "the model's functions cannot be inlined",
             why=str(error).strip().splitlines()[0],
@@ -190,14 +190,16 @@ def _dims(value: Any) -> tuple[int | None, ...] | None:
 
 
 def _fixed_batch(declared: Sequence[Any]) -> int | None:
-    """The number of rows that all inputs were exported with, None where an input leaves it free.
+    """The number of rows that all inputs were exported with, None where an input leaves any length free.
 
     torch.onnx.export fixes every length that ``dynamic_axes`` does not name; Stable-Baselines3's and rsl_rl's recipes
     name none.
     """
-    leading = {dims[0] for dims in map(_dims, declared) if dims is not None and len(dims) > 1}
-    unknown = any(_dims(v) is None for v in declared)
-    return None if unknown or len(leading) != 1 else leading.pop()
+    shapes = [_dims(v) for v in declared]
+    if any(dims is None or None in dims for dims in shapes):
+        return None
+    leading = {dims[0] for dims in shapes if dims is not None and len(dims) > 1}
+    return leading.pop() if len(leading) == 1 else None
 
 
 def _input(raiser: Raiser, value: Any, batch: int | None) -> None:

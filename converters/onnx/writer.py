@@ -77,7 +77,7 @@ class _Builder:
         if key not in self._constants:
             name = self.fresh(f"{self._prefix}/{hint}" if self._prefix else hint)
             self._constants[key] = name
-            self.initializers.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+            self.initializers.append(self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
         return self._constants[key]
 
     def lower(self, node: Node) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.commands import ROOT, python
+from tests.commands import ROOT, fixture, python
 
 #: package → the packages of this project that it may import
 ALLOWED = {
@@ -109,3 +110,21 @@ def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
     code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
     assert python("-c", code).out.split() == ["False", "True"]
     assert "has no attribute 'nothing'" in python("-c", "import exporter; exporter.nothing").err
+
+
+def test_an_export_loads_neither_openssl_nor_numpy_random(tmp_path: Path) -> None:
+    """Each costs megabytes, and a cold export without verification needs none of them."""
+    script = (
+        "import sys\n"
+        "from exporter.cli import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
+        "print([m for m in ('_hashlib', 'numpy.random', 'tensorflow', 'onnxruntime') if m in sys.modules])"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script, fixture("continuous"), "-o", str(tmp_path), "--verify", "none"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ran.stdout.splitlines()[-1] == "[]"

@@ -21,7 +21,13 @@ def normaliser(graph: Graph, name: str) -> dict[str, object] | None:
         mean = graph.constant(node.inputs[1])
         for reader in graph.consumers()[node.name]:
             std = graph.constant(reader.inputs[1]) if reader.op == "RealDiv" else None
-            if mean is not None and std is not None and mean.ndim == 1 and np.all(np.isfinite(std)) and np.all(np.isfinite(mean)):
+            if (
+                mean is not None
+                and std is not None
+                and mean.ndim == 1
+                and np.all(np.isfinite(std))
+                and np.all(np.isfinite(mean))
+            ):
                 width = np.broadcast_shapes(mean.shape, std.shape)
                 return {
                     "kind": "normal",

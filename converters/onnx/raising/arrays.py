@@ -239,7 +239,7 @@ def _sliced(r: Raiser, x: str, bounds: Mapping[int, Sequence[int]], shape: Seque
         else:
             begin[axis] = start
         whole = stop >= _END or (isinstance(length, int) and stop >= length)
-        if (whole if step > 0 else stop < -_END or (isinstance(length, int) and stop < -length)):
+        if whole if step > 0 else stop < -_END or (isinstance(length, int) and stop < -length):
             end_mask |= 1 << axis
         else:
             end[axis] = stop

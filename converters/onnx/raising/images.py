@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +51,8 @@ def _window(op: Op, r: Raiser, x: str, size: Sequence[int]) -> _Window:
     strides, dilations = op.integers("strides", ones) or ones, op.integers("dilations", ones) or ones
     pads = op.integers("pads", (0,) * (2 * spatial)) or (0,) * (2 * spatial)
     auto_pad = op.text("auto_pad", "NOTSET")
-    if not len(strides) == len(dilations) == spatial or len(pads) != 2 * spatial or min(*size, *strides, *dilations) < 1:
+    fitting = len(strides) == len(dilations) == spatial and len(pads) == 2 * spatial
+    if not fitting or min(*size, *strides, *dilations) < 1:
         raise op.refused("its window, strides, dilations and pads do not fit together", "the model is damaged")
     pairs = tuple(zip(pads[:spatial], pads[spatial:], strict=True))
     if auto_pad == "VALID":
@@ -145,7 +147,7 @@ def _biased(op: Op, r: Raiser, value: str) -> str:
 def _convolved(op: Op, r: Raiser, image: str, kernel: np.ndarray, window: _Window, padding: str) -> str:
     """An NHWC image by a kernel [out, in per group, height, width]."""
     groups = op.integer("group", 1)
-    attrs = {
+    attrs: dict[str, Any] = {
         "strides": (1, *window.strides, 1),
         "dilations": (1, *window.dilations, 1),
         "padding": padding,
@@ -209,7 +211,7 @@ def _spread(op: Op, r: Raiser, image: str, axis: int, stride: int) -> str:
 # ------------------------------------------------------------------ pools
 
 
-def _pool_attrs(window: _Window, padding: str) -> dict[str, object]:
+def _pool_attrs(window: _Window, padding: str) -> dict[str, Any]:
     return {"ksize": (1, *window.size, 1), "strides": (1, *window.strides, 1), "padding": padding}
 
 

@@ -165,7 +165,7 @@ def _plain(kind: str) -> Callable[[Raiser, str, list[int], bool], str]:
 
 
 def _log_sum_exp(r: Raiser, x: str, axes: list[int], keep: bool) -> str:
-    """log Σ exp(x), the largest element taken out first (zero where all are −∞, as onnxruntime does)."""
+    """The logarithm of Σ exp(x), the largest element taken out first (zero where all are −∞, as onnxruntime does)."""
     top = r.reduce("Max", x, axes, keep=True)
     finite = r.add("Less", [r.add("Abs", [top]), r.number(top, np.inf)])
     top = r.add("Select", [finite, top, r.add("ZerosLike", [top])])

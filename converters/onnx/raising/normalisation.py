@@ -52,7 +52,7 @@ def _layer(op: Op, r: Raiser) -> list[str | None]:
 
 
 def _rms(op: Op, r: Raiser) -> str:
-    """x/√(mean(x²) + ε)·scale over the axes from ``axis`` on (opset 23)."""
+    """Elements as x/√(mean(x²) + ε)·scale over the axes from ``axis`` on (opset 23)."""
     x = op.need(0)
     axes = range(r.axis(op, x, op.integer("axis", -1)), r.rank(op, x))
     mean = r.reduce("Mean", r.add("Square", [x]), axes, keep=True)
@@ -70,8 +70,25 @@ def _instance(op: Op, r: Raiser) -> str:
     return r.add("Add", [r.add("Mul", [value, scale]), bias])
 
 
+def _group(op: Op, r: Raiser) -> str:
+    """Groups of channels, each over its own pixels. Scale and bias are per group in opset 18, per channel later."""
+    x = op.need(0)
+    dims = r.shape(op, x)
+    groups, channels = op.integer("num_groups", 1), r.length(op, x, 1)
+    if groups < 1 or channels % groups:
+        raise op.refused(f"it has {groups} groups for {channels} channels", "the model is damaged")
+    split = r.reshape(x, (dims[0], groups, -1))
+    value, _, _ = _standardised(r, split, [2], op.number("epsilon", 1e-5))
+    per_group = r.length(op, op.need(1), 0) != channels
+    shape = (1, groups, 1) if per_group else (1, -1, *(1,) * (len(dims) - 2))
+    scale, bias = (r.reshape(op.need(i), shape) for i in (1, 2))
+    if per_group:
+        return r.reshape(r.add("Add", [r.add("Mul", [value, scale]), bias]), dims)
+    return r.add("Add", [r.add("Mul", [r.reshape(value, dims), scale]), bias])
+
+
 def _length(op: Op, r: Raiser) -> str:
-    """x divided by its norm along an axis."""
+    """Elements divided by their norm along an axis."""
     x, p = op.need(0), op.integer("p", 2)
     axis = [r.axis(op, x, op.integer("axis", -1))]
     if p == 1:
@@ -86,5 +103,6 @@ OPS: Mapping[str, Raise] = {
     "LayerNormalization": _layer,
     "RMSNormalization": _rms,
     "InstanceNormalization": _instance,
+    "GroupNormalization": _group,
     "LpNormalization": _length,
 }

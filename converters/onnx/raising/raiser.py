@@ -28,7 +28,7 @@ _MAX_NODES = 1 << 16
 
 
 def node_name(value: str) -> str:
-    """An ONNX value's name as TensorFlow allows a node to be called ([A-Za-z0-9.][A-Za-z0-9_.\\-/]*).
+    """An ONNX value's name as TensorFlow allows a node to be called: [A-Za-z0-9.] and then _ - and / too.
 
     The suffix ``:0`` of tensors that tf2onnx converted goes, ``:1`` becomes ``_1``.
     """

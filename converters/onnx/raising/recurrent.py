@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from converters.graph.types import FLOAT32, Dim
 from converters.onnx.raising.node import Op, Raise
 from converters.onnx.raising.raiser import Raiser
@@ -68,7 +70,7 @@ def _rows_of(op: Op, r: Raiser, position: int, step: _Step) -> str | None:
 
 
 def _zeros(r: Raiser, step: _Step) -> str:
-    return r.add("Fill", [r.vector([step.rows, step.hidden]), r.const(FLOAT32.type(0), "zero")])
+    return r.add("Fill", [r.vector([step.rows, step.hidden]), r.const(np.zeros((), FLOAT32), "zero")])
 
 
 def _weights(op: Op, r: Raiser, position: int, parts: Sequence[slice] | None = None) -> list[str]:
@@ -114,10 +116,10 @@ def _gates(r: Raiser, value: str, count: int) -> list[str]:
 
 
 def _lstm(op: Op, r: Raiser) -> list[str | None]:
-    """c' = f·c + i·tanh(g), h' = o·tanh(c')."""
+    """The cell: c' = f·c + i·tanh(g), h' = o·tanh(c')."""
     step = _step(op, r)
     peepholes = op.get(7)
-    if peepholes is not None and (r.known(peepholes) is None or r.known(peepholes).any()):  # type: ignore[union-attr]
+    if peepholes is not None and r.needed_constant(op, peepholes, "what its gates see of the cell").any():
         raise op.refused("it has peepholes", "no trainer writes such a layer")
     (kernel,), (inner,) = _weights(op, r, 1), _weights(op, r, 2)
     total = r.add("MatMul", [step.x, kernel])
@@ -136,7 +138,7 @@ def _lstm(op: Op, r: Raiser) -> list[str | None]:
 
 
 def _gru(op: Op, r: Raiser) -> list[str | None]:
-    """h' = (1 − z)·tanh(…) + z·h; ``linear_before_reset`` (PyTorch) resets after the product."""
+    """The state: h' = (1 − z)·tanh(…) + z·h; ``linear_before_reset`` (PyTorch) resets after the product."""
     step = _step(op, r)
     size = step.hidden
     cuts = [slice(i * size, (i + 1) * size) for i in range(3)]
@@ -146,9 +148,7 @@ def _gru(op: Op, r: Raiser) -> list[str | None]:
     of_x: list[str | None] = [*biases[0]] if biases else [None] * 3
     of_h: list[str | None] = [*biases[1]] if biases else [None] * 3
     inputs = [_product(r, step.x, k, b) for k, b in zip(kernels, of_x, strict=True)]
-    z, reset = (
-        r.add("Sigmoid", [r.add("Add", [inputs[i], _product(r, h, inner[i], of_h[i])])]) for i in range(2)
-    )
+    z, reset = (r.add("Sigmoid", [r.add("Add", [inputs[i], _product(r, h, inner[i], of_h[i])])]) for i in range(2))
     if op.integer("linear_before_reset", 0):
         state = r.add("Mul", [reset, _product(r, h, inner[2], of_h[2])])
     else:
@@ -159,7 +159,7 @@ def _gru(op: Op, r: Raiser) -> list[str | None]:
 
 
 def _rnn(op: Op, r: Raiser) -> list[str | None]:
-    """h' = tanh(x·W + h·R + b)."""
+    """The state: h' = tanh(x·W + h·R + b)."""
     step = _step(op, r)
     (kernel,), (inner,) = _weights(op, r, 1), _weights(op, r, 2)
     total = r.add("MatMul", [step.x, kernel])

@@ -1,0 +1,68 @@
+"""What is made of ONNX models runs in the TensorFlow of 2017 and 2018, which had no attention and no hybrid actions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.artifact import WriteOptions
+from converters.frozen_graph.writer import write
+from converters.graph.run import run_graph
+from converters.runner.process import RuntimeProcess
+from exporter.parity.compare import compare, floored
+from exporter.parity.tolerances import Tolerance
+from exporter.sources import read_source
+from fixtures.sb3 import FOLDER, POLICIES
+from signatures.errors import RuntimeUnavailableError
+from signatures.roles import Role
+from signatures.sampling import draw_cases
+from tests.corpus.conftest import SHARED
+from tests.legacy.runtime import WHEELS, legacy_process, unsupported_reason
+
+pytestmark = [pytest.mark.legacy, pytest.mark.slow]
+
+SOURCES = [*(FOLDER / f"{n}.onnx" for n in POLICIES), *sorted(SHARED.glob("corpus/onnx/*.onnx"))]
+#: Log-probabilities of classes that are next to impossible follow from differences of large logits.
+CLOSE = Tolerance(5e-4, 1e-5)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(v, id=f"tf{v}", marks=pytest.mark.xdist_group(f"tf{v}")) for v in WHEELS],
+)
+def legacy(request: pytest.FixtureRequest) -> Iterator[RuntimeProcess]:
+    reason = unsupported_reason()
+    if reason is not None:
+        pytest.skip(reason)
+    try:
+        process = legacy_process(request.param)
+    except RuntimeUnavailableError as error:
+        pytest.skip(f"{error.what}: {error.why}")
+    with process:
+        yield process
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem[:80])
+def test_runs_there_and_agrees(source: Path, legacy: RuntimeProcess, tmp_path: Path) -> None:
+    (policy,) = read_source(source).policies()
+    artifact = write(policy, WriteOptions("{}"))
+    path = tmp_path / "policy.bytes"
+    path.write_bytes(artifact.files[artifact.main])
+    model = legacy.load(str(path))
+    outputs = [s for s in policy.signature.outputs if s.role is not Role.SAMPLED]
+    for case in draw_cases(policy.signature):
+        names = [s.name for s in outputs]
+        got, wanted = model.run(case.feeds, names), run_graph(policy.graph, case.feeds, names)
+        for spec in outputs:
+            pair = [wanted[spec.name], got[spec.name]]
+            if spec.role is Role.LOG_PROBS:
+                pair = [floored(a, policy.signature.branches) for a in pair]
+            if pair[0].dtype.kind == "f":
+                difference = compare(*pair, CLOSE)
+                assert difference.passed, f"{case.name}: {spec.name}: {difference}"
+            else:  # a tie may fall either way
+                assert np.mean(pair[0] == pair[1]) > 0.8
+    model.unload()

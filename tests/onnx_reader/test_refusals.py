@@ -1,0 +1,278 @@
+"""What cannot be converted is refused with the node, the op and what to do; what is damaged is called damaged."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, numpy_helper
+
+from converters.onnx.reader import read_onnx
+from exporter.sources import read_source
+from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
+from tests.onnx_reader.models import Array, constant, declared, floats, helper, model, node, read, save
+
+X = {"x": (np.float32, ["batch", 4])}
+SEQUENCE = {"x": (np.float32, [3, "batch", 4])}
+KERNELS = {"w": floats(1, 8, 4), "r": floats(1, 8, 2), "b": floats(1, 16)}
+
+
+def body(kind: str) -> Any:
+    return helper.make_graph([node(kind, ["x"], "out")], "body", [], [declared("out", np.float32, ["batch", 4])])
+
+
+REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array], str]] = {
+    "an unknown op": ([node("Det", ["x"])], X, {}, r"Det \(node 'y'\): no entry of the raising table"),
+    "another domain": (
+        [node("Gelu", ["x"], domain="com.microsoft")], X, {}, r"Gelu of com\.microsoft \(node 'y'\): its domain",
+    ),
+    "a branch that is not known": (
+        [
+            node("ReduceMax", ["x"], "m", keepdims=0), constant("zero", 0), node("Greater", ["m", "zero"], "c"),
+            node("If", ["c"], "y", then_branch=body("Relu"), else_branch=body("Neg")),
+        ], X, {}, "its condition is not known",
+    ),
+    "a layer over several steps": (
+        [node("LSTM", ["x", "w", "r", "b"], hidden_size=2)], SEQUENCE, KERNELS, "it runs over 3 steps",
+    ),
+    "two directions": (
+        [node("LSTM", ["x", "w", "r"], hidden_size=2, direction="bidirectional")],
+        {"x": (np.float32, [1, "batch", 4])}, {"w": floats(2, 8, 4), "r": floats(2, 8, 2)}, "bidirectional",
+    ),
+    "other activations": (
+        [node("LSTM", ["x", "w", "r"], hidden_size=2, activations=["Relu", "Tanh", "Tanh"])],
+        {"x": (np.float32, [1, "batch", 4])}, KERNELS, "its activations are relu",
+    ),
+    "statistics of the batch": (
+        [node("BatchNormalization", ["x", "s", "b", "m", "v"], training_mode=1)], X,
+        {k: np.ones(4, np.float32) for k in "sbmv"}, "training mode",
+    ),
+    "several best": ([constant("k", [2], np.int64), node("TopK", ["x", "k"], ["y", "i"])], X, {}, "k is 2"),
+    "the last of equals": ([node("ArgMax", ["x"], axis=1, select_last_index=1)], X, {}, "last of equal"),
+    "a padding by reflection": (
+        [constant("p", [0, 1, 0, 1], np.int64), node("Pad", ["x", "p"], mode="reflect")], X, {}, "'reflect'",
+    ),
+    "where values decide how many": ([node("NonZero", ["x"])], X, {}, "computed while the graph runs"),
+    "strings": ([node("Constant", [], "s", value_string="x"), node("Add", ["x", "s"])], X, {}, "no numbers"),
+    "half precision": (
+        [node("Cast", ["x"], "h", to=TensorProto.FLOAT16), node("Cast", ["h"], to=TensorProto.FLOAT)], X, {},
+        "data type",
+    ),
+    "an equation with traces": ([node("Einsum", ["x"], equation="bb->b")], {"x": (np.float32, [4, 4])}, {}, "plain"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused(what: str, tmp_path: Path) -> None:
+    nodes, inputs, constants, text = REFUSED[what]
+    message = model(nodes, inputs, ["y"], constants, domains={"com.microsoft": 1})
+    with pytest.raises(UnsupportedOpError, match=text) as caught:
+        read(message, tmp_path)
+    assert caught.value.issues
+    assert caught.value.fix
+
+
+def test_all_ops_that_are_not_known_are_named(tmp_path: Path) -> None:
+    message = model([node("Det", ["x"], "a"), node("Unique", ["a"], "b"), node("Relu", ["b"])], X)
+    with pytest.raises(UnsupportedOpError, match=r"also: Unique") as caught:
+        read(message, tmp_path)
+    assert [op for _, op in caught.value.issues] == ["Det", "Unique"]
+
+
+def test_an_output_that_no_policy_needs_is_left_out(tmp_path: Path) -> None:
+    message = model([node("Det", ["x"], "other"), node("Relu", ["x"], "action")], X, ["other", "action"])
+    found = read(message, tmp_path)
+    assert list(found.outputs) == ["action"]
+    assert "Det" in found.left_out["other"]
+    (policy,) = read_source(tmp_path / "model.onnx").policies()
+    assert any("the output other is left out" in note for note in policy.signature.notes)
+
+
+def test_an_old_opset_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(UnsupportedOpError, match="opset 6") as caught:
+        read(model([node("Relu", ["x"])], X, opset=6), tmp_path)
+    assert "version_converter" in str(caught.value)
+
+
+def test_doubles_in_between_are_narrowed(tmp_path: Path) -> None:
+    message = model(
+        [
+            node("Cast", ["x"], "wide", to=TensorProto.DOUBLE),
+            node("Mul", ["wide", "c"], "p"),
+            node("Cast", ["p"], "action", to=1),
+        ],
+        X,
+        ["action"],
+        {"c": np.array([0.1], np.float64)},
+    )
+    assert read(message, tmp_path).doubles
+    (policy,) = read_source(tmp_path / "model.onnx").policies()
+    assert any("float64" in note for note in policy.signature.notes)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16])
+def test_an_input_of_another_float_is_refused(dtype: Any, tmp_path: Path) -> None:
+    message = model([node("Cast", ["x"], to=1)], {"x": (dtype, ["batch", 4])})
+    with pytest.raises(NotAPolicyError, match="float32"):
+        read(message, tmp_path)
+
+
+# ------------------------------------------------------------------ damage
+
+
+def small() -> Any:
+    return model(
+        [node("Gemm", ["x", "w", "b"], "h"), node("Tanh", ["h"], "action")],
+        {"x": (np.float32, ["batch", 4])},
+        {"action": (np.float32, ["batch", 2])},
+        {"w": floats(4, 2), "b": floats(2)},
+    )
+
+
+def test_a_file_cut_anywhere_is_refused(tmp_path: Path) -> None:
+    data = small().SerializeToString()
+    for length in range(0, len(data), 3):
+        path = tmp_path / "cut.onnx"
+        path.write_bytes(data[:length])
+        with pytest.raises(ExportModelError):
+            read_source(path).policies()
+
+
+def test_bytes_changed_at_random_never_end_in_a_traceback(tmp_path: Path) -> None:
+    data = small().SerializeToString()
+    chance = random.Random(5)
+    path = tmp_path / "changed.onnx"
+    for _ in range(300):
+        changed = bytearray(data)
+        for _ in range(chance.randrange(1, 4)):
+            changed[chance.randrange(len(data))] = chance.randrange(256)
+        path.write_bytes(bytes(changed))
+        try:
+            read_source(path).policies()
+        except ExportModelError as error:
+            assert error.exit_status == 2
+
+
+def changed(change: Any) -> Any:
+    message = small()
+    change(message.graph)
+    return message
+
+
+def dangling(graph: Any) -> None:
+    graph.node[0].input[0] = "nowhere"
+
+
+def twice(graph: Any) -> None:
+    graph.node[0].output[0] = "action"
+    graph.node[1].input[0] = "action"
+
+
+def no_output(graph: Any) -> None:
+    graph.output[0].name = "nowhere"
+
+
+def two_inputs(graph: Any) -> None:
+    graph.input.append(graph.input[0])
+
+
+def short_data(graph: Any) -> None:
+    graph.initializer[0].raw_data = graph.initializer[0].raw_data[:-4]
+
+
+def huge_dims(graph: Any) -> None:
+    graph.initializer[0].dims[:] = [1 << 40, 1 << 40]
+
+
+def negative_dims(graph: Any) -> None:
+    graph.initializer[0].dims[0] = -4
+
+
+DAMAGE = (dangling, twice, no_output, two_inputs, short_data, huge_dims, negative_dims)
+
+
+@pytest.mark.parametrize("change", DAMAGE, ids=lambda change: change.__name__)
+def test_damage_is_called_so(change: Any, tmp_path: Path) -> None:
+    with pytest.raises(DamagedFileError):
+        read(changed(change), tmp_path)
+
+
+def test_a_small_file_cannot_ask_for_much_memory(tmp_path: Path) -> None:
+    message = model(
+        [
+            constant("s", [1 << 20, 1 << 20], np.int64),
+            node("ConstantOfShape", ["s"], "c"),
+            node("MatMul", ["x", "c"], "action"),
+        ],
+        {"x": (np.float32, ["batch", 1 << 20])},
+        ["action"],
+    )
+    read(message, tmp_path)  # nothing that large is made
+
+
+def test_no_nodes(tmp_path: Path) -> None:
+    path = tmp_path / "empty.onnx"
+    path.write_bytes(onnx.ModelProto(ir_version=8).SerializeToString())
+    with pytest.raises(NotAPolicyError):
+        read_onnx(path)
+
+
+# ------------------------------------------------------------------ external data
+
+
+def external(folder: Path, location: str, offset: int = 0, length: int | None = None) -> Path:
+    message = small()
+    tensor = message.graph.initializer[0]
+    data = numpy_helper.to_array(tensor).tobytes()
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    for key, value in (("location", location), ("offset", offset), ("length", length or len(data))):
+        tensor.external_data.add(key=key, value=str(value))
+    (folder / "weights.data").write_bytes(bytes(offset) + data)
+    return save(message, folder)
+
+
+@pytest.mark.parametrize("offset", [0, 64])
+def test_weights_beside_the_model_are_read(offset: int, tmp_path: Path) -> None:
+    path = external(tmp_path, "weights.data", offset)
+    source = read_source(path)
+    weights = next(n for n in source.models[0].graph.nodes if n.origin == "w")
+    np.testing.assert_array_equal(weights.value, floats(4, 2))
+    assert set(source.models[0].files) == {path, tmp_path / "weights.data"}
+
+
+@pytest.mark.parametrize(
+    "location", ["../weights.data", "/etc/passwd", "", "sub/../../weights.data", ".", "missing.data", "a\0b"]
+)
+def test_weights_outside_of_the_folder_are_refused(location: str, tmp_path: Path) -> None:
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    (tmp_path / "weights.data").write_bytes(bytes(64))
+    with pytest.raises(DamagedFileError, match=r"folder|not there"):
+        read_onnx(external(folder, location))
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    (tmp_path / "secret").write_bytes(bytes(64))
+    path = external(folder, "link.data")
+    (folder / "link.data").symlink_to(tmp_path / "secret")
+    with pytest.raises(DamagedFileError, match="outside"):
+        read_onnx(path)
+
+
+@pytest.mark.parametrize(("offset", "length"), [(0, 4096), (4096, 32), (-8, 32)])
+def test_weights_that_are_too_short_are_refused(offset: int, length: int, tmp_path: Path) -> None:
+    path = external(tmp_path, "weights.data", 0, length)
+    message = onnx.ModelProto.FromString(path.read_bytes())
+    entry = next(e for e in message.graph.initializer[0].external_data if e.key == "offset")
+    entry.value = str(offset)
+    save(message, tmp_path)
+    with pytest.raises(DamagedFileError):
+        read_onnx(path)
