@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import ROOT, fixture, python
+import fixtures
+from tests.commands import ROOT, python
 
 #: package → the packages of this project that it may import
 ALLOWED = {
@@ -121,7 +122,7 @@ def test_an_export_loads_neither_openssl_nor_numpy_random(tmp_path: Path) -> Non
         "print([m for m in ('_hashlib', 'numpy.random', 'tensorflow', 'onnxruntime') if m in sys.modules])"
     )
     ran = subprocess.run(
-        [sys.executable, "-c", script, fixture("continuous"), "-o", str(tmp_path), "--verify", "none"],
+        [sys.executable, "-c", script, str(fixtures.path("continuous")), "-o", str(tmp_path), "--verify", "none"],
         cwd=ROOT,
         capture_output=True,
         text=True,
