@@ -41,7 +41,7 @@ KINDS = {
             "a Barracuda .nn model",
             "the frozen_graph_def.pb or .bytes from the same training run can be exported; look in models/ or results/",
         ),
-        FileKind("onnx", "an ONNX model", "it is a target of this tool already; a TensorFlow source is needed"),
+        FileKind("onnx", "an ONNX model"),
         FileKind("saved_model", "a SavedModel"),
         FileKind("meta_graph", "a checkpoint's graph (.meta)"),
         FileKind("raw_graph", "a graph with variables, as training begins with (raw_graph_def.pb)"),

@@ -11,6 +11,7 @@ import numpy as np
 
 from converters.graph.types import Dim
 from converters.onnx.proto import array_of, load_external, tensors
+from converters.onnx.raising.drafting import MAX_NODES
 from converters.onnx.raising.node import DTYPES, STANDARD
 from converters.onnx.raising.raiser import Raiser, joined_errors
 from converters.onnx.raising.table import TABLE
@@ -124,6 +125,7 @@ def _inlined(model: Any) -> Any:
     ]
     if not model.functions and not defined:
         return model
+    _check_unfolding(model)
     try:
         if model.functions:
             model = onnx.inliner.inline_local_functions(model)
@@ -138,6 +140,32 @@ def _inlined(model: Any) -> Any:
             fix="export it with functions inlined (onnx.inliner.inline_local_functions)",
         ) from error
     return model
+
+
+def _check_unfolding(model: Any) -> None:
+    """Functions that call functions that call functions may unfold a small file to any size: refuse before."""
+    functions = {(f.domain, f.name): f for f in model.functions}
+    sizes: dict[tuple[str, str], int] = {}
+
+    def size(nodes: Sequence[Any], callers: frozenset[tuple[str, str]]) -> int:
+        total = 0
+        for node in nodes:
+            key = (node.domain, node.op_type)
+            if key in callers:
+                raise DamagedFileError(f"the function {node.op_type!r} calls itself", fix="export the model again")
+            if key in functions and key not in sizes:
+                sizes[key] = size(_all_nodes(functions[key]), callers | {key})
+            total += sizes.get(key, 1)
+            if total > MAX_NODES:
+                raise UnsupportedOpError(
+                    f"the model's functions unfold to more than {MAX_NODES} nodes",
+                    issues=[(node.name, node.op_type)],
+                    why="a policy has some hundreds",
+                    fix="give the policy alone, without the training part",
+                )
+        return total
+
+    size(_all_nodes(model.graph), frozenset())
 
 
 def _is_function(schema: Any) -> bool:

@@ -63,6 +63,23 @@ REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array
         [node("Cast", ["x"], "h", to=TensorProto.FLOAT16), node("Cast", ["h"], to=TensorProto.FLOAT)], X, {},
         "data type",
     ),
+    "counting without end": (
+        [
+            constant("a", 0, np.int64), constant("b", 1 << 40, np.int64), constant("d", 1, np.int64),
+            node("Range", ["a", "b", "d"], "r"), node("Shape", ["r"]),
+        ], X, {}, "it counts from",
+    ),
+    "more parts than outputs": ([node("Split", ["x"], axis=1, num_outputs=1 << 40)], X, {}, "parts for 1 outputs"),
+    "indices of the largest": (
+        [node("MaxPool", ["x"], ["m", "i"], kernel_shape=[2]), node("Cast", ["i"], to=1)],
+        {"x": (np.float32, ["batch", 2, 8])}, {}, "its output 'i' is not made",
+    ),
+    "a loop": (
+        [
+            constant("n", 3, np.int64), constant("c", True, np.bool_),
+            node("Loop", ["n", "c", "x"], "y", body=helper.make_graph([], "body", [], [])),
+        ], X, {}, "it is a loop",
+    ),
     "an equation with traces": ([node("Einsum", ["x"], equation="bb->b")], {"x": (np.float32, [4, 4])}, {}, "plain"),
 }  # fmt: skip
 
@@ -91,6 +108,12 @@ def test_an_output_that_no_policy_needs_is_left_out(tmp_path: Path) -> None:
     assert "Det" in found.left_out["other"]
     (policy,) = read_source(tmp_path / "model.onnx").policies()
     assert any("the output other is left out" in note for note in policy.signature.notes)
+
+
+def test_strings_that_no_policy_needs_are_no_matter(tmp_path: Path) -> None:
+    text = helper.make_tensor("t", TensorProto.STRING, [1], [b"a name"])
+    message = model([node("Constant", [], "label", value=text), node("Relu", ["x"], "action")], X, ["action"])
+    assert list(read(message, tmp_path).outputs) == ["action"]
 
 
 def test_an_old_opset_is_refused_with_the_remedy(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.graph.ops.convolution import window_padding
 from converters.graph.types import FLOAT32
-from converters.onnx.raising.arrays import padded
+from converters.onnx.raising.cutting import padded
 from converters.onnx.raising.node import Op, Raise
 from converters.onnx.raising.raiser import Raiser
 

@@ -1,8 +1,4 @@
-"""The graph in the making: what raising functions build with.
-
-Types are inferred as nodes are added (the op table's rules), so that a function can ask for ranks, lengths and known
-values: half of ONNX's ops are told apart by them.
-"""
+"""ONNX nodes into a draft, one by one: values get names, what cannot be converted breaks what depends on it."""
 
 from __future__ import annotations
 
@@ -13,18 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.ops.base import REQUIRED
-from converters.graph.ops.table import TABLE
-from converters.graph.shapes import Types, add_types
-from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
+from converters.graph.types import FLOAT32, TensorType
 from converters.onnx.proto import array_of, attribute_of
-from converters.onnx.raising.node import Op, Raise
+from converters.onnx.raising.drafting import Draft
+from converters.onnx.raising.fixed_rows import FixedRows
+from converters.onnx.raising.node import STANDARD, Op, Raise
 from signatures.errors import DamagedFileError, UnsupportedOpError
-from signatures.graph import Graph, NameScope, Node, TensorShape, node_of, ref, topological
-
-#: Ops whose result depends on shapes, not on values.
-_SHAPE_OPS = frozenset(("Shape", "Size", "Rank"))
-_MAX_NODES = 1 << 16
+from signatures.graph import Graph, NameScope, Node, TensorShape, topological
 
 
 def node_name(value: str) -> str:
@@ -37,12 +28,12 @@ def node_name(value: str) -> str:
     return name or "value"
 
 
-class Raiser:
-    """Collects nodes for the new graph; see the module.
+class Raiser(Draft):
+    """The draft of a model; see the module.
 
     ``opsets`` is the version of each domain, ``reserved`` the values whose names are kept as they are (inputs and
     outputs). ``batch`` is the number of rows that a model was exported for, where that is fixed: its first axes are
-    freed, and shapes that begin with that number are read as beginning with the batch.
+    freed, and shapes that hold the number are read accordingly (``fixed_rows.py``).
     """
 
     def __init__(
@@ -52,11 +43,14 @@ class Raiser:
         reserved: Sequence[str],
         batch: int | None = None,
     ) -> None:
+        own = NameScope(())
+        self._reserved = {value: own.fresh(node_name(value)) for value in dict.fromkeys(reserved)}
+        super().__init__(NameScope(self._reserved.values()))
         self.table = table
         self.opsets = opsets
         self.batch = batch
-        self.nodes: list[Node] = []
-        self.types: Types = {}
+        self.fixed = None if batch is None else FixedRows(batch, self.symbols)
+        #: ONNX value → tensor
         self.values: dict[str, str] = {}
         #: ONNX value → why it could not be made
         self.broken: dict[str, UnsupportedOpError] = {}
@@ -64,46 +58,10 @@ class Raiser:
         self.draws: list[str] = []
         #: whether a recurrent layer takes its memory in a form that is right for one row only
         self.one_row = False
-        self.symbols = Symbols()
-        own = NameScope(())
-        self._reserved = {value: own.fresh(node_name(value)) for value in dict.fromkeys(reserved)}
-        self._names = NameScope(self._reserved.values())
-        self._position: dict[str, int] = {}
-        #: tensors whose value depends on what is assumed of an input
-        self._tainted: set[str] = set()
-        self._lengths: dict[str, str] = {}
+        #: nodes that stand for a value
         self._bound: set[str] = set()
-        self._constants: dict[tuple[Any, ...], str] = {}
         #: where the nodes of an inlined body go, empty for the model's own
         self._scope = ""
-        self._prefix = ""
-
-    # ------------------------------------------------------------------ new nodes
-
-    def add(self, op: str, inputs: Sequence[str], name: str = "", **attrs: Any) -> str:
-        """A new node with the op's default attributes; returns its output 0."""
-        defaults = {a.name: a.default for a in TABLE[op].attrs if a.derive is None and a.default is not REQUIRED}
-        fresh = self._names.fresh(f"{self._prefix}/{name or op}" if self._prefix else name or op)
-        return self._append(Node(fresh, op, tuple(inputs), {**defaults, **attrs}))
-
-    def const(self, array: np.ndarray, name: str = "const") -> str:
-        """A constant; equal small ones of one ONNX node share a node."""
-        array = np.asarray(array)
-        key = (self._prefix, array.dtype.str, array.shape, array.tobytes()) if array.size <= 64 else None
-        if key is not None and key in self._constants:
-            return self._constants[key]
-        made = self._append(Node(self._names.fresh(f"{self._prefix}/{name}"), "Const", value=array))
-        if key is not None:
-            self._constants[key] = made
-        return made
-
-    def ints(self, numbers: Sequence[int] | int, name: str = "const") -> str:
-        """An int32 constant: a vector, or a scalar."""
-        return self.const(np.array(numbers, INT32), name)
-
-    def number(self, like: str, value: float, name: str = "const") -> str:
-        """A scalar constant of the dtype of ``like``."""
-        return self.const(np.array(value, self.dtype(like)), name)
 
     def draw(self, op: str, inputs: Sequence[str], value: str) -> str:
         """A sampler of N(0, 1), which carries the name of the ONNX value that is drawn."""
@@ -113,225 +71,19 @@ class Raiser:
             self.nodes[-1] = replace(self.nodes[-1], origin=value)
         return made
 
-    def _append(self, node: Node) -> str:
-        if len(self.nodes) > _MAX_NODES:
-            raise UnsupportedOpError(
-                f"the model unfolds to more than {_MAX_NODES} nodes",
-                why="a policy has some hundreds",
-                fix="give the policy alone, without the training part",
-            )
-        add_types(self.types, node, self.symbols)
-        if node.op not in _SHAPE_OPS and any(r in self._tainted for r in node.inputs):
-            self._tainted.update(ref(node.name, i) for i in range(self.outputs(node.name)))
-        self._position[node.name] = len(self.nodes)
-        self.nodes.append(node)
-        return node.name
-
-    def outputs(self, name: str) -> int:
-        """How many outputs a node has."""
-        count = 1
-        while ref(name, count) in self.types:
-            count += 1
-        return count
-
-    # ------------------------------------------------------------------ what is known of a tensor
-
-    def type_of(self, reference: str) -> TensorType:
-        """dtype, shape and value as far as they are known."""
-        return self.types[reference]
-
-    def dtype(self, reference: str) -> np.dtype:
-        """The dtype of a tensor."""
-        return self.types[reference].dtype
-
-    def is_float(self, reference: str) -> bool:
-        """Whether a tensor holds floats."""
-        return self.types[reference].dtype.kind == "f"
-
-    def constant(self, reference: str) -> np.ndarray | None:
-        """The value of a tensor that is the same in every run."""
-        return None if reference in self._tainted else self.types[reference].constant
-
-    def known(self, reference: str) -> np.ndarray | None:
-        """The value of a tensor under what is assumed of the inputs (``sequence_length`` is 1)."""
-        return self.types[reference].constant
-
-    def producer(self, reference: str) -> Node:
-        """The node that makes a tensor, looked for behind identities."""
-        node = self.nodes[self._position[node_of(reference)]]
-        while node.op == "Identity":
-            node = self.nodes[self._position[node_of(node.inputs[0])]]
-        return node
-
-    def needed_constant(self, op: Op, reference: str, meaning: str) -> np.ndarray:
-        """The value of an operand that must be known; raises UnsupportedOpError."""
-        value = self.known(reference)
-        if value is None:
-            raise op.refused(
-                f"{meaning} is computed while the graph runs",
-                f"{meaning} must be known before, in every target",
-                "if it depends on an input with one value, give it: --set NAME=VALUE; else export the model with "
-                "fixed sizes",
-            )
-        return value
-
-    def shape(self, op: Op, reference: str) -> tuple[Dim, ...]:
-        """The shape of a tensor; raises UnsupportedOpError where not even its rank is known."""
-        shape = self.types[reference].shape
-        if shape is None:
-            raise op.refused("the rank of an input is not known", "its meaning depends on the rank")
-        return shape
-
-    def rank(self, op: Op, reference: str) -> int:
-        """The number of axes of a tensor; raises UnsupportedOpError."""
-        return len(self.shape(op, reference))
-
-    def length(self, op: Op, reference: str, axis: int) -> int:
-        """The length of an axis that must be a number; raises UnsupportedOpError."""
-        size = self.shape(op, reference)[axis]
-        if not isinstance(size, int):
-            raise op.refused(f"the length of axis {axis} is not known", "it must be a number before the graph runs")
-        return size
-
-    def axis(self, op: Op, reference: str, axis: int) -> int:
-        """A possibly negative axis as a positive one; raises UnsupportedOpError."""
-        rank = self.rank(op, reference)
-        if not -rank <= axis < max(rank, 1):
-            raise op.refused(f"axis {axis} is outside of {rank} axes", "the model is damaged")
-        return axis % max(rank, 1)
-
-    # ------------------------------------------------------------------ small building blocks
-
-    def vector(self, dims: Sequence[Dim], *, open_axis: bool = False) -> str:
-        """An int32 shape vector. With ``open_axis`` a single symbol is written -1, for Reshape."""
-        names = [d for d in dims if isinstance(d, str)]
-        if not names or (open_axis and len(names) == 1 and -1 not in dims and 0 not in dims):
-            return self.ints([-1 if isinstance(d, str) else d for d in dims], "shape")
-        parts = [self.length_of(d) if isinstance(d, str) else self.ints(d, "length") for d in dims]
-        return self.add("Pack", parts, "shape", axis=0)
-
-    def length_of(self, symbol: str) -> str:
-        """A scalar: the length that a symbol stands for, taken from a tensor that has it."""
-        if symbol not in self._lengths:
-            for reference, kind in self.types.items():
-                if kind.shape is not None and symbol in kind.shape:
-                    shape = self.add("Shape", [reference], "lengths", out_type=INT32)
-                    self._lengths[symbol] = self.element(shape, kind.shape.index(symbol))
-                    break
-            else:
-                raise UnsupportedOpError(f"the length {symbol} is not known before the graph runs", issues=[])
-        return self._lengths[symbol]
-
-    def element(self, vector: str, index: int) -> str:
-        """``vector[index]`` as a scalar."""
-        return self.add(
-            "StridedSlice",
-            [vector, self.ints([index], "begin"), self.ints([index + 1], "end"), self.ints([1], "step")],
-            "element",
-            shrink_axis_mask=1,
-        )
-
-    def reshape(self, reference: str, dims: Sequence[Dim]) -> str:
-        """The same elements under another shape (symbols allowed, -1 for one open axis)."""
-        made = self.add("Reshape", [reference, self.vector(dims, open_axis=True)])
-        if -1 not in dims:  # which symbol an open axis is, is known here
-            self.types[made] = replace(self.types[made], shape=tuple(dims))
-        return made
-
-    def transpose(self, reference: str, permutation: Sequence[int]) -> str:
-        """Axes in another order; the result itself where the order is the same."""
-        if list(permutation) == sorted(permutation):
-            return reference
-        value = self.constant(reference)
-        if value is not None:
-            return self.const(np.ascontiguousarray(value.transpose(permutation)), "transposed")
-        return self.add("Transpose", [reference, self.ints(list(permutation), "perm")])
-
-    def expand_dims(self, reference: str, axis: int) -> str:
-        """A new axis of length 1."""
-        return self.add("ExpandDims", [reference, self.ints(axis, "axis")])
-
-    def squeeze(self, reference: str, axes: Sequence[int]) -> str:
-        """Without the axes of length 1 at ``axes``."""
-        return self.add("Squeeze", [reference], squeeze_dims=tuple(axes)) if axes else reference
-
-    def cast(self, reference: str, dtype: np.dtype) -> str:
-        """The tensor in another dtype."""
-        return reference if self.dtype(reference) == dtype else self.add("Cast", [reference], DstT=np.dtype(dtype))
-
-    def shape_operand(self, reference: str) -> str:
-        """A shape or index vector as int32: a constant where it is one (TensorFlow.js has no int64)."""
-        value = self.constant(reference)
-        if value is not None:
-            return self.const(np.clip(value, -(2**31), 2**31 - 1).astype(INT32), "operand")
-        return self.cast(reference, INT32)
-
-    def slice(self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1) -> str:
-        """``x[..., start:stop:step]`` at one axis."""
-        begin, end, steps = [0] * (axis + 1), [0] * (axis + 1), [1] * (axis + 1)
-        masks = (1 << axis) - 1
-        begin[axis], end[axis], steps[axis] = start or 0, stop or 0, step
-        return self.add(
-            "StridedSlice",
-            [reference, self.ints(begin, "begin"), self.ints(end, "end"), self.ints(steps, "steps")],
-            begin_mask=masks | (1 << axis if start is None else 0),
-            end_mask=masks | (1 << axis if stop is None else 0),
-        )
-
-    def concat(self, parts: Sequence[str], axis: int) -> str:
-        """Joined along an axis."""
-        return parts[0] if len(parts) == 1 else self.add("ConcatV2", [*parts, self.ints(axis, "axis")])
-
-    def reduce(self, kind: str, reference: str, axes: Sequence[int], *, keep: bool) -> str:
-        """Sum, Mean, Max, Min or Prod over axes."""
-        return self.add(kind, [reference, self.ints(list(axes), "axes")], keep_dims=keep)
-
-    def broadcast(self, reference: str, dims: Sequence[Dim]) -> str:
-        """The tensor repeated to a shape it broadcasts to. BroadcastTo came with TF 1.12; Tile was always there."""
-        shape = self.types[reference].shape
-        assert shape is not None
-        if len(shape) < len(dims):
-            shape = (1,) * (len(dims) - len(shape)) + shape
-            reference = self.reshape(reference, shape)
-        counts: list[Dim] = [d if s == 1 else 1 for s, d in zip(shape, dims, strict=True)]
-        return reference if all(c == 1 for c in counts) else self.add("Tile", [reference, self.vector(counts)])
-
-    def where(self, op: Op, condition: str, a: str, b: str) -> str:
-        """``condition ? a : b``, broadcast."""
-        shapes = [self.shape(op, r) for r in (condition, a, b)]
-        if shapes[0] == shapes[1] == shapes[2]:
-            return self.add("Select", [condition, a, b])
-        if self.is_float(a):
-            return self.add("SelectV2", [condition, a, b])
-        dims = self.joined(op, shapes)
-        return self.add("Select", [self.broadcast(r, dims) for r in (condition, a, b)])
-
-    def joined(self, op: Op, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
-        """The shape that several broadcast to; raises UnsupportedOpError where they do not."""
-        dims: tuple[Dim, ...] | None = ()
-        for shape in shapes:
-            try:
-                dims = broadcast(dims, shape, self.symbols)
-            except ValueError as error:
-                raise op.refused(str(error), "the model is damaged") from error
-        assert dims is not None
-        return dims
-
-    # ------------------------------------------------------------------ ONNX values
-
     def placeholder(self, value: str, dtype: np.dtype, shape: TensorShape, assumed: np.ndarray | None = None) -> str:
         """An input of the model. ``assumed`` is the value that it has in every run of a policy."""
         node = Node(self._reserved[value], "Placeholder", attrs={"dtype": dtype, "shape": shape}, origin=value)
-        self._append(node)
+        self.append(node)
         if assumed is not None:
             self.types[node.name] = TensorType(dtype, tuple(assumed.shape), assumed)
-            self._tainted.add(node.name)
+            self.tainted.add(node.name)
         self.values[value] = node.name
         return node.name
 
     def initializer(self, value: str, array: np.ndarray) -> None:
         """A constant of the model, or of a body that is being inlined."""
-        self.values[value] = self._append(Node(self._name_for(value), "Const", value=array, origin=self._origin(value)))
+        self.values[value] = self.append(Node(self._name_for(value), "Const", value=array, origin=self._origin(value)))
 
     def raise_node(self, op: Op, names: Sequence[str]) -> None:
         """Make what an ONNX node becomes, and let its values (``names`` are the ones it reads) stand for it.
@@ -346,7 +98,7 @@ class Raiser:
             self._break(op, joined_errors([*self._causes(op, missing), *errors]))
             return
         target = next((o for o in op.outputs if o), op.name)
-        self._prefix = self._scope + (self._reserved.get(target) or node_name(target))
+        self.prefix = self._scope + (self._reserved.get(target) or node_name(target))
         try:
             results = function(op, self)
         except UnsupportedOpError as error:
@@ -356,6 +108,8 @@ class Raiser:
         bound = [(v, m) for v, m in zip(op.outputs, made, strict=False) if v and m is not None]
         for value, result in bound:
             self.bind(value, result, rename=len(bound) == 1)
+        for value in (v for v in op.outputs if v and v not in self.values):
+            self.broken[value] = op.refused(f"its output {value!r} is not made", "no policy reads it")
 
     def bind(self, value: str, reference: str, *, rename: bool = False) -> None:
         """Let a node that is called after ``value`` (and carries its name as origin) stand for it.
@@ -371,15 +125,15 @@ class Raiser:
         if rename and reference == last.name and last.origin in (None, origin) and self._may_rename(last):
             self._rename_last(name, origin)
         else:
-            at = self._position.get(reference)
+            at = self.position.get(reference)
             if at is not None and self.nodes[at].origin is None and self.nodes[at].op != "Const":
                 self.nodes[at] = replace(self.nodes[at], origin=origin)
-            self._append(Node(name, "Identity", (reference,), origin=origin))
+            self.append(Node(name, "Identity", (reference,), origin=origin))
         self.values[value] = name
         self._bound.add(name)
 
     def _may_rename(self, node: Node) -> bool:
-        if node.op in ("Placeholder", "Const") or node.name in self._bound or node.name in self._lengths.values():
+        if node.op in ("Placeholder", "Const") or node.name in self._bound or node.name in self.lengths.values():
             return False
         return self.outputs(node.name) == 1
 
@@ -387,15 +141,15 @@ class Raiser:
         """The usual case: a function's last node is the result, so it takes the value's name itself."""
         last = self.nodes[-1]
         self.nodes[-1] = replace(last, name=name, origin=origin)
-        self._position[name] = self._position.pop(last.name)
+        self.position[name] = self.position.pop(last.name)
         self.types[name] = self.types.pop(last.name)
-        if last.name in self._tainted:
-            self._tainted.add(name)
+        if last.name in self.tainted:
+            self.tainted.add(name)
 
     def _name_for(self, value: str) -> str:
         if not self._scope and value in self._reserved:
             return self._reserved[value]
-        return self._names.fresh(self._scope + node_name(value))
+        return self.names.fresh(self._scope + node_name(value))
 
     def _origin(self, value: str) -> str | None:
         """Values inside a body have no name that could be asked for from outside."""
@@ -403,9 +157,9 @@ class Raiser:
 
     def inline(self, op: Op, body: Any, bindings: Mapping[str, str]) -> list[str]:
         """The nodes of a body, run once where ``op`` stands; returns its outputs."""
-        outer = (self.values, self._scope, self._prefix)
+        outer = (self.values, self._scope, self.prefix)
         self.values = {**self.values, **bindings}
-        self._scope = f"{self._prefix}/"
+        self._scope = f"{self.prefix}/"
         try:
             for tensor in body.initializer:
                 self.initializer(tensor.name, array_of(tensor))
@@ -416,24 +170,22 @@ class Raiser:
                 raise joined_errors(self._causes(op, missing))
             return [self.values[n] for n in names]
         finally:
-            self.values, self._scope, self._prefix = outer
+            self.values, self._scope, self.prefix = outer
 
     def run(self, protos: Iterable[Any]) -> None:
         """Raise nodes in their order."""
         for proto in protos:
             names = list(proto.input)
             inputs = tuple(self.values.get(n) if n else None for n in names)
-            version = self.opsets.get("" if proto.domain == "ai.onnx" else proto.domain, 0)
-            op = Op(
-                proto.op_type,
-                proto.domain,
-                proto.name or next((o for o in proto.output if o), "?"),
-                version,
-                inputs,
-                {a.name: attribute_of(a) for a in proto.attribute},
-                tuple(proto.output),
-            )
-            self.raise_node(op, names)
+            version = self.opsets.get("" if proto.domain in STANDARD else proto.domain, 0)
+            name = proto.name or next((o for o in proto.output if o), "?")
+            op = Op(proto.op_type, proto.domain, name, version, inputs, {}, tuple(proto.output))
+            try:
+                op = replace(op, attrs={a.name: attribute_of(a) for a in proto.attribute})
+            except UnsupportedOpError as error:
+                self._break(op, error)
+            else:
+                self.raise_node(op, names)
 
     def _causes(self, op: Op, missing: Sequence[str]) -> list[UnsupportedOpError]:
         """Why values are missing; raises DamagedFileError where nothing makes them."""
@@ -468,7 +220,7 @@ def joined_errors(errors: Sequence[UnsupportedOpError]) -> UnsupportedOpError:
 
 
 def _unknown(op: Op) -> tuple[str, str, str]:
-    if op.domain not in ("", "ai.onnx"):
+    if op.domain not in STANDARD:
         return (
             "its domain is not ONNX's own",
             "ops of other domains are private to one runtime",

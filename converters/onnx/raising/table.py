@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from converters.onnx.raising import arrays, chance, elementwise, flow, images, linear, normalisation, recurrent
+from converters.onnx.raising import arrays, chance, cutting, elementwise, flow, images, linear, normalisation, recurrent
 from converters.onnx.raising.node import Raise
 
 
 def _table() -> Mapping[tuple[str, str], Raise]:
     table: dict[tuple[str, str], Raise] = {}
-    for module in (elementwise, linear, arrays, images, normalisation, recurrent, chance, flow):
+    for module in (elementwise, linear, arrays, cutting, images, normalisation, recurrent, chance, flow):
         for kind, function in module.OPS.items():
             if ("", kind) in table:
                 raise ValueError(f"{kind} stands twice in the table")

@@ -1,0 +1,276 @@
+"""The graph in the making: what raising functions build with.
+
+Types are inferred as nodes are added (the op table's rules), so that a function can ask for ranks, lengths and known
+values: half of ONNX's ops are told apart by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from converters.graph.ops.base import REQUIRED
+from converters.graph.ops.table import TABLE
+from converters.graph.shapes import Types, add_types
+from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast
+from converters.onnx.raising.node import Op
+from signatures.errors import UnsupportedOpError
+from signatures.graph import NameScope, Node, node_of, ref
+
+#: Ops whose result depends on shapes, not on values.
+_SHAPE_OPS = frozenset(("Shape", "Size", "Rank"))
+#: A policy has some hundreds.
+MAX_NODES = 1 << 16
+_SHARED_CONSTANT = 64
+
+
+class Draft:
+    """Nodes and their types; see the module. ``names`` hands out the names of nodes."""
+
+    def __init__(self, names: NameScope) -> None:
+        self.nodes: list[Node] = []
+        self.types: Types = {}
+        self.symbols = Symbols()
+        self.names = names
+        #: what the names of new nodes begin with
+        self.prefix = ""
+        #: tensors whose value depends on what is assumed of an input
+        self.tainted: set[str] = set()
+        self.position: dict[str, int] = {}
+        self.lengths: dict[str, str] = {}
+        self._constants: dict[tuple[Any, ...], str] = {}
+
+    # ------------------------------------------------------------------ new nodes
+
+    def add(self, op: str, inputs: Sequence[str], name: str = "", **attrs: Any) -> str:
+        """A new node with the op's default attributes; returns its output 0."""
+        defaults = {a.name: a.default for a in TABLE[op].attrs if a.derive is None and a.default is not REQUIRED}
+        fresh = self.names.fresh(f"{self.prefix}/{name or op}" if self.prefix else name or op)
+        return self.append(Node(fresh, op, tuple(inputs), {**defaults, **attrs}))
+
+    def const(self, array: np.ndarray, name: str = "const") -> str:
+        """A constant; equal small ones of one ONNX node share a node."""
+        array = np.asarray(array)
+        key = (self.prefix, array.dtype.str, array.shape, array.tobytes()) if array.size <= _SHARED_CONSTANT else None
+        if key is not None and key in self._constants:
+            return self._constants[key]
+        made = self.append(Node(self.names.fresh(f"{self.prefix}/{name}"), "Const", value=array))
+        if key is not None:
+            self._constants[key] = made
+        return made
+
+    def ints(self, numbers: Sequence[int] | int, name: str = "const") -> str:
+        """An int32 constant: a vector, or a scalar."""
+        return self.const(np.array(numbers, INT32), name)
+
+    def number(self, like: str, value: float, name: str = "const") -> str:
+        """A scalar constant of the dtype of ``like``."""
+        return self.const(np.array(value, self.dtype(like)), name)
+
+    def append(self, node: Node) -> str:
+        """Take a node in, and infer what it gives; returns its output 0."""
+        if len(self.nodes) > MAX_NODES:
+            raise UnsupportedOpError(
+                f"the model unfolds to more than {MAX_NODES} nodes",
+                why="a policy has some hundreds",
+                fix="give the policy alone, without the training part",
+            )
+        add_types(self.types, node, self.symbols)
+        if node.op not in _SHAPE_OPS and any(r in self.tainted for r in node.inputs):
+            self.tainted.update(ref(node.name, i) for i in range(self.outputs(node.name)))
+        self.position[node.name] = len(self.nodes)
+        self.nodes.append(node)
+        return node.name
+
+    def outputs(self, name: str) -> int:
+        """How many outputs a node has."""
+        count = 1
+        while ref(name, count) in self.types:
+            count += 1
+        return count
+
+    # ------------------------------------------------------------------ what is known of a tensor
+
+    def type_of(self, reference: str) -> TensorType:
+        """dtype, shape and value as far as they are known."""
+        return self.types[reference]
+
+    def dtype(self, reference: str) -> np.dtype:
+        """The dtype of a tensor."""
+        return self.types[reference].dtype
+
+    def is_float(self, reference: str) -> bool:
+        """Whether a tensor holds floats."""
+        return self.types[reference].dtype.kind == "f"
+
+    def constant(self, reference: str) -> np.ndarray | None:
+        """The value of a tensor that is the same in every run."""
+        return None if reference in self.tainted else self.types[reference].constant
+
+    def known(self, reference: str) -> np.ndarray | None:
+        """The value of a tensor under what is assumed of the inputs (``sequence_length`` is 1)."""
+        return self.types[reference].constant
+
+    def producer(self, reference: str) -> Node:
+        """The node that makes a tensor, looked for behind identities."""
+        node = self.nodes[self.position[node_of(reference)]]
+        while node.op == "Identity":
+            node = self.nodes[self.position[node_of(node.inputs[0])]]
+        return node
+
+    def needed_constant(self, op: Op, reference: str, meaning: str) -> np.ndarray:
+        """The value of an operand that must be known; raises UnsupportedOpError."""
+        value = self.known(reference)
+        if value is None:
+            raise op.refused(
+                f"{meaning} is computed while the graph runs",
+                f"{meaning} must be known before, in every target",
+                "if it depends on an input with one value, give it: --set NAME=VALUE; else export the model with "
+                "fixed sizes",
+            )
+        return value
+
+    def shape(self, op: Op, reference: str) -> tuple[Dim, ...]:
+        """The shape of a tensor; raises UnsupportedOpError where not even its rank is known."""
+        shape = self.types[reference].shape
+        if shape is None:
+            raise op.refused("the rank of an input is not known", "its meaning depends on the rank")
+        return shape
+
+    def rank(self, op: Op, reference: str) -> int:
+        """The number of axes of a tensor; raises UnsupportedOpError."""
+        return len(self.shape(op, reference))
+
+    def length(self, op: Op, reference: str, axis: int) -> int:
+        """The length of an axis that must be a number; raises UnsupportedOpError."""
+        size = self.shape(op, reference)[axis]
+        if not isinstance(size, int):
+            raise op.refused(f"the length of axis {axis} is not known", "it must be a number before the graph runs")
+        return size
+
+    def axis(self, op: Op, reference: str, axis: int) -> int:
+        """A possibly negative axis as a positive one; raises UnsupportedOpError."""
+        rank = self.rank(op, reference)
+        if not -rank <= axis < max(rank, 1):
+            raise op.refused(f"axis {axis} is outside of {rank} axes", "the model is damaged")
+        return axis % max(rank, 1)
+
+    # ------------------------------------------------------------------ small building blocks
+
+    def vector(self, dims: Sequence[Dim], *, open_axis: bool = False) -> str:
+        """An int32 shape vector. With ``open_axis`` a single symbol is written -1, for Reshape."""
+        names = [d for d in dims if isinstance(d, str)]
+        if not names or (open_axis and len(names) == 1 and -1 not in dims and 0 not in dims):
+            return self.ints([-1 if isinstance(d, str) else d for d in dims], "shape")
+        parts = [self.length_of(d) if isinstance(d, str) else self.ints(d, "length") for d in dims]
+        return self.add("Pack", parts, "shape", axis=0)
+
+    def length_of(self, symbol: str) -> str:
+        """A scalar: the length that a symbol stands for, taken from a tensor that has it."""
+        if symbol not in self.lengths:
+            for reference, kind in self.types.items():
+                if kind.shape is not None and symbol in kind.shape:
+                    shape = self.add("Shape", [reference], "lengths", out_type=INT32)
+                    self.lengths[symbol] = self.element(shape, kind.shape.index(symbol))
+                    break
+            else:
+                raise UnsupportedOpError(f"the length {symbol} is not known before the graph runs", issues=[])
+        return self.lengths[symbol]
+
+    def element(self, vector: str, index: int) -> str:
+        """``vector[index]`` as a scalar."""
+        return self.add(
+            "StridedSlice",
+            [vector, self.ints([index], "begin"), self.ints([index + 1], "end"), self.ints([1], "step")],
+            "element",
+            shrink_axis_mask=1,
+        )
+
+    def reshape(self, reference: str, dims: Sequence[Dim]) -> str:
+        """The same elements under another shape (symbols allowed, -1 for one open axis)."""
+        made = self.add("Reshape", [reference, self.vector(dims, open_axis=True)])
+        if -1 not in dims:  # which symbol an open axis is, is known here
+            self.types[made] = replace(self.types[made], shape=tuple(dims))
+        return made
+
+    def transpose(self, reference: str, permutation: Sequence[int]) -> str:
+        """Axes in another order; the result itself where the order is the same."""
+        if list(permutation) == sorted(permutation):
+            return reference
+        value = self.constant(reference)
+        if value is not None:
+            return self.const(np.ascontiguousarray(value.transpose(permutation)), "transposed")
+        return self.add("Transpose", [reference, self.ints(list(permutation), "perm")])
+
+    def expand_dims(self, reference: str, axis: int) -> str:
+        """A new axis of length 1."""
+        return self.add("ExpandDims", [reference, self.ints(axis, "axis")])
+
+    def squeeze(self, reference: str, axes: Sequence[int]) -> str:
+        """Without the axes of length 1 at ``axes``."""
+        return self.add("Squeeze", [reference], squeeze_dims=tuple(axes)) if axes else reference
+
+    def cast(self, reference: str, dtype: np.dtype) -> str:
+        """The tensor in another dtype."""
+        return reference if self.dtype(reference) == dtype else self.add("Cast", [reference], DstT=np.dtype(dtype))
+
+    def shape_operand(self, reference: str) -> str:
+        """A shape or index vector as int32: a constant where it is one (TensorFlow.js has no int64)."""
+        value = self.constant(reference)
+        if value is not None:
+            return self.const(np.clip(value, -(2**31), 2**31 - 1).astype(INT32), "operand")
+        return self.cast(reference, INT32)
+
+    def slice(self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1) -> str:
+        """``x[..., start:stop:step]`` at one axis."""
+        begin, end, steps = [0] * (axis + 1), [0] * (axis + 1), [1] * (axis + 1)
+        masks = (1 << axis) - 1
+        begin[axis], end[axis], steps[axis] = start or 0, stop or 0, step
+        return self.add(
+            "StridedSlice",
+            [reference, self.ints(begin, "begin"), self.ints(end, "end"), self.ints(steps, "steps")],
+            begin_mask=masks | (1 << axis if start is None else 0),
+            end_mask=masks | (1 << axis if stop is None else 0),
+        )
+
+    def concat(self, parts: Sequence[str], axis: int) -> str:
+        """Joined along an axis."""
+        return parts[0] if len(parts) == 1 else self.add("ConcatV2", [*parts, self.ints(axis, "axis")])
+
+    def reduce(self, kind: str, reference: str, axes: Sequence[int], *, keep: bool) -> str:
+        """Sum, Mean, Max, Min or Prod over axes."""
+        return self.add(kind, [reference, self.ints(list(axes), "axes")], keep_dims=keep)
+
+    def broadcast(self, reference: str, dims: Sequence[Dim]) -> str:
+        """The tensor repeated to a shape it broadcasts to. BroadcastTo came with TF 1.12; Tile was always there."""
+        shape = self.types[reference].shape
+        assert shape is not None
+        if len(shape) < len(dims):
+            shape = (1,) * (len(dims) - len(shape)) + shape
+            reference = self.reshape(reference, shape)
+        counts: list[Dim] = [d if s == 1 else 1 for s, d in zip(shape, dims, strict=True)]
+        return reference if all(c == 1 for c in counts) else self.add("Tile", [reference, self.vector(counts)])
+
+    def where(self, op: Op, condition: str, a: str, b: str) -> str:
+        """``condition ? a : b``, broadcast."""
+        shapes = [self.shape(op, r) for r in (condition, a, b)]
+        if shapes[0] == shapes[1] == shapes[2]:
+            return self.add("Select", [condition, a, b])
+        if self.is_float(a):
+            return self.add("SelectV2", [condition, a, b])
+        dims = self.joined(op, shapes)
+        return self.add("Select", [self.broadcast(r, dims) for r in (condition, a, b)])
+
+    def joined(self, op: Op, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
+        """The shape that several broadcast to; raises UnsupportedOpError where they do not."""
+        dims: tuple[Dim, ...] | None = ()
+        for shape in shapes:
+            try:
+                dims = broadcast(dims, shape, self.symbols)
+            except ValueError as error:
+                raise op.refused(str(error), "the model is damaged") from error
+        assert dims is not None
+        return dims
