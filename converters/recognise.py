@@ -36,11 +36,7 @@ KINDS = {
     kind.key: kind
     for kind in (
         FROZEN_GRAPH,
-        FileKind(
-            "nn",
-            "a Barracuda .nn model",
-            "the frozen_graph_def.pb or .bytes from the same training run can be exported; look in models/ or results/",
-        ),
+        FileKind("nn", "a Barracuda .nn model"),
         FileKind("onnx", "an ONNX model"),
         FileKind("saved_model", "a SavedModel"),
         FileKind("meta_graph", "a checkpoint's graph (.meta)"),
