@@ -34,15 +34,6 @@ class Original:
         #: an action without chance → the action it belongs to
         self.plain = {s.name: head for s, head in zip(plain, self.heads, strict=False)}
 
-    @property
-    def outputs(self) -> list[str]:
-        """The outputs it can answer for."""
-        names = [name for name in self.source.fetches if not self._drawn(name)]
-        for spec in self.signature.outputs:
-            if spec.name not in names and self._derivable(spec):
-                names.append(spec.name)
-        return names
-
     def _drawn(self, name: str) -> bool:
         return self.signature.output(name).role is Role.SAMPLED
 
@@ -64,7 +55,7 @@ class Original:
         return bool(self.source.branches) and all(b is not None for b in self.source.branches)
 
     def run(self, feeds: Arrays) -> dict[str, np.ndarray]:
-        """All ``outputs`` for one set of canonical inputs."""
+        """Every output it can answer for, for one set of canonical inputs."""
         wanted = self.source.rows
         count = self.signature.rows(feeds)
         if wanted is None or wanted == count:
