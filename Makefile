@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-JS := converters/tfjs/js
+JS := converters/runner/js
 PYTEST := $(BIN)/python -m pytest
 
 .PHONY: install demo test lint types bench clean help

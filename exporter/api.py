@@ -11,7 +11,7 @@ from converters.registry import TARGETS
 from converters.source import ReadOptions
 from exporter.inspection import Inspection, inspect_source
 from exporter.parity.report import ParityReport
-from exporter.parity.verify import VerifyOptions
+from exporter.parity.subject import VerifyOptions
 from exporter.pipeline import ExportOptions, ExportResult, export, verify_folder
 from signatures.errors import ParityError, UsageError
 from signatures.roles import Role, parse_role

@@ -17,7 +17,7 @@ from signatures.errors import ExportModelError, UsageError
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
     from exporter.parity.report import ParityReport
-    from exporter.parity.verify import VerifyOptions
+    from exporter.parity.subject import VerifyOptions
     from exporter.pipeline import ExportResult
 
 _TARGETS = "bytes,saved_model,tfjs,onnx"
@@ -99,8 +99,8 @@ def _parity_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _verify_options(seed: int, samples: int, steps: int, atol: float, rtol: float) -> VerifyOptions:
+    from exporter.parity.subject import VerifyOptions
     from exporter.parity.tolerances import Tolerance
-    from exporter.parity.verify import VerifyOptions
 
     return VerifyOptions(seed, samples, steps, Tolerance(atol, rtol))
 
@@ -364,15 +364,19 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
 @runtimes_command.command("install")
 @click.argument("name")
 def install_command(name: str) -> None:
-    """Install a runtime: tfjs puts the locked npm packages into the user's cache folder."""
-    from exporter.runtimes import available_runtimes, install_tfjs
+    """Install a runtime into the user's cache folder; "tfjs" and "tf1" stand for all whose names begin so."""
+    from exporter.runtimes import RUNTIMES
 
-    if name in ("tfjs", "tfjs-cpu", "tfjs-wasm"):
-        install_tfjs(lambda text: click.echo(text))
+    chosen = [r for r in RUNTIMES if r.name == name or r.name.startswith((f"{name}-", f"{name}."))]
+    steps = list(dict.fromkeys(r.install for r in chosen if r.install is not None))
+    if steps:
+        for install in steps:
+            install(lambda text: click.echo(text))
         return
-    how = {i.name: i.how for i in available_runtimes()}.get(name)
+    how = {r.name: r.find().how for r in chosen}.get(name)
     raise UsageError(
-        f"runtimes install {name}: only tfjs is installed by this command",
+        f"runtimes install {name}: "
+        + ("there is no such runtime" if how is None else "this command does not install it"),
         fix=how or "export-model runtimes lists the runtimes and how to install each",
     )
 

@@ -21,7 +21,8 @@ from converters.source import OriginalRun, ReadOptions, SourceModel
 from exporter import bundle
 from exporter.parity.pool import RuntimePool, chosen_runtimes
 from exporter.parity.report import ParityReport
-from exporter.parity.verify import Subject, VerifyOptions, verify
+from exporter.parity.subject import Subject, VerifyOptions
+from exporter.parity.verify import verify
 from exporter.sources import Source, naming, read_source
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.graph import Graph

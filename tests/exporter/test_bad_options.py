@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from exporter import export_model as export_by_python
+from exporter.parity.subject import VerifyOptions
 from exporter.parity.tolerances import Tolerance
-from exporter.parity.verify import VerifyOptions
 from fixtures import path as fixture
 from signatures.errors import UsageError
 from tests.commands import export_model, files_in, is_refused, python

@@ -11,7 +11,7 @@ import exporter
 from exporter import export_model, inspect_model, verify_bundle
 from exporter.inspection import Inspection
 from exporter.parity.report import ParityReport
-from exporter.parity.verify import VerifyOptions
+from exporter.parity.subject import VerifyOptions
 from exporter.pipeline import ExportResult
 from fixtures import path as fixture
 from signatures.errors import (

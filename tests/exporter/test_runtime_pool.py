@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
 from converters.runner.process import RunFailedError
 from exporter.parity import pool as pools
 from exporter.parity.pool import INDEPENDENT, RuntimePool, chosen_runtimes
-from exporter.runtimes import RuntimeInfo
+from exporter.runtimes import RuntimeInfo, javascript
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
 
@@ -93,30 +95,28 @@ def test_a_process_that_died_is_started_again() -> None:
             again.run({}, ["action"])
 
 
-def test_a_runtime_that_does_not_start_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pools, "_command", lambda name: ["/nonexistent/python"])
-    with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="numpy did not start"):
+def test_a_runtime_that_does_not_start_is_unavailable() -> None:
+    commands = {"numpy": lambda: ["/nonexistent/python"]}
+    with RuntimePool(commands) as pool, pytest.raises(RuntimeUnavailableError, match="numpy did not start"):
         pool.process("numpy")
 
 
-def test_a_runtime_that_ends_at_once_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setattr(pools, "_command", lambda name: [sys.executable, "-c", "raise SystemExit('no such module')"])
-    with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="no such module"):
+def test_a_runtime_that_ends_at_once_is_unavailable() -> None:
+    commands = {"numpy": lambda: [sys.executable, "-c", "raise SystemExit('no such module')"]}
+    with RuntimePool(commands) as pool, pytest.raises(RuntimeUnavailableError, match="no such module"):
         pool.process("numpy")
 
 
 def test_without_node_tensorflow_js_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pools, "node_executable", lambda: None)
+    monkeypatch.setattr(javascript, "node_executable", lambda: None)
     with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="Node is not installed"):
         pool.process("tfjs-cpu")
 
 
 def test_tensorflow_js_runs_in_node_with_its_backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pools, "node_executable", lambda: "node")
+    monkeypatch.setattr(javascript, "node_executable", lambda: "node")
     monkeypatch.setenv("EXPORT_MODEL_JS", "/packages")
-    command = pools._command("tfjs-wasm")
+    command = javascript.TFJS_WASM.command()
     assert command[0] == "node"
     assert command[1].endswith("runner.mjs")
     assert command[2:] == ["--backend", "wasm", "--modules", "/packages"]

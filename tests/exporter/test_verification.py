@@ -12,8 +12,8 @@ import pytest
 from converters.graph.options import CompileOptions
 from exporter.parity.original import Original
 from exporter.parity.report import Comparison, ParityReport
+from exporter.parity.subject import VerifyOptions
 from exporter.parity.tolerances import Tolerance
-from exporter.parity.verify import VerifyOptions
 from exporter.pipeline import ExportResult
 from exporter.summary import failure_lines, not_run_lines, parity_table, verdict
 from fixtures import FIXTURES

@@ -98,7 +98,7 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
         f"export_model-{__version__}.dist-info",
     }
     for name in ("runner.mjs", "package.json", "package-lock.json"):
-        assert f"converters/tfjs/js/{name}" in names
+        assert f"converters/runner/js/{name}" in names
     strays = [n for n in names if "node_modules" in n or "__pycache__" in n or "/test" in n or n.endswith(".bytes")]
     assert not strays
     code = {str(p.relative_to(ROOT).as_posix()) for t in ("exporter", "converters", "signatures") for p in modules(t)}

@@ -34,7 +34,7 @@ import numpy as np
 from converters.runner.child import claim_stdout, serve
 from converters.runner.process import RuntimeProcess
 from converters.runner.wire import Tensors
-from exporter.runtimes import _cache_root
+from exporter.runtimes.cache import cache_folder
 from signatures.errors import RuntimeUnavailableError
 
 #: Version → sha256 of its wheel for CPython 3.6, manylinux1, x86-64.
@@ -84,7 +84,7 @@ def ensure_runtime(version: str) -> Path:
 
     Raises RuntimeUnavailableError.
     """
-    target = _cache_root() / "export-model" / f"tf-{version}"
+    target = cache_folder() / f"tf-{version}"
     if target.is_dir():
         return target
     reason = unsupported_reason()

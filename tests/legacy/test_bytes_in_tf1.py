@@ -18,7 +18,8 @@ from converters.graph.options import CompileOptions
 from converters.runner.process import RunFailedError, RuntimeProcess
 from exporter.parity.pool import RuntimePool
 from exporter.parity.report import Comparison
-from exporter.parity.verify import Subject, verify
+from exporter.parity.subject import Subject
+from exporter.parity.verify import verify
 from exporter.pipeline import ExportOptions, ExportResult, export
 from fixtures import FIXTURES, path
 from fixtures.goldens import read_npz

