@@ -49,11 +49,7 @@ KINDS = {
             "a Git LFS pointer, not the model itself",
             "run 'git lfs pull' in the repository it came from, or download the file through the web page",
         ),
-        FileKind(
-            "torch",
-            "a PyTorch checkpoint (.pt)",
-            "export ONNX from ML-Agents: mlagents-learn <config> --resume --run-id <id>, stop at once with Ctrl-C",
-        ),
+        FileKind("torch_checkpoint", "a PyTorch checkpoint (.pt)"),
         FileKind("keras", "a Keras model"),
         FileKind("hdf5", "a Keras model in HDF5 (.h5)"),
         FileKind("tflite", "a TensorFlow Lite model", "give the graph it was converted from"),
@@ -182,7 +178,7 @@ def _key(data: bytes, name: str) -> str:
     if head.startswith((b"UnityFS", b"UnityRaw", b"UnityWeb", b"%YAML 1.1\n%TAG !u!")) or b"%TAG !u!" in head[:64]:
         return "unity_asset"
     if head.startswith((b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")):
-        return "torch"
+        return "torch_checkpoint"
     if data.endswith(_TABLE_MAGIC):
         return "checkpoint"
     text = _text_key(data, head)
@@ -201,7 +197,7 @@ def _zip_key(data: bytes) -> str:
     except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, struct.error):  # a damaged one
         return "zip"
     if any(n.endswith("data.pkl") for n in names):
-        return "torch"
+        return "torch_checkpoint"
     if "model.weights.h5" in names or "config.json" in names:
         return "keras"
     return "zip"

@@ -34,6 +34,7 @@ READERS = MappingProxyType(
         "keras": "converters.saved_model.keras",
         "hdf5": "converters.saved_model.keras",
         "tfjs": "converters.tfjs.source",
+        "torch_checkpoint": "converters.torch_checkpoint.source",
         "bundle": "converters.bundle_source",
     }
 )

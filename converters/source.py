@@ -37,9 +37,12 @@ class SourceModel:
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """What a reader may be told: the checkpoint's step (None: the newest)."""
+    """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
+    order, images C, H, W (empty: as far as the source tells).
+    """
 
     step: int | None = None
+    sensors: tuple[tuple[int, ...], ...] = ()
 
 
 #: A reader takes the path (a file whose content was recognised, or a folder) and gives its models.

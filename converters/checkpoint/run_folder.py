@@ -26,25 +26,26 @@ def read(path: Path, options: ReadOptions) -> list[SourceModel]:
         if not kept:
             raise no_such_step(options.step, sorted({s for b in found for s in b.steps}))
         without = tuple(f"{b.name} has no checkpoint of step {options.step}" for b in found if b not in kept)
-        return [_with(m, None, without) for b in kept for m in _read(b, path, options.step)]
-    return [model for behavior in found for model in _read(behavior, path, None)]
+        return [_with(m, None, without) for b in kept for m in _read(b, path, options)]
+    return [model for behavior in found for model in _read(behavior, path, options)]
 
 
-def _read(behavior: Behavior, folder: Path, step: int | None) -> list[SourceModel]:
+def _read(behavior: Behavior, folder: Path, options: ReadOptions) -> list[SourceModel]:
     """The models of a behavior: one; one per final export where a folder of 0.1-0.5 has several of the same kind."""
+    step = options.step
     if step is None and behavior.finals:
         chosen = best(behavior.finals)
         notes = left_out([p.name for p in behavior.finals if p not in chosen] + [k.label for k in behavior.kept])
         models: list[SourceModel] = []
         for path in chosen:
             name = behavior.name if len(chosen) == 1 else path.stem
-            models.extend(_with(m, name, notes) for m in _file(path, folder))
+            models.extend(_with(m, name, notes) for m in _file(path, folder, options))
         return models
     kept = _newest(behavior, step)
     notes = left_out([p.name for p in behavior.finals] + [k.label for k in behavior.kept if k is not kept])
     if kept.suffix == ".index":
         return [read_checkpoint(kept.prefix, None, behavior.name, notes)]
-    return [_with(m, behavior.name, notes) for m in _file(kept.path, folder)]
+    return [_with(m, behavior.name, notes) for m in _file(kept.path, folder, options)]
 
 
 def _newest(behavior: Behavior, step: int | None) -> Kept:
@@ -57,7 +58,7 @@ def _newest(behavior: Behavior, step: int | None) -> Kept:
     return min(usable, key=lambda k: STEPPED.index(k.suffix))
 
 
-def _file(path: Path, folder: Path) -> list[SourceModel]:
+def _file(path: Path, folder: Path, options: ReadOptions) -> list[SourceModel]:
     """The models of one file, by the reader of what it is. Errors name it relative to the folder."""
     where = str(path.relative_to(folder))
     kind = recognise_path(path)
@@ -65,7 +66,7 @@ def _file(path: Path, folder: Path) -> list[SourceModel]:
     if read_file is None:
         raise not_readable(kind, Path(where))
     try:
-        return read_file(path, ReadOptions())
+        return read_file(path, replace(options, step=None))
     except ExportModelError as error:
         raise error.at(where) from error.__cause__
 

@@ -71,6 +71,11 @@ def array_of(tensor: Any) -> np.ndarray:
     return array
 
 
+def dtype_name(kind: int) -> str | None:
+    """A TensorProto.DataType by numpy's name; None for those that no policy has."""
+    return np.dtype(_STORED[kind][0]).name if kind in _STORED else None
+
+
 def _damaged(name: str, why: str) -> DamagedFileError:
     return DamagedFileError(
         f"the tensor {name!r} cannot be read", why=why, fix="export the model again; this file is damaged"

@@ -82,6 +82,17 @@ def read_model(path: Path) -> WebModel:
         raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
 
 
+def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
+    """(the signature, node → op) of a model.json, without its weights. Raises DamagedFileError."""
+    try:
+        model = json.loads(path.read_bytes())
+        signature = model.get("signature") or (model.get("userDefinedMetadata") or {}).get("signature") or {}
+        nodes = {str(n["name"]): str(n["op"]) for n in model["modelTopology"]["node"]}
+        return _signature(signature), nodes
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
+
+
 def _refuse_functions(topology: Mapping[str, Any]) -> None:
     names = {f["signature"]["name"] for f in topology["library"]["function"]}
     calls = [n for n in topology["node"] if n["op"] in names or n["op"] in ("While", "StatelessWhile", "If")]

@@ -1,0 +1,315 @@
+"""Pickles as data: a machine that knows plain containers and PyTorch's tensors, and calls nothing.
+
+A pickle is a program that may import and call anything, so the standard library's machine is not used: opcodes are
+taken apart by ``pickletools.genops`` (which runs nothing) and carried out here. The names that a pickle imports are
+looked up in a fixed table, whose entries make values of this module; any other name is refused by name. Opcodes:
+CPython Lib/pickletools.py; what torch.save writes: torch/serialization.py, torch/_utils.py, torch/storage.py.
+"""
+
+from __future__ import annotations
+
+import pickletools
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import IO, Any
+
+from signatures.errors import DamagedFileError, NotAPolicyError
+
+#: A checkpoint of ML-Agents has some thousands of opcodes; with a critic and an optimizer some ten thousands.
+MAX_OPCODES = 1 << 21
+#: Of a tensor: kernels of images have four, and no axis is longer than a file can be.
+MAX_AXES, MAX_LENGTH = 8, 1 << 31
+_FIX = "give a checkpoint as ML-Agents wrote it (checkpoint.pt, <behavior>-<step>.pt)"
+_MARK = object()
+_KEYS = (str, int, float, bool, type(None))
+
+
+@dataclass(frozen=True, slots=True)
+class StorageType:
+    """A class such as ``torch.FloatStorage``: which numbers a storage holds (numpy's name of their dtype)."""
+
+    dtype: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tensor:
+    """A tensor as it is pickled: a storage, where in it the tensor begins, and the steps along each axis (elements)."""
+
+    storage: Any
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Function:
+    """An imported name that may be called; ``make`` gets the arguments and gives a value of this module."""
+
+    name: str
+    make: Callable[[tuple[Any, ...]], Any]
+
+
+_STORAGES = {
+    "Float": "float32",
+    "Double": "float64",
+    "Half": "float16",
+    "BFloat16": "bfloat16",
+    "Long": "int64",
+    "Int": "int32",
+    "Short": "int16",
+    "Char": "int8",
+    "Byte": "uint8",
+    "Bool": "bool",
+}
+
+
+def unpickle(stream: IO[bytes], storage: Callable[[tuple[Any, ...]], Any]) -> Any:
+    """The value of one pickle; the stream stands behind it then.
+
+    ``storage`` makes what a persistent id stands for. Raises NotAPolicyError for a name that is not in the table,
+    DamagedFileError for a pickle that breaks the rules of its own format.
+    """
+    machine = _Machine(storage)
+    try:
+        with warnings.catch_warnings():  # of escapes in a damaged name, by pickletools
+            warnings.simplefilter("ignore")
+            for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+                if count > MAX_OPCODES:
+                    raise _damaged(f"its pickle has more than {MAX_OPCODES} opcodes")
+                if opcode.name == "STOP":
+                    return machine.pop()
+                machine.run(opcode.name, argument)
+    except (ValueError, IndexError, KeyError, OverflowError, TypeError, AttributeError) as error:
+        text = str(error).strip().splitlines()
+        raise _damaged(f"its pickle cannot be read: {text[0] if text else type(error).__name__}") from error
+    raise _damaged("its pickle has no end")
+
+
+class _Machine:
+    """The stack and the memo of a pickle."""
+
+    def __init__(self, storage: Callable[[tuple[Any, ...]], Any]) -> None:
+        self.storage = storage
+        self.stack: list[Any] = []
+        self.memo: dict[int, Any] = {}
+
+    def run(self, name: str, argument: Any) -> None:
+        """Carry out one opcode."""
+        if name in _IGNORED:
+            return
+        if name in _PUSHED:
+            self.stack.append(_PUSHED[name])
+        elif name in _ARGUMENT:
+            self.stack.append(argument)
+        elif name in _NEW:
+            self.stack.append(_NEW[name]())
+        else:
+            method = getattr(self, f"_{name.lower()}", None)
+            if method is None:
+                raise NotAPolicyError(
+                    f"its pickle asks for what no checkpoint needs (opcode {name})",
+                    why="only plain containers and tensors are built from a checkpoint; nothing in it is run",
+                    fix=_FIX,
+                )
+            method(argument)
+
+    def pop(self) -> Any:
+        """The top of the stack."""
+        value = self.stack.pop()
+        if value is _MARK:
+            raise _damaged("its pickle takes a mark for a value")
+        return value
+
+    def _items(self) -> list[Any]:
+        """What stands above the last mark, which goes too."""
+        for at in range(len(self.stack) - 1, -1, -1):
+            if self.stack[at] is _MARK:
+                found = self.stack[at + 1 :]
+                del self.stack[at:]
+                return found
+        raise _damaged("its pickle asks for a mark that is not there")
+
+    def _top(self, kind: type) -> Any:
+        if not isinstance(self.stack[-1], kind):
+            raise _damaged(f"its pickle fills something that is no {kind.__name__}")
+        return self.stack[-1]
+
+    # ------------------------------------------------------------------ containers
+
+    def _tuple(self, _: Any) -> None:
+        self.stack.append(tuple(self._items()))
+
+    def _tuple1(self, _: Any) -> None:
+        self._last(1)
+
+    def _tuple2(self, _: Any) -> None:
+        self._last(2)
+
+    def _tuple3(self, _: Any) -> None:
+        self._last(3)
+
+    def _last(self, count: int) -> None:
+        values = [self.pop() for _ in range(count)]
+        self.stack.append(tuple(reversed(values)))
+
+    def _list(self, _: Any) -> None:
+        self.stack.append(self._items())
+
+    def _append(self, _: Any) -> None:
+        value = self.pop()
+        self._top(list).append(value)
+
+    def _appends(self, _: Any) -> None:
+        values = self._items()
+        self._top(list).extend(values)
+
+    def _dict(self, _: Any) -> None:
+        items = self._items()
+        self.stack.append({})
+        self._fill(items)
+
+    def _setitem(self, _: Any) -> None:
+        value, key = self.pop(), self.pop()
+        self._fill([key, value])
+
+    def _setitems(self, _: Any) -> None:
+        self._fill(self._items())
+
+    def _fill(self, items: list[Any]) -> None:
+        target = self._top(dict)
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            if not isinstance(key, _KEYS):
+                raise _damaged(f"a key in its pickle is a {type(key).__name__}")
+            target[key] = value
+
+    # ------------------------------------------------------------------ memo and stack
+
+    def _pop(self, _: Any) -> None:
+        self.stack.pop()
+
+    def _pop_mark(self, _: Any) -> None:
+        self._items()
+
+    def _dup(self, _: Any) -> None:
+        self.stack.append(self.stack[-1])
+
+    def _put(self, index: int) -> None:
+        self.memo[index] = self.stack[-1]
+
+    _binput = _long_binput = _put
+
+    def _memoize(self, _: Any) -> None:
+        self.memo[len(self.memo)] = self.stack[-1]
+
+    def _get(self, index: int) -> None:
+        self.stack.append(self.memo[index])
+
+    _binget = _long_binget = _get
+
+    # ------------------------------------------------------------------ names and calls
+
+    def _global(self, argument: str) -> None:
+        module, _, name = argument.partition(" ")
+        self.stack.append(_named(module, name))
+
+    def _stack_global(self, _: Any) -> None:
+        name, module = self.pop(), self.pop()
+        if not isinstance(name, str) or not isinstance(module, str):
+            raise _damaged("its pickle imports something that has no name")
+        self.stack.append(_named(module, name))
+
+    _inst = _global
+
+    def _reduce(self, _: Any) -> None:
+        arguments, function = self.pop(), self.pop()
+        if not isinstance(function, _Function) or not isinstance(arguments, tuple):
+            raise _damaged("its pickle calls something that is no function")
+        self.stack.append(function.make(arguments))
+
+    def _build(self, _: Any) -> None:
+        """Attributes of a container: a state dictionary's ``_metadata``, which only PyTorch's loader looks at."""
+        self.pop()
+        self._top(dict)
+
+    def _binpersid(self, _: Any) -> None:
+        identity = self.pop()
+        if not isinstance(identity, tuple):
+            raise _damaged("a persistent id in its pickle is no tuple")
+        self.stack.append(self.storage(identity))
+
+
+_IGNORED = frozenset(("PROTO", "FRAME"))
+_PUSHED = {"MARK": _MARK, "NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+_NEW: dict[str, Callable[[], Any]] = {"EMPTY_LIST": list, "EMPTY_DICT": dict}
+_ARGUMENT = frozenset(
+    (
+        *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
+        *("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
+    )
+)
+
+
+# ------------------------------------------------------------------ the names that are known
+
+
+def _ordered_dict(arguments: tuple[Any, ...]) -> dict[Any, Any]:
+    """An OrderedDict, its items given as pairs or set later; dictionaries keep their order here."""
+    made: dict[Any, Any] = {}
+    for pair in arguments[0] if arguments else ():
+        key, value = pair
+        if not isinstance(key, _KEYS):
+            raise _damaged(f"a key in its pickle is a {type(key).__name__}")
+        made[key] = value
+    return made
+
+
+def _tensor(arguments: tuple[Any, ...]) -> Tensor:
+    """``_rebuild_tensor_v2(storage, storage_offset, size, stride, requires_grad, backward_hooks, metadata)``."""
+    storage, offset, shape, strides = arguments[:4]
+    if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) != len(strides):
+        raise _damaged("a tensor's shape and strides do not fit together")
+    if len(shape) > MAX_AXES or not all(_is_count(n) for n in (offset, *shape, *strides)):
+        raise _damaged("a tensor's shape or strides are none")
+    return Tensor(storage, offset, shape, strides)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MAX_LENGTH
+
+
+def _parameter(arguments: tuple[Any, ...]) -> Any:
+    """``_rebuild_parameter(data, requires_grad, backward_hooks)``: its data."""
+    return arguments[0]
+
+
+def _size(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """``torch.Size((3, 4))``."""
+    return tuple(arguments[0])
+
+
+_NAMES: dict[tuple[str, str], Any] = {
+    ("collections", "OrderedDict"): _Function("OrderedDict", _ordered_dict),
+    ("torch._utils", "_rebuild_tensor"): _Function("_rebuild_tensor", _tensor),
+    ("torch._utils", "_rebuild_tensor_v2"): _Function("_rebuild_tensor_v2", _tensor),
+    ("torch._utils", "_rebuild_parameter"): _Function("_rebuild_parameter", _parameter),
+    ("torch", "Size"): _Function("Size", _size),
+    **{("torch", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
+    **{("torch.cuda", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
+}
+
+
+def _named(module: str, name: str) -> Any:
+    found = _NAMES.get((module, name))
+    if found is None:
+        raise NotAPolicyError(
+            f"its pickle asks for {module[:100]}.{name[:100]}",
+            why="only tensors and plain containers are built from a checkpoint, and nothing in it is run; a file that "
+            "asks for more may be an attack, or no checkpoint of ML-Agents",
+            fix=_FIX,
+        )
+    return found
+
+
+def _damaged(what: str) -> DamagedFileError:
+    return DamagedFileError(what, why="the file is cut off or damaged", fix="copy or download it again")

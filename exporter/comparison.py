@@ -1,0 +1,371 @@
+"""``export-model compare``: artefacts that any tool made, held against a reference.
+
+The reference is read as a policy, so that it says what to draw for its inputs and which outputs are drawn. A candidate
+is not read, only fed: its names are taken from its file, matched with the reference's, and it is run as it lies there,
+in the runtimes of its format. What it lacks, has too much or calls otherwise is a failure that says what to map.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from converters.artifact import WriteOptions
+from converters.frozen_graph.writer import write as write_frozen
+from converters.graph.options import CompileOptions
+from converters.interface import Interface, Port, interfaces_of
+from converters.runner.process import LoadedModel, RunFailedError
+from converters.source import OriginalRun
+from exporter.parity.compare import compare
+from exporter.parity.entrants import Entrant, Failure, Feeds, unload
+from exporter.parity.pool import RUNTIMES_OF, RuntimePool, chosen_runtimes
+from exporter.parity.report import ParityReport
+from exporter.parity.subject import Subject, VerifyOptions
+from exporter.parity.tolerances import Tolerance
+from exporter.parity.verify import random_outputs, verify
+from exporter.sources import read_source
+from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
+from signatures.roles import Role
+from signatures.sampling import draw_cases
+from signatures.spec import Policy, TensorSpec
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """What does not fit, at which of the reference's names; ``blocking`` where a run would make no sense."""
+
+    name: str
+    text: str
+    blocking: bool = False
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A candidate's interface with the reference's names: what it is fed and asked for under its own."""
+
+    label: str
+    interface: Interface
+    #: canonical input → the candidate's port
+    inputs: Mapping[str, Port]
+    #: canonical output → the candidate's name of it
+    outputs: Mapping[str, str]
+    #: the candidate's own inputs that have one value only, or the number of rows (None)
+    constant: Mapping[str, np.ndarray | None]
+    #: outputs that the candidate draws, because it makes the noise that the reference is fed
+    drawn: frozenset[str]
+    problems: tuple[_Problem, ...]
+
+    @property
+    def missing(self) -> list[str]:
+        """Outputs of the reference that it has no name for."""
+        return [p.name for p in self.problems if not p.blocking]
+
+
+def compare_artefacts(
+    reference: Path,
+    candidates: Sequence[Path],
+    *,
+    names: Mapping[str, str] | None = None,
+    runtimes: str | Sequence[str] = "auto",
+    options: VerifyOptions | None = None,
+    understanding: CompileOptions | None = None,
+    allow_unverified: bool = False,
+    progress: Progress = lambda text: None,
+    pool: RuntimePool | None = None,
+) -> ParityReport:
+    """Hold every candidate (and every format of one that is a bundle) against the reference.
+
+    ``names`` maps a name of the reference to the candidates' name for it. Raises ExportModelError where a file cannot
+    be read, UsageError where a name of ``names`` is none, RuntimeUnavailableError where no runtime could run any.
+    """
+    policy, source = _reference(reference, understanding)
+    interfaces = [(path, found) for path in candidates for found in interfaces_of(path)]
+    if not interfaces:
+        raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
+    aliases = _mapped(_aliases(policy, reference), names or {}, [i for _, i in interfaces])
+    labels = _labels(interfaces)
+    matched = [_match(label, found, policy, aliases) for label, (_, found) in zip(labels, interfaces, strict=True)]
+    used, known = chosen_runtimes(runtimes, [m.interface.format for m in matched])
+    with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
+        artifact = write_frozen(policy, WriteOptions("{}"))
+        frozen = Path(folder, artifact.main)
+        frozen.write_bytes(artifact.files[artifact.main])
+        subject = Subject(
+            policy.name,
+            policy.signature,
+            policy.graph,
+            {},
+            {m.label: _size(m.interface.path) for m in matched},
+            frozen,
+            source,
+            policy.source,
+        )
+
+        def field(numpy_model: LoadedModel, failure: Failure) -> Iterator[Entrant]:
+            for candidate in matched:
+                yield from _entrants(candidate, policy, numpy_model, used, pool, failure)
+
+        report = verify(subject, used, known, pool, options, progress, field=field)
+    if report.passed is None and not allow_unverified:
+        raise RuntimeUnavailableError(
+            "no runtime that runs the candidates is installed, so nothing was compared",
+            why=f"they are {', '.join(sorted({m.interface.format for m in matched}))}",
+            fix="export-model runtimes lists the runtimes and how to install each; or --allow-unverified",
+        )
+    return report
+
+
+def _opened(pool: RuntimePool | None) -> AbstractContextManager[RuntimePool]:
+    """A pool that is given stays open."""
+    return RuntimePool() if pool is None else nullcontext(pool)
+
+
+def _reference(path: Path, understanding: CompileOptions | None) -> tuple[Policy, OriginalRun | None]:
+    found = list(read_source(path).compiled(understanding))
+    if len(found) > 1:
+        raise UsageError(
+            f"the reference holds {len(found)} policies",
+            where=str(path),
+            why=", ".join(p.name for _, p in found),
+            fix="choose one with --brain, or give one model of it",
+        )
+    model, policy = found[0]
+    return policy, model.original
+
+
+def _labels(found: Sequence[tuple[Path, Interface]]) -> list[str]:
+    """What each candidate is called in the report: its format where that is enough, else with its path."""
+    formats = [i.format for _, i in found]
+    if len(set(formats)) == len(formats) and len({p for p, _ in found}) == 1:
+        return formats
+    return [f"{interface.format} {_short(interface.path)}" for _, interface in found]
+
+
+def _short(path: Path) -> str:
+    return "/".join(path.resolve().parts[-2:])
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
+
+
+# ---- names
+
+
+def _base(name: str) -> str:
+    """A name without the output index that TensorFlow and tf2onnx append, and what TF Serving prefixes."""
+    return name.removesuffix(":0").removeprefix("serving_default_")
+
+
+def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
+    """Canonical name → what a candidate may call it: first what the reference's own file does, then the canonical."""
+    keys: dict[str, str] = {}
+    try:
+        own = interfaces_of(path)
+    except ExportModelError:  # a checkpoint, a .nn: what nobody feeds by name has no names beside the policy's
+        own = []
+    for port in (p for i in own for p in (*i.inputs, *i.outputs) if p.tensor is not None):
+        keys.setdefault(_base(str(port.tensor)), _base(port.name))
+    aliases: dict[str, tuple[str, ...]] = {}
+    for spec in (*policy.signature.inputs, *policy.signature.outputs):
+        source = _base(spec.source) if isinstance(spec.source, str) else spec.name
+        aliases[spec.name] = tuple(dict.fromkeys([keys.get(source, source), source, spec.name]))
+    return aliases
+
+
+def _mapped(
+    aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], interfaces: Sequence[Interface]
+) -> dict[str, tuple[str, ...]]:
+    """The aliases, with what --map says in place of all others of a name. Raises UsageError."""
+    ports = [p for i in interfaces for p in (*i.inputs, *i.outputs)]
+    mapped = dict(aliases)
+    for name, other in names.items():
+        canonical = next((c for c, known in aliases.items() if _base(name) in known), None)
+        if canonical is None:
+            raise UsageError(
+                f"--map {name}={other}: the reference has no input or output {name!r}",
+                fix=_suggestion(name, [a for known in aliases.values() for a in known]),
+            )
+        if _find(other, ports) is None:
+            raise UsageError(
+                f"--map {name}={other}: no candidate has an input or output {other!r}",
+                fix=_suggestion(other, [p.name for p in ports]),
+            )
+        # A candidate that calls it as the reference does needs no map: with several, each is found by its own name.
+        mapped[canonical] = (other, *aliases[canonical])
+    return mapped
+
+
+def _suggestion(name: str, names: Sequence[str]) -> str:
+    names = list(dict.fromkeys(names))
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]}?" if close else f"there are {', '.join(names[:20])}"
+
+
+def _find(name: str, ports: Sequence[Port]) -> Port | None:
+    return next((p for p in ports if p.name == name), None) or next((p for p in ports if _base(p.name) == name), None)
+
+
+def _match(label: str, interface: Interface, policy: Policy, aliases: Mapping[str, Sequence[str]]) -> _Candidate:
+    """The candidate's ports for the reference's names, and what does not fit."""
+    problems: list[_Problem] = []
+
+    def port_of(spec: TensorSpec, ports: Sequence[Port]) -> Port | None:
+        return next((p for a in aliases[spec.name] if (p := _find(a, ports)) is not None), None)
+
+    signature = policy.signature
+    inputs = {s.name: p for s in signature.inputs if (p := port_of(s, interface.inputs)) is not None}
+    found = {s.name: p for s in signature.outputs if (p := port_of(s, interface.outputs)) is not None}
+    lacking = [s for s in signature.inputs if s.name not in inputs]
+    noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
+    reached = {s.name: policy.graph.ancestors([s.name]) for s in signature.outputs}
+    drawn = frozenset(name for name in found if reached[name] & noise)
+    for spec in signature.outputs:
+        # What the reference's file has not either (an action without chance that was made for it) may be missing.
+        if spec.name not in found and (spec.source is not None or not found):
+            text = f"there is no output {aliases[spec.name][0]!r}; there are {_names(interface.outputs)}"
+            problems.append(_Problem(spec.name, text))
+    for spec in lacking:
+        if spec.role is not Role.NOISE and any(spec.name in reached[name] for name in found):
+            text = f"there is no input {aliases[spec.name][0]!r}; there are {_names(interface.inputs)}"
+            problems.append(_Problem(spec.name, text, blocking=True))
+    for spec in signature.inputs:
+        misfit = _misfit(spec, inputs[spec.name]) if spec.name in inputs else ""
+        if misfit:
+            problems.append(_Problem(spec.name, misfit, blocking=True))
+    constant, left = _constants(interface, policy, {p.name for p in inputs.values()})
+    if not interface.open:
+        for port in left:
+            text = f"it takes an input {port.name!r} that the reference has not"
+            problems.append(_Problem(port.name, text, blocking=True))
+    return _Candidate(label, interface, inputs, {n: p.name for n, p in found.items()}, constant, drawn, tuple(problems))
+
+
+def _names(ports: Sequence[Port]) -> str:
+    return ", ".join(repr(p.name) for p in ports[:12]) or "none"
+
+
+def _misfit(spec: TensorSpec, port: Port) -> str:
+    """Why an input cannot take what the reference takes; empty where it can, as far as the file tells."""
+    kinds = (np.dtype(spec.dtype).kind, None if port.dtype is None else np.dtype(port.dtype).kind)
+    integers = {"i", "u", "b"}
+    if kinds[1] is not None and spec.dtype != port.dtype and not {*kinds} <= integers:
+        return f"the input {port.name!r} is {port.dtype}, the reference's {spec.dtype}"
+    if port.shape is None:
+        return ""
+    same = len(port.shape) == len(spec.shape) and all(
+        a is None or b is None or a == b for a, b in zip(port.shape[1:], spec.shape[1:], strict=True)
+    )
+    if not same:
+        return f"the input {port.name!r} has the shape {_dims(port.shape)}, the reference's {_dims(spec.shape)}"
+    if port.shape and spec.shape and spec.shape[0] is None and port.shape[0] is not None:
+        return f"the input {port.name!r} takes {port.shape[0]} rows only, the reference any number"
+    return ""
+
+
+def _dims(shape: Sequence[int | None]) -> str:
+    return "[" + ", ".join("?" if n is None else str(n) for n in shape) + "]"
+
+
+def _constants(
+    interface: Interface, policy: Policy, taken: set[str]
+) -> tuple[dict[str, np.ndarray | None], list[Port]]:
+    """(the candidate's inputs that are not policy inputs but known: batch_size, sequence_length; those unknown)."""
+    fixed = {_base(n): np.asarray(v) for n, v in policy.source.fixed.items()}
+    batches = {_base(n) for n in policy.source.batch_sizes}
+    constant: dict[str, np.ndarray | None] = {}
+    left = []
+    for port in interface.inputs:
+        base = _base(port.name)
+        if port.name in taken:
+            continue
+        if base in fixed:
+            constant[port.name] = fixed[base]
+        elif base in batches or base == "batch_size":
+            constant[port.name] = None
+        elif base == "sequence_length":
+            constant[port.name] = np.array(1, np.int32)
+        else:
+            left.append(port)
+    return constant, left
+
+
+# ---- running
+
+
+def _entrants(
+    candidate: _Candidate,
+    policy: Policy,
+    numpy_model: LoadedModel,
+    runtimes: Sequence[str],
+    pool: RuntimePool,
+    failure: Failure,
+) -> Iterator[Entrant]:
+    kind = candidate.interface.format
+    chosen = [r for r in RUNTIMES_OF[kind] if r in runtimes and r != "numpy"]
+    for runtime in chosen:
+        try:
+            model = pool.process(runtime).load(str(candidate.interface.path), **candidate.interface.options)
+        except RunFailedError as error:
+            failure(candidate.label, runtime, error, "*")
+            for problem in candidate.problems:
+                failure(candidate.label, runtime, RunFailedError(problem.text), problem.name)
+            continue
+        blocked = any(p.blocking for p in candidate.problems)
+        hints = {} if blocked else _same_numbers(candidate, policy, numpy_model, model)
+        for problem in candidate.problems:
+            failure(candidate.label, runtime, RunFailedError(problem.text + hints.get(problem.name, "")), problem.name)
+        if candidate.outputs and not blocked:
+            run = _renamed(model, candidate)
+            yield Entrant(kind, runtime, run, list(candidate.outputs), model, candidate.label, candidate.drawn)
+        unload(model)
+
+
+def _same_numbers(
+    candidate: _Candidate, policy: Policy, numpy_model: LoadedModel, model: LoadedModel
+) -> dict[str, str]:
+    """Missing output → a hint, where an output under another name has its numbers."""
+    left = [p.name for p in candidate.interface.outputs if p.name not in candidate.outputs.values()]
+    drawn = random_outputs(policy.graph, candidate.missing)
+    wanted = [n for n in candidate.missing if n not in drawn]
+    if not wanted or not left or candidate.interface.open:
+        return {}
+    case = draw_cases(policy.signature)[1]
+    try:
+        answers = _renamed(model, replace(candidate, outputs={n: n for n in left}))(case.feeds, left)
+    except RunFailedError:  # said where it is run for the comparison
+        return {}
+    expected = numpy_model.run(case.feeds, wanted)
+    hints = {}
+    for name in wanted:
+        same = [o for o in left if compare(expected[name], answers[o], Tolerance(), narrowed=True).passed]
+        if same:
+            hints[name] = f"; the numbers of {same[0]!r} are the same: --map {name}={same[0]}"
+    return hints
+
+
+def _renamed(model: LoadedModel, candidate: _Candidate) -> Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]:
+    """A run under canonical names."""
+
+    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        rows = next((len(a) for a in feeds.values() if a.ndim), 1)
+        given = {p.name: _cast(feeds[name], p.dtype) for name, p in candidate.inputs.items()}
+        ranks = {p.name: len(p.shape or ()) for p in candidate.interface.inputs}
+        for name, value in candidate.constant.items():
+            given[name] = np.full([1] * ranks[name], rows, np.int32) if value is None else np.asarray(value)
+        answers = model.run(given, [candidate.outputs[n] for n in fetch])
+        return {n: answers[candidate.outputs[n]] for n in fetch}
+
+    return run
+
+
+def _cast(array: np.ndarray, dtype: str | None) -> np.ndarray:
+    return array if dtype is None or array.dtype.name == dtype else array.astype(dtype)

@@ -1,0 +1,50 @@
+"""A size budget as a gate: ``--max-size tfjs=60kB``. A format that is larger is a comparison that failed."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from exporter.parity.report import Comparison, ParityReport
+from exporter.parity.tolerances import Tolerance
+from exporter.tables import size_text
+from signatures.errors import UsageError
+
+#: All formats of the bundle together.
+TOTAL = "total"
+_UNITS = {"": 1, "b": 1, "kb": 1000, "mb": 1000**2, "gb": 1000**3, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30}
+_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]*)")
+
+
+def parse_budget(values: Sequence[str]) -> dict[str, int]:
+    """``["tfjs=60kB", "1MB"]`` as bytes by format; a size alone is that of the whole bundle. Raises UsageError."""
+    budget: dict[str, int] = {}
+    for value in values:
+        name, equals, size = value.rpartition("=")
+        found = _SIZE.fullmatch(size.strip().lower())
+        unit = None if found is None else _UNITS.get(found[2])
+        if found is None or unit is None or (equals and not name):
+            raise UsageError(
+                f"--max-size {value}: FORMAT=SIZE or SIZE is expected", fix="for example tfjs=60kB, or 1.5MB for all"
+            )
+        budget[name.strip() or TOTAL] = int(float(found[1]) * unit)
+    return budget
+
+
+def held_to(report: ParityReport, budget: Mapping[str, int]) -> ParityReport:
+    """The report with a comparison of each size in ``budget``. Raises UsageError on a format that was not written."""
+    sizes = {**report.sizes, TOTAL: sum(report.sizes.values())}
+    checks = []
+    for name, most in budget.items():
+        if name not in sizes:
+            raise UsageError(f"--max-size {name}=…: there is no such format here", fix=f"there are {', '.join(sizes)}")
+        over = sizes[name] - most
+        reason = "" if over <= 0 else f"{size_text(sizes[name])}, and the budget is {size_text(most)}"
+        excess = float(max(over, 0))
+        relative = excess / most if most else math.inf if excess else 0.0
+        tolerance = Tolerance(0.0, 0.0)
+        checks.append(Comparison(name, "file", "size", "size", excess, relative, tolerance, over <= 0, None, reason))
+    passed = False if any(not c.passed for c in checks) else report.passed
+    return replace(report, comparisons=(*report.comparisons, *checks), passed=passed)

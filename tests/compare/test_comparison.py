@@ -1,0 +1,218 @@
+"""Artefacts held against a reference: what agrees, what is called otherwise, what is missing, what differs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper, numpy_helper
+
+from exporter.comparison import compare_artefacts
+from exporter.parity.pool import RuntimePool
+from exporter.parity.report import Comparison, ParityReport
+from exporter.pipeline import ExportOptions, export
+from fixtures import path as fixture
+from signatures.errors import RuntimeUnavailableError, UsageError
+
+RUNTIMES = "tensorflow,onnxruntime,tfjs-cpu"
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    out = tmp_path_factory.mktemp("bundles")
+
+    def of(name: str) -> Path:
+        if not (out / name).exists():
+            list(export([fixture(name)], ExportOptions(out, verify="none")))
+        return out / name
+
+    return of
+
+
+Bundles = Callable[[str], Path]
+
+
+def edited(source: Path, target: Path, edit: Callable[[onnx.ModelProto], None]) -> Path:
+    model = onnx.load(source)
+    edit(model)
+    onnx.save(model, target)
+    return target
+
+
+def renamed(model: onnx.ModelProto, old: str, new: str) -> None:
+    for node in model.graph.node:
+        for names in (node.input, node.output):
+            names[:] = [new if n == old else n for n in names]
+    for value in (*model.graph.input, *model.graph.output):
+        value.name = new if value.name == old else value.name
+
+
+def only_failure(report: ParityReport) -> Comparison:
+    assert report.passed is False
+    (failure,) = report.failures
+    return failure
+
+
+@pytest.mark.parametrize("name", ["continuous", "discrete", "sampled", "recurrent", "visual"])
+def test_a_bundle_agrees_with_its_source(name: str, bundles: Bundles, pool: RuntimePool) -> None:
+    report = compare_artefacts(fixture(name), [bundles(name)], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is True
+    assert report.reference == "source/tensorflow"
+    assert {(c.format, c.runtime) for c in report.comparisons} == {
+        ("bytes", "tensorflow"),
+        ("saved_model", "tensorflow"),
+        ("tfjs", "tfjs-cpu"),
+        ("onnx", "onnxruntime"),
+    }
+
+
+def test_last_weeks_bundle_against_todays(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    old, new = bundles("continuous"), tmp_path / "new"
+    shutil.copytree(old, new)
+    assert compare_artefacts(old, [new], runtimes=RUNTIMES, pool=pool).passed is True
+
+    def moved(model: onnx.ModelProto) -> None:
+        weight = next(t for t in model.graph.initializer if len(t.dims) == 2)
+        values = numpy_helper.to_array(weight).copy()
+        values[0, 0] += 0.1
+        weight.CopyFrom(numpy_helper.from_array(values, weight.name))
+
+    edited(new / "continuous.onnx", new / "continuous.onnx", moved)
+    report = compare_artefacts(old, [new], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    assert {(c.format, c.runtime) for c in report.failures} == {("onnx", "onnxruntime")}
+
+
+def test_candidates_of_one_format_are_told_apart(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    folder = bundles("discrete")
+    other = shutil.copy(folder / "discrete.onnx", tmp_path / "theirs.onnx")
+    report = compare_artefacts(
+        fixture("discrete"), [folder / "discrete.onnx", Path(other)], runtimes="onnxruntime,tensorflow", pool=pool
+    )
+    assert report.passed is True
+    assert {c.format for c in report.comparisons} == {
+        "onnx discrete/discrete.onnx",
+        f"onnx {tmp_path.name}/theirs.onnx",
+    }
+
+
+def test_the_names_of_the_source_are_known_too(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    """What tf2onnx makes of a graph has "node:0" for names."""
+
+    def by_tensor(model: onnx.ModelProto) -> None:
+        for value in [v.name for v in (*model.graph.input, *model.graph.output)]:
+            renamed(model, value, f"{value}:0")
+
+    file = edited(bundles("recurrent") / "recurrent.onnx", tmp_path / "theirs.onnx", by_tensor)
+    assert compare_artefacts(fixture("recurrent"), [file], runtimes=RUNTIMES, pool=pool).passed is True
+
+
+def test_a_lost_name_is_a_failure_that_says_what_to_map(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    file = edited(
+        bundles("discrete") / "discrete.onnx", tmp_path / "theirs.onnx", lambda m: renamed(m, "action", "Identity")
+    )
+    failure = only_failure(compare_artefacts(fixture("discrete"), [file], runtimes=RUNTIMES, pool=pool))
+    assert (failure.output, failure.runtime) == ("action", "onnxruntime")
+    assert "there is no output 'action'" in failure.reason
+    assert "--map action=Identity" in failure.reason
+    mapped = compare_artefacts(fixture("discrete"), [file], names={"action": "Identity"}, runtimes=RUNTIMES, pool=pool)
+    assert mapped.passed is True
+    assert "action" in {c.output for c in mapped.comparisons}
+
+
+def test_a_web_model_without_its_signatures_names_is_found(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    folder = tmp_path / "tfjs"
+    shutil.copytree(bundles("discrete") / "tfjs", folder)
+    model = json.loads((folder / "model.json").read_text())
+    signature = model["signature"]
+    signature["outputs"] = {f"Identity_{i}": info for i, info in enumerate(signature["outputs"].values())}
+    model.pop("userDefinedMetadata")
+    (folder / "model.json").write_text(json.dumps(model))
+    report = compare_artefacts(fixture("discrete"), [folder], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    assert {f.output for f in report.failures} >= {"action", "value_estimate"}
+    assert all("there is no output" in f.reason for f in report.failures)
+
+
+def test_an_op_that_the_runtime_does_not_know(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    """A converter that writes an op which ONNX has not, all the same."""
+
+    def unknown(model: onnx.ModelProto) -> None:
+        next(n for n in model.graph.node if n.op_type in ("MatMul", "Gemm")).op_type = "Betainc"
+
+    file = edited(bundles("continuous") / "continuous.onnx", tmp_path / "theirs.onnx", unknown)
+    failure = only_failure(compare_artefacts(fixture("continuous"), [file], runtimes=RUNTIMES, pool=pool))
+    assert (failure.kind, failure.output) == ("failure", "*")
+    assert "Betainc" in failure.reason
+
+
+def test_an_input_that_is_missing_or_too_much(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    def masks_frozen(model: onnx.ModelProto) -> None:
+        values = model.graph.input
+        masks = next(v for v in values if v.name == "action_masks")
+        width = masks.type.tensor_type.shape.dim[1].dim_value
+        values.remove(masks)
+        model.graph.initializer.append(numpy_helper.from_array(np.ones((1, width), np.float32), "action_masks"))
+        values.append(helper.make_tensor_value_info("temperature", onnx.TensorProto.FLOAT, [1]))
+
+    file = edited(bundles("discrete") / "discrete.onnx", tmp_path / "theirs.onnx", masks_frozen)
+    report = compare_artefacts(fixture("discrete"), [file], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    reasons = {f.output: f.reason for f in report.failures}
+    assert "there is no input 'action_masks'" in reasons["action_masks"]
+    assert "an input 'temperature' that the reference has not" in reasons["temperature"]
+
+
+def test_a_batch_that_is_frozen_or_another_width_is_said(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
+    def state(model: onnx.ModelProto) -> onnx.TensorShapeProto:
+        return next(v for v in model.graph.input if v.name == "state").type.tensor_type.shape
+
+    def frozen(model: onnx.ModelProto) -> None:
+        state(model).dim[0].dim_value = 32
+
+    def wide(model: onnx.ModelProto) -> None:
+        state(model).dim[1].dim_value = 99
+
+    source = bundles("continuous") / "continuous.onnx"
+    for edit, words in ((frozen, "takes 32 rows only"), (wide, "has the shape [?, 99], the reference's [?, 8]")):
+        file = edited(source, tmp_path / "theirs.onnx", edit)
+        failure = next(
+            f
+            for f in compare_artefacts(fixture("continuous"), [file], runtimes=RUNTIMES, pool=pool).failures
+            if f.output == "state"
+        )
+        assert words in failure.reason
+
+
+def test_noise_that_the_candidate_draws_itself_is_not_compared_by_numbers(
+    bundles: Bundles, tmp_path: Path, pool: RuntimePool
+) -> None:
+    (kept,) = export([fixture("sampled")], ExportOptions(tmp_path, verify="none", name="kept"))
+    report = compare_artefacts(fixture("sampled"), [kept.folder], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is True
+    assert {c.kind for c in report.comparisons if c.output == "action"} == {"shape", "draws"}
+
+
+def test_bad_maps_are_refused(bundles: Bundles, pool: RuntimePool) -> None:
+    file = bundles("discrete") / "discrete.onnx"
+    with pytest.raises(UsageError, match="no input or output 'acton'") as caught:
+        compare_artefacts(fixture("discrete"), [file], names={"acton": "action"}, runtimes=RUNTIMES, pool=pool)
+    assert caught.value.fix == "did you mean action?"
+    with pytest.raises(UsageError, match="no candidate has an input or output 'Identity'"):
+        compare_artefacts(fixture("discrete"), [file], names={"action": "Identity"}, runtimes=RUNTIMES, pool=pool)
+
+
+def test_a_reference_with_two_brains_needs_one_chosen(bundles: Bundles, pool: RuntimePool) -> None:
+    with pytest.raises(UsageError, match="2 policies"):
+        compare_artefacts(fixture("twobrains"), [bundles("discrete")], runtimes=RUNTIMES, pool=pool)
+
+
+def test_where_nothing_ran_nothing_is_said_to_agree(bundles: Bundles, pool: RuntimePool) -> None:
+    file = bundles("discrete") / "discrete.onnx"
+    with pytest.raises(RuntimeUnavailableError, match="nothing was compared"):
+        compare_artefacts(fixture("discrete"), [file], runtimes="numpy", pool=pool)

@@ -1,0 +1,274 @@
+"""What the weights do not tell is refused with what to do; run folders; the command line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.recognise import recognise_path
+from converters.source import ReadOptions
+from exporter.sources import read_source
+from fixtures.torch_checkpoint import FOLDER
+from fixtures.torch_checkpoint.cases import CASES, waves
+from signatures.errors import DamagedFileError, NotAPolicyError, SourceError, UsageError
+from signatures.roles import Role
+from tests.commands import export_model
+from tests.torch_checkpoint.pt_files import Writer, actor, checkpoint, weights, zipped
+
+IMAGES = {c.name: c for c in CASES if not c.stored}
+
+
+def placed(folder: Path, tensors: Any, name: str = "checkpoint.pt") -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(checkpoint(tensors))
+    return path
+
+
+def image(folder: Path, name: str) -> Path:
+    return placed(folder, weights(FOLDER / f"{name}.json"))
+
+
+# ------------------------------------------------------------------ other files
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ({"model": 1, "optimizer": 2}, "it holds model, optimizer"),
+        ({"Policy": {}, "global_step": 1}, "it holds Policy, global_step"),
+        ([1, 2], "it holds a list"),
+        (None, "it holds a nonetype"),
+    ],
+)
+def test_another_checkpoint_is_refused_with_what_it_holds(value: Any, words: str, tmp_path: Path) -> None:
+    for data in (Writer().zip(value), Writer().row(value)):
+        (tmp_path / "a.pth").write_bytes(data)
+        with pytest.raises(NotAPolicyError, match="no checkpoint of ML-Agents") as caught:
+            read_source(tmp_path / "a.pth")
+        assert words in str(caught.value)
+        assert "torch.onnx.export" in str(caught.value)
+
+
+def test_torchscript_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "a.pt").write_bytes(zipped({"a/data.pkl": b"\x80\x02}.", "a/constants.pkl": b"", "a/code/m.py": b""}))
+    with pytest.raises(NotAPolicyError, match="TorchScript"):
+        read_source(tmp_path / "a.pt")
+
+
+def test_the_kind_is_told_by_content(tmp_path: Path) -> None:
+    for name in ("ppo_1_1", "poca_0_26_discrete"):
+        shutil.copy(FOLDER / f"{name}.pt", tmp_path / "a.bytes")
+        assert recognise_path(tmp_path / "a.bytes").key == "torch_checkpoint"
+
+
+def test_the_actors_own_state_dictionary_is_read_too(tmp_path: Path) -> None:
+    writer = Writer()
+    (tmp_path / "actor.pt").write_bytes(writer.zip(writer.state(actor())))
+    (policy,) = read_source(tmp_path / "actor.pt").policies()
+    assert policy.name == "actor"
+
+
+# ------------------------------------------------------------------ networks that are not built
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("network_body.observation_encoder.rsa.fc_q.weight", "attention"),
+        ("network_body.rsa.fc_q.weight", "attention"),
+        ("network_body.processors.0.self_embedder.seq_layers.0.weight", "variable length"),
+        ("network_body._body_endoder.layers.0.hypernet.0.weight", "hypernetwork"),
+        ("network_body._body_endoder._hidden_layers.0.weight", "hypernetwork"),
+        ("network_body.my_layer.weight", "network_body.my_layer.weight"),
+        ("action_model._continuous_distribution.other", "action_model._continuous_distribution.other"),
+    ],
+)
+def test_parts_that_are_not_read_are_refused_by_name(part: str, words: str, tmp_path: Path) -> None:
+    path = placed(tmp_path, {**actor(), part: waves(part, (4, 3))})
+    with pytest.raises(SourceError, match="not read from a checkpoint") as caught:
+        read_source(path)
+    assert words in str(caught.value)
+    assert "mlagents-learn" in str(caught.value)
+
+
+def test_the_previews_are_refused_by_their_step_counter(tmp_path: Path) -> None:
+    tensors = weights(FOLDER / "simple_0_22.json")
+    writer = Writer()
+    value = {
+        "Policy": writer.state(tensors),
+        "global_step": writer.state({"_GlobalSteps__global_step": np.zeros(1, np.float32)}),
+    }
+    (tmp_path / "a.pt").write_bytes(writer.zip(value))
+    with pytest.raises(SourceError, match=r"0\.20 or 0\.21"):
+        read_source(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (
+            {"action_model___continuous_distribution__mu__bias": None},
+            "has no action_model._continuous_distribution.mu.bias",
+        ),
+        (
+            {"network_body___body_endoder__seq_layers__0__bias": np.zeros(3, np.float32)},
+            "seq_layers.0.bias has the shape",
+        ),
+        ({"network_body___body_endoder__seq_layers__0__weight": None}, "seq_layers.0.weight"),
+        ({"version_number": np.zeros(2, np.float32)}, "version_number has the shape"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(DamagedFileError) as caught:
+        read_source(placed(tmp_path, actor(**changed)))
+    assert words in str(caught.value)
+
+
+def test_a_policy_without_actions_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DamagedFileError, match="has no action"):
+        read_source(placed(tmp_path, actor(actions=0)))
+
+
+def sac() -> dict[str, Any]:
+    """A small actor whose deviation depends on the observation."""
+    head = "action_model___continuous_distribution__log_sigma"
+    return actor(**{head: None, f"{head}__weight": waves("s", (2, 4)), f"{head}__bias": waves("b", (2,))})
+
+
+def test_the_optimizers_say_which_trainer_it_was(tmp_path: Path) -> None:
+    for optimizer, tensors, trainer in (
+        ("Optimizer:entropy_optimizer", sac(), "SAC"),
+        ("Optimizer:value_optimizer", actor(), "PPO"),
+        ("Optimizer", actor(), "PPO"),
+        ("Optimizer:adam", actor(), "POCA"),
+    ):
+        (tmp_path / "a.pt").write_bytes(checkpoint(tensors, **{optimizer: {}}))
+        (policy,) = read_source(tmp_path / "a.pt").policies()
+        assert policy.signature.algorithm == trainer
+        assert not any("is taken to" in note for note in policy.signature.notes)
+
+
+def test_without_an_optimizer_a_note_says_what_is_assumed(tmp_path: Path) -> None:
+    for tensors, assumed in ((sac(), True), (actor(), False)):
+        (policy,) = read_source(placed(tmp_path, tensors)).policies()
+        assert any("tanh is taken to bound" in note for note in policy.signature.notes) == assumed
+
+
+def test_an_action_whose_bound_is_not_known_is_refused(tmp_path: Path) -> None:
+    for optimizer, tensors in (("Optimizer:entropy_optimizer", actor()), ("Optimizer:value_optimizer", sac())):
+        (tmp_path / "a.pt").write_bytes(checkpoint(tensors, **{optimizer: {}}))
+        with pytest.raises(SourceError, match="a clip, or tanh"):
+            read_source(tmp_path / "a.pt")
+
+
+# ------------------------------------------------------------------ sensors
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_images_are_refused_with_what_is_missing_and_the_flag_that_says_it(name: str, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="does not tell") as caught:
+        read_source(image(tmp_path, name))
+    assert "--sensors" in str(caught.value)
+
+
+def test_the_sizes_that_would_fit_are_listed(tmp_path: Path) -> None:
+    with pytest.raises(SourceError) as caught:
+        read_source(image(tmp_path, "resnet_1_1"))
+    assert "3x15x15" in str(caught.value)  # the smallest that ML-Agents takes: 15, 7, 3, 1
+
+
+def test_an_image_of_which_only_one_size_fits_needs_no_flag(tmp_path: Path) -> None:
+    """match3 on the smallest board: every larger one leaves more numbers."""
+    tensors = weights(FOLDER / "match3_1_1.json")
+    for name, array in tensors.items():
+        if name.endswith("processors.0.dense.0.weight"):
+            tensors[name] = np.ascontiguousarray(array[:, :144])
+    (policy,) = read_source(placed(tmp_path, tensors)).policies()
+    assert [s.shape for s in policy.signature.inputs if s.role is Role.VISUAL] == [(None, 2, 5, 5)]
+
+
+@pytest.mark.parametrize(
+    ("name", "sensors", "words"),
+    [
+        ("simple_1_1", ((1, 21, 24),), "takes 9 columns, and these sensors give 6"),
+        ("simple_1_1", ((1, 84, 84), (3,)), "was not built for an image"),
+        ("simple_1_1", ((3, 21, 24), (3,)), "was not built for an image"),
+        ("simple_1_1", ((3,), (1, 21, 24)), "is an image"),
+        ("simple_0_25", ((2,), (3, 20, 36)), "has 3 numbers"),
+        ("simple_0_25", ((3,),), "has 2 sensors"),
+        ("simple_0_25", ((3,), (3, 20, 36), (3, 20, 36)), "is a vector"),
+        ("dense_1_1", ((2, 3, 5), (3,)), "was not built for an image"),
+        ("simple_0_22", ((3, 20, 28),), "columns"),
+        ("simple_0_22", ((3, 2, 2), (3,)), "was not built for an image"),
+    ],
+)
+def test_sensors_that_do_not_fit_are_refused(
+    name: str, sensors: tuple[tuple[int, ...], ...], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match="does not fit the checkpoint") as caught:
+        read_source(image(tmp_path, name), ReadOptions(sensors=sensors))
+    assert words in str(caught.value)
+
+
+# ------------------------------------------------------------------ the command line and run folders
+
+
+def test_the_command_line(tmp_path: Path) -> None:
+    path = image(tmp_path, "nature_1_1")
+    refused = export_model(path, "-o", tmp_path / "out", "--verify", "none")
+    assert refused.status == 2 and "--sensors" in refused.err and not (tmp_path / "out").exists()
+    done = export_model(path, "-o", tmp_path / "out", "--verify", "none", "--sensors", "2,3x36x45")
+    assert done.status == 0, done.err
+    assert (tmp_path / "out/checkpoint/checkpoint.onnx").is_file()
+    for text in ("2,3x36", "2,x", "two", "2,3x0x4", "2,3x99999999999x4"):
+        wrong = export_model(path, "-o", tmp_path / "out", "--sensors", text)
+        assert wrong.status == 2 and "is no shape of a sensor" in wrong.err
+
+
+def names_read(path: Path, step: int | None = None) -> dict[str, list[str]]:
+    source = read_source(path, ReadOptions(step))
+    return {str(m.name): [p.name for p in m.files] for m in source.models}
+
+
+def test_a_run_folder_that_has_only_checkpoints(tmp_path: Path) -> None:
+    """What is left when the export to ONNX failed: the newest step, or the one that is asked for."""
+    run = tmp_path / "results/first"
+    for name in ("Hop/Hop-500.pt", "Hop/Hop-1000.pt", "Hop/checkpoint.pt"):
+        placed(run, actor(), name)
+    assert names_read(run) == {"Hop": ["Hop-1000.pt"]}
+    assert names_read(run, 500) == {"Hop": ["Hop-500.pt"]}
+    assert names_read(run / "Hop") == {"Hop": ["Hop-1000.pt"]}
+
+
+def test_the_last_checkpoint_alone(tmp_path: Path) -> None:
+    placed(tmp_path / "results/first", actor(), "Hop/checkpoint.pt")
+    assert names_read(tmp_path / "results/first") == {"Hop": ["checkpoint.pt"]}
+
+
+def test_a_final_onnx_goes_before_checkpoints(tmp_path: Path) -> None:
+    run = tmp_path / "results/first"
+    for name in ("Hop/Hop-500.pt", "Hop/checkpoint.pt"):
+        placed(run, actor(), name)
+    shutil.copy(FOLDER / "ppo_1_1.onnx", run / "Hop/Hop-500.onnx")
+    assert names_read(run) == {"Hop": ["Hop-500.onnx"]}
+    shutil.copy(FOLDER / "ppo_1_1.onnx", run / "Hop.onnx")
+    assert names_read(run) == {"Hop": ["Hop.onnx"]}
+
+
+def test_a_checkpoint_that_is_newer_than_every_export_is_read(tmp_path: Path) -> None:
+    run = tmp_path / "results/first"
+    for name in ("Hop/Hop-500.pt", "Hop/Hop-1000.pt", "Hop/checkpoint.pt"):
+        placed(run, actor(), name)
+    shutil.copy(FOLDER / "ppo_1_1.onnx", run / "Hop/Hop-500.onnx")
+    assert names_read(run) == {"Hop": ["Hop-1000.pt"]}
+
+
+def test_sensors_reach_the_checkpoint_in_a_run_folder(tmp_path: Path) -> None:
+    placed(tmp_path / "results/a", weights(FOLDER / "simple_1_1.json"), "Hop/checkpoint.pt")
+    (model,) = read_source(tmp_path / "results/a", ReadOptions(sensors=((1, 21, 24), (3,)))).models
+    assert model.name == "Hop"
