@@ -1,24 +1,27 @@
 """export-model: trained Unity ML-Agents policies for every runtime, proven to act the same.
 
-``from exporter import export_model, inspect_model, verify_bundle``. Nothing heavy is imported before it is used: a cold
-start is a feature.
+``from exporter import export_model, inspect_model, verify_bundle, compare_artefacts, load_policy``. Nothing heavy is
+imported before it is used: a cold start is a feature.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from exporter.version import __version__
 
 if TYPE_CHECKING:
+    from exporter.acting.policy import load_policy
     from exporter.api import export_model, inspect_model, verify_bundle
+    from exporter.comparison import compare_artefacts
 
-__all__ = ["__version__", "export_model", "inspect_model", "verify_bundle"]
+__all__ = ["__version__", "compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"]
+
+_HOMES = {"load_policy": "exporter.acting.policy", "compare_artefacts": "exporter.comparison"}
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("export_model", "inspect_model", "verify_bundle"):
-        from exporter import api
-
-        return getattr(api, name)
+    if name in __all__:
+        return getattr(importlib.import_module(_HOMES.get(name, "exporter.api")), name)
     raise AttributeError(f"module 'exporter' has no attribute {name!r}")

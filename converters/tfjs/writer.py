@@ -15,6 +15,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,9 @@ from signatures.graph import Graph, Node
 from signatures.spec import Policy, TensorSpec
 
 SHARD_BYTES = 4 << 20
+#: The module that acts with the model in a page, and its types; they lie beside it.
+_JS = Path(__file__).with_name("js")
+_ACTING = ("policy.mjs", "policy.d.mts")
 #: Activations that TensorFlow.js fuses into a product on every backend (tfjs-core ops/fused_util).
 FUSED_ACTIVATIONS = ("Relu", "Relu6", "Elu", "Sigmoid")
 _NARROW = {
@@ -160,4 +164,6 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
         },
     }
     text = json.dumps(model, separators=(",", ":"), ensure_ascii=True).encode()
-    return Artifact("tfjs", "tfjs", {"tfjs/model.json": text, **{f"tfjs/{k}": v for k, v in shards.items()}})
+    acting = {name: (_JS / name).read_bytes() for name in _ACTING}
+    files = {"model.json": text, **shards, **acting}
+    return Artifact("tfjs", "tfjs", {f"tfjs/{name}": data for name, data in files.items()})

@@ -1,0 +1,23 @@
+"""Fixtures as bundles, exported when they are first asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from exporter.pipeline import ExportOptions, export
+from fixtures import path as fixture
+from tests.acting.bundles import Bundles
+
+
+@pytest.fixture(scope="session")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> Bundles:
+    out = tmp_path_factory.mktemp("acting")
+
+    def of(name: str) -> Path:
+        if not (out / name).exists():
+            list(export([fixture(name)], ExportOptions(out, verify="none")))
+        return out / name
+
+    return of
