@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.compile import CONTRACT_NODE, compile_graph
+from converters.graph.compile import CONTRACT_NODE
+from converters.graph.signature import derived_notes
 from converters.registry import reader
 from converters.renaming import renamed
 from converters.source import ReadOptions, SourceModel
 from signatures.digest import sha256_hex
-from signatures.errors import BundleError, DamagedFileError, ExportModelError
+from signatures.errors import BundleError, DamagedFileError
 from signatures.graph import Graph, NameScope, Node, topological
 from signatures.infer import SourceFacts
 from signatures.roles import Role
@@ -74,34 +75,36 @@ def recalled(graph: Graph) -> tuple[Graph, Contract | None]:
     return redrawn(Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)), contract), contract
 
 
-def facts_of(graph: Graph, contract: Contract | None) -> SourceFacts:
-    """What the contract says of a graph, for the compiler."""
+def facts_of(graph: Graph, contract: Contract | None, nodes: Mapping[str, str] | None = None) -> SourceFacts:
+    """What the contract says of a graph, for the compiler; ``nodes`` maps outputs to nodes of other names (ONNX)."""
     if contract is None:
         return SourceFacts()
     signature = contract.signature
     layouts = [p.get("layout") for p in signature.preprocess.values() if isinstance(p, Mapping)]
-    facts = SourceFacts(
+    found_again = derived_notes(signature)
+    return SourceFacts(
         roles={s.name: s.role for s in signature.inputs if s.name in graph},
         family=signature.family,
-        algorithm=signature.algorithm,
+        algorithm=signature.algorithm or "",
         image_layout=next((text for text in layouts if isinstance(text, str)), "NHWC"),
         memory_layout=() if signature.memory is None else signature.memory.layout,
         constants=signature.constants,
         distributions={s.name: s.distribution for s in signature.inputs if s.distribution and s.name in graph},
+        outputs=_outputs(graph, signature, nodes or {}),
+        notes=tuple(n for n in signature.notes if n not in found_again),
+        labels=signature.labels,
     )
-    return replace(facts, notes=_own_notes(graph, contract, facts))
 
 
-def _own_notes(graph: Graph, contract: Contract, facts: SourceFacts) -> tuple[str, ...]:
-    """The contract's notes, less those that the compiler will find again by itself."""
-    notes = contract.signature.notes
-    if not notes:
-        return ()
-    try:
-        found = {note for policy in compile_graph(graph, contract.name, None, facts) for note in policy.signature.notes}
-    except ExportModelError:  # it will be raised where the policy is asked for
-        return notes
-    return tuple(n for n in notes if n not in found)
+def _outputs(graph: Graph, signature: PolicySignature, nodes: Mapping[str, str]) -> dict[str, Role | None]:
+    """Output node → its role. The actions come first, and what they mean is read off the graph, as in any source."""
+    heads = 2 if signature.action_space == "hybrid" else 1
+    roles: dict[str, Role | None] = {}
+    for position, spec in enumerate(signature.outputs):
+        node = nodes.get(spec.name, spec.name)
+        if node in graph:
+            roles[node] = Role.ACTION if position < heads else spec.role
+    return roles
 
 
 def redrawn(graph: Graph, contract: Contract) -> Graph:
@@ -113,10 +116,14 @@ def redrawn(graph: Graph, contract: Contract) -> Graph:
     count = NameScope(n.name for n in graph.nodes).fresh("draws")
     draws: dict[str, Node] = {}
     for node in (graph[n] for n in sorted(graph.ancestors(drawn))):
-        best = graph.producer(node.inputs[0]) if node.op == "Reshape" else node
         shape = graph.constant(node.inputs[1]) if node.op == "Reshape" else None
-        if best.op == "ArgMax" and shape is not None and shape.tolist() == [-1, 1]:
-            dtype = best.attrs.get("output_type", np.dtype(np.int64))
+        if shape is None or shape.tolist() != [-1, 1]:
+            continue
+        best, dtype = graph.producer(node.inputs[0]), None
+        while best.op == "Cast":  # of a format that has not the dtype, or whose ArgMax gives another
+            dtype, best = dtype or best.attrs["DstT"], graph.producer(best.inputs[0])
+        if best.op == "ArgMax":
+            dtype = dtype or best.attrs.get("output_type", np.dtype(np.int64))
             attrs = {"seed": 0, "seed2": 0, "output_dtype": dtype}
             draws[node.name] = replace(node, op="Multinomial", inputs=(best.inputs[0], count), attrs=attrs)
     if not draws:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from converters.artifact import WriteOptions
 from converters.graph.options import CompileOptions
 from converters.registry import TARGETS, writer
+from converters.source import ReadOptions
 from exporter.bundle import safe_name
 from exporter.sources import naming, read_source
 from exporter.tables import size_text, table
 from signatures.errors import ExportModelError
+from signatures.graph import Graph
 from signatures.roles import Role
 from signatures.spec import Policy, TensorSpec
 
 _FEED = {
     Role.VECTOR: "the agent's vector observation, as the environment gives it (normalised inside the policy)",
-    Role.VISUAL: "camera image, {layout}, colours from 0 to 1 (divide bytes by 255), first row at the top",
+    Role.VISUAL: "camera image, {layout}, colours {colours}, first row at the top",
     Role.ENTITIES: "variable-length observation",
     Role.NOISE: "N(0, 1) draws, or zeros for the action without chance",
     Role.MASKS: "1 = allowed, 0 = forbidden; branches side by side",
@@ -70,6 +72,8 @@ class Inspection:
     size: int
     nodes: int
     policies: Sequence[PolicyInspection]
+    #: (name, graph) of every model in it, as it was read
+    graphs: Sequence[tuple[str, Graph]] = field(default_factory=tuple, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -84,9 +88,11 @@ class Inspection:
         }
 
 
-def inspect_source(path: Path | str, options: CompileOptions | None = None) -> Inspection:
+def inspect_source(
+    path: Path | str, options: CompileOptions | None = None, read: ReadOptions | None = None
+) -> Inspection:
     """Read and understand a source without writing anything. Raises what the export would raise."""
-    source = read_source(path)
+    source = read_source(path, read)
     found = []
     for policy in source.policies(options):
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
@@ -98,6 +104,7 @@ def inspect_source(path: Path | str, options: CompileOptions | None = None) -> I
         source.size,
         sum(len(m.graph.nodes) for m in source.models),
         found,
+        [(safe_name(source.stem(m)), m.graph) for m in source.models],
     )
 
 
@@ -137,6 +144,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
     lines.append("")
     rows = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
     lines.append(table(("output", "dtype", "shape", "in the source", "meaning"), rows))
+    lines += _label_lines(signature.labels)
     if signature.constants:
         lines += ["", "constants: " + ", ".join(f"{k}={v}" for k, v in signature.constants.items())]
     lines += [f"note: {note}" for note in signature.notes]
@@ -147,11 +155,22 @@ def _policy_text(inspected: PolicyInspection) -> str:
     return "\n".join(lines)
 
 
+def _label_lines(labels: Mapping[str, Any]) -> list[str]:
+    """What the numbers are called, where somebody said it."""
+    named = [(name, texts) for name, texts in labels.get("observations", {}).items()]
+    named += [("continuous actions", labels["actions"])] if "actions" in labels else []
+    named += [(f"branch {i}", texts) for i, texts in enumerate(labels.get("branches", []))]
+    lines = [f"labels of {name}: " + ", ".join(f"{i} {text}" for i, text in enumerate(texts)) for name, texts in named]
+    return ["", *lines] if lines else []
+
+
 def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
     known = spec.distribution or {}
     if spec.role is Role.VECTOR and known.get("kind") == "integer":
         return f"the discrete state, an integer from {known['low']} to {known['high']}"
-    return _FEED.get(spec.role, spec.role.value).format(layout=preprocess.get("layout", "NHWC"))
+    own = preprocess.get("range") == [0, 255]
+    colours = "from 0 to 255 (bytes as they are)" if own else "from 0 to 1 (divide bytes by 255)"
+    return _FEED.get(spec.role, spec.role.value).format(layout=preprocess.get("layout", "NHWC"), colours=colours)
 
 
 def _row(spec: TensorSpec, text: str) -> list[str]:

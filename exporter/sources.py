@@ -75,6 +75,24 @@ class Source:
         return [policy for _, policy in self.compiled(options)]
 
 
+@contextmanager
+def live_source(kind: str, given: object) -> Iterator[Source]:
+    """A live object as a source; ``kind`` is ``session``, ``tf_function`` or ``keras_model``.
+
+    It lasts as long as the context: what TensorFlow runs the original from lies in a temporary folder. Raises
+    UsageError, and what ``read_source`` raises.
+    """
+    import tempfile
+
+    from converters.live.source import label, read_live
+
+    with tempfile.TemporaryDirectory(prefix="export-model-", ignore_cleanup_errors=True) as folder:
+        place = Path(label(kind))
+        with naming(place):
+            live = read_live(kind, given, Path(folder))
+        yield Source(place, live.kind, live.sha256, live.size, [live.model])
+
+
 def read_source(path: Path | str, options: ReadOptions | None = None) -> Source:
     """Read a source. Raises SourceError, NotAPolicyError, DamagedFileError or GraphError, each naming the file."""
     path = Path(path)

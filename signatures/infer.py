@@ -21,9 +21,11 @@ from signatures.roles import (
     CONSTANT_NAMES,
     INPUT_PATTERNS,
     INPUT_ROLES,
+    LISTED_CONSTANTS,
     OBSERVATIONS,
     OUTPUT_NAMES,
     OUTPUT_ROLES,
+    Constant,
     Role,
 )
 
@@ -40,7 +42,8 @@ class SourceFacts:
     """What a reader knows of a source beside its graph.
 
     - ``roles``: placeholders whose role the format says (it goes before names and structure).
-    - ``family``, ``algorithm``: where the format tells; else the graph is asked.
+    - ``family``, ``algorithm``: where the format tells; else (None) the graph is asked. An empty algorithm: none can be
+      told.
     - ``image_layout``: NHWC, or NCHW for torch exports.
     - ``memory_layout``: the memory's parts in order; empty: found from the graph.
     - ``constants``: the ones that are no nodes of the graph.
@@ -49,6 +52,7 @@ class SourceFacts:
       declares none, and any node may be an output.
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``notes``: what the user should know of this source.
+    - ``labels``: names of observations (by placeholder) and actions, where the source carries them.
     """
 
     roles: Mapping[str, Role] = field(default_factory=dict)
@@ -56,11 +60,12 @@ class SourceFacts:
     algorithm: str | None = None
     image_layout: str = "NHWC"
     memory_layout: tuple[str, ...] = ()
-    constants: Mapping[str, int | float] = field(default_factory=dict)
+    constants: Mapping[str, Constant] = field(default_factory=dict)
     distributions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     outputs: Mapping[str, Role | None] = field(default_factory=dict)
     rows: int | None = None
     notes: tuple[str, ...] = ()
+    labels: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +88,7 @@ class Brain:
     scope: str
     #: (output's name in the source, its role, its tensor), in graph order
     outputs: tuple[tuple[str, Role, str], ...]
-    constants: Mapping[str, int | float] = field(default_factory=dict)
+    constants: Mapping[str, Constant] = field(default_factory=dict)
     #: tensors that nothing reads and that could be outputs too, in a graph whose names say nothing
     left_out: tuple[str, ...] = ()
 
@@ -140,7 +145,9 @@ def find_brains(
     given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
     if Role.ACTION in given.values():
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
-        return (Brain("", outputs, _constants(graph, ""), tuple(n for n in declared or () if n in fed - set(given))),)
+        scope = _scope_of(graph, [n for n, role in given.items() if role is Role.ACTION])
+        rest = tuple(n for n in declared or () if n in fed - set(given))
+        return (Brain(scope, outputs, _constants(graph, scope), rest),)
     if declared:
         fed &= set(declared)
     scopes: dict[str, int] = {}
@@ -154,14 +161,18 @@ def find_brains(
     return (_unnamed(graph, fed, set(declared or ())),)
 
 
-def _constants(graph: Graph, scope: str) -> dict[str, int | float]:
-    found: dict[str, int | float] = {}
+def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
+    found: dict[str, Constant] = {}
     for name in CONSTANT_NAMES:
         node = graph.get(scope + name)
         value = graph.constant(node.name) if node is not None else None
-        if value is not None and value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all():
+        if value is None or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
+            continue
+        if value.size == 1:
             number = value.reshape(()).item()
             found[name] = int(number) if float(number).is_integer() else float(number)
+        elif name in LISTED_CONSTANTS and 0 < value.size <= _MAX_LEAVES:
+            found[name] = [int(number) for number in value.reshape(-1).tolist()]
     return found
 
 

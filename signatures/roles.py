@@ -7,7 +7,9 @@ Names by version: ML-Agents ``python/unitytrainers`` 0.1–0.5, ``mlagents/train
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from enum import StrEnum
+from typing import TypeAlias
 
 
 class Role(StrEnum):
@@ -115,6 +117,11 @@ CONSTANT_NAMES = (
     "discrete_action_output_shape",
 )
 
+#: The constants that may hold several numbers: the sizes of the branches (a row of float32 in torch exports).
+LISTED_CONSTANTS = ("discrete_action_output_shape",)
+#: What a constant is in policy.json.
+Constant: TypeAlias = int | float | list[int]
+
 #: Canonical names; numbered ones get ``_0``, ``_1``… or a suffix from the second on.
 CANONICAL = {
     Role.NOISE: "epsilon",
@@ -144,3 +151,8 @@ def parse_role(text: str) -> Role | None:
     if text in ALIASES:
         return ALIASES[text]
     return Role(text) if text in Role._value2member_map_ else None
+
+
+def numbers(constants: Mapping[str, Constant]) -> dict[str, int | float]:
+    """The constants that are single numbers."""
+    return {name: value for name, value in constants.items() if not isinstance(value, list)}

@@ -1,7 +1,7 @@
 """Inputs to try a policy on, drawn from the policy itself and seeded.
 
-Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, values of 1e3, all but
-one action masked), images in 0..1, batches of 1, 2 and 7.
+Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, values of 1e3, float32
+denormals, all but one action masked), images in 0..1, batches of 1, 2 and 7, and one of 64 where there are no images.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
+#: Tried once, and not with images, which take long.
+LARGE_BATCH = 64
 #: What a free axis behind the batch is tried with (image sides, number of entities).
 _FREE_AXIS = 8
 
@@ -41,11 +43,14 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
         for batch in BATCHES
         for i in range(samples)
     ]
-    for name, style in (("zeros", _zeros), ("clip edges", _clip_edges), ("beyond the clip", _beyond), ("1e3", _large)):
+    edges = (("zeros", _zeros), ("clip edges", _clip_edges), ("beyond the clip", _beyond), ("1e3", _large))
+    for name, style in (*edges, ("denormals", _denormals)):
         cases.append(_case(signature, rng, name, 2, style))
     if any(s.role is Role.MASKS for s in signature.inputs):
         cases.append(_case(signature, rng, "all but one action masked", 7, _typical, masks=_one_allowed))
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
+    if not any(s.role is Role.VISUAL for s in signature.inputs):
+        cases.append(_case(signature, rng, f"typical, batch {LARGE_BATCH}", LARGE_BATCH, _typical))
     return cases
 
 
@@ -87,7 +92,7 @@ def _other(
             return rng.integers(0, sizes[0], shape)
         return np.stack([rng.integers(0, sizes[min(i, len(sizes) - 1)], shape[0]) for i in range(shape[1])], axis=1)
     if spec.role is Role.VISUAL:
-        return rng.random(shape)
+        return rng.random(shape) * float((spec.distribution or {}).get("high", 1.0))
     if spec.role is Role.NOISE:
         return rng.standard_normal(shape)
     if spec.role is Role.MEMORY_IN:
@@ -128,6 +133,11 @@ def _beyond(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) 
 
 def _large(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(1e3 * rng.choice([-1.0, 1.0], shape))
+
+
+def _denormals(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """Below the smallest normal float32: runtimes may take them for zero."""
+    return np.asarray(np.finfo(np.float32).tiny * rng.uniform(-1.0, 1.0, shape))
 
 
 def _all_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from signatures.graph import Graph
-from signatures.roles import OBSERVATIONS, Role
+from signatures.labels import parsed
+from signatures.roles import OBSERVATIONS, Constant, Role
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +82,14 @@ class PolicySignature:
     family: str
     action_space: str  # continuous | discrete | hybrid
     branches: tuple[int, ...] = ()
-    #: The training algorithm where the graph tells it: PPO, SAC, BC, DQN.
+    #: The training algorithm where the graph tells it: PPO, SAC, POCA, BC, DQN.
     algorithm: str | None = None
     memory: Memory | None = None
     preprocess: Mapping[str, Any] = field(default_factory=dict)
-    constants: Mapping[str, int | float] = field(default_factory=dict)
+    constants: Mapping[str, Constant] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    #: Names that people gave to observations and actions (signatures/labels.py); empty where they gave none.
+    labels: Mapping[str, Any] = field(default_factory=dict)
 
     def input(self, name: str) -> TensorSpec:
         """The input called ``name``; KeyError if there is none."""
@@ -127,6 +131,7 @@ class PolicySignature:
             "preprocess": dict(self.preprocess),
             "constants": dict(self.constants),
             "notes": list(self.notes),
+            **({"labels": dict(self.labels)} if self.labels else {}),
         }
 
     @classmethod
@@ -144,9 +149,18 @@ class PolicySignature:
             if memory
             else None,
             preprocess=entry.get("preprocess", {}),
-            constants=entry.get("constants", {}),
+            constants={str(name): _constant(value) for name, value in entry.get("constants", {}).items()},
             notes=tuple(entry.get("notes", ())),
+            labels=parsed(entry.get("labels")),
         )
+
+
+def _constant(value: Any) -> Constant:
+    """A constant of policy.json; raises ValueError where it is none."""
+    items = value if isinstance(value, list) else [value]
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in items):
+        raise ValueError(f"the constant {value!r} is no number")
+    return [int(v) for v in items] if isinstance(value, list) else items[0]
 
 
 def _named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:

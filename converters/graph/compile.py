@@ -14,18 +14,18 @@ from converters.graph.passes.companions import LOG_PROBS, add_companions
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import batch_size_rank, complete_shapes, constant_value, set_values, settle_inputs
 from converters.graph.passes.naming import name_tensors
-from converters.graph.passes.noise import lift_noise, samplers
+from converters.graph.passes.noise import lift_noise, samplers, unseeded
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.straighten import straighten
 from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.shapes import Types, infer_types
-from converters.graph.signature import Compiled, build_signature
+from converters.graph.signature import Compiled, branch_sizes, build_signature
 from converters.graph.types import static_shape
 from signatures.errors import UsageError
 from signatures.graph import Graph, Node, node_of, split_ref, topological
 from signatures.infer import ActionMeaning, Brain, Head, SourceFacts, action_meaning, classify_inputs, find_brains
-from signatures.roles import Role
+from signatures.roles import Constant, Role
 from signatures.spec import Policy, SourceMap
 
 #: The name of the string constant in which our GraphDefs carry their contract.
@@ -104,6 +104,8 @@ class _Compiler:
             dtype = types[fetches[head.name]].dtype
             scores = masked and head.base != "continuous_actions"
             self.meanings[head.name] = action_meaning(work, fetches[head.name], dtype, scores)
+        # Sizes are looked up before the source's own action without chance takes the place of one with branches.
+        sizes = branch_sizes(types, [b for m in self.meanings.values() for b in m.branches])
         work, fetches = _settle_single_draws(work, fetches, list(self.meanings.values()), types)
         draws = {n.name: _dims(types, n.name) for n in samplers(work)}
         deterministic = self.options.deterministic
@@ -111,17 +113,19 @@ class _Compiler:
         fed = {n: _dims(types, n) for n, r in roles.items() if r is Role.NOISE and n in work}
         before = work
         work = lift_noise(work, "keep" if kept else "zero" if deterministic else self.options.noise, fed)
+        work = unseeded(work)
         noise = {**draws, **fed}
         tensors = {n: _tensor(before[n]) for n in noise}
         branches = self._branch_origins(work, pinned)
         for head in self.brain.heads:
             work, fetches = add_companions(work, fetches, head, self.meanings[head.name], noise)
+        squashed = work.producer(fetches[self.brain.heads[0].name]).op == "Tanh"
         if deterministic:
             fetches = self._without_chance(fetches, sources)
         work, fetches = drop_identities(fold(work).pruned(fetches.values()), fetches)
         compiled = Compiled(
             work, fetches, sources, self.brain, self.options, self.facts, roles, self.meanings, draws,
-            {n.op for n in upstream.nodes},
+            {n.op for n in upstream.nodes}, sizes, squashed,
         )  # fmt: skip
         signature, feeds, named = build_signature(compiled)
         policy = self._named(name, Policy(name, work, signature, feeds, named), roles)
@@ -163,13 +167,13 @@ class _Compiler:
         internal brain of 0.3 to 0.5 feeds it to every recurrent policy without asking whether it is there.
         """
         scope, source = self.brain.scope, self.options.names == "source"
-        keys = list(self.brain.constants) if source else []
+        kept = {**self.facts.constants, **self.brain.constants} if source else {}
         unread = [n for n, r in roles.items() if r is Role.SEQUENCE_LENGTH and source]
-        reserved = (CONTRACT_NODE, *(scope + k for k in keys), *unread)
+        reserved = (CONTRACT_NODE, *(scope + k for k in kept), *unread)
         graph = name_tensors(policy.graph, policy.feeds, policy.fetches, reserved)
         constants = [
-            Node(scope + key, "Const", value=np.array(self.brain.constants[key], np.int32), origin=f"{scope}{key}:0")
-            for key in keys
+            Node(scope + key, "Const", value=self._constant(value), origin=f"{scope}{key}:0")
+            for key, value in kept.items()
         ]
         return Policy(
             name,
@@ -178,6 +182,13 @@ class _Compiler:
             {s.name: s.name for s in policy.signature.inputs},
             {s.name: s.name for s in policy.signature.outputs},
         )
+
+    def _constant(self, value: Constant) -> np.ndarray:
+        """A constant as the trainer writes it: TensorFlow's are int32 scalars, torch's rows of float32."""
+        if isinstance(value, list):
+            return np.array([value], np.float32)
+        torch = self.facts.family is not None and "PyTorch" in self.facts.family
+        return np.array([value], np.float32) if torch else np.array(value, np.int32)
 
     def _source_map(
         self, policy: Policy, source: Graph, roles: Mapping[str, Role], branches: tuple[str | None, ...], noise: Shapes

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
 from signatures.errors import GraphError
-from signatures.graph import Graph, normal_ref, ref, split_ref
+from signatures.graph import Graph, Node, normal_ref, ref, split_ref
 
 #: Ops that round nothing, beside the structural ones.
 _EXACT = frozenset(
@@ -52,6 +53,34 @@ def _moved(array: np.ndarray, jitter: np.random.Generator, ulps: int = 1) -> np.
         return np.asarray(np.where(array == 0, array, array + sign * step)).astype(array.dtype)
 
 
+def _added_up(
+    entry: OpDef,
+    node: Node,
+    arguments: Sequence[np.ndarray],
+    results: Sequence[np.ndarray],
+    jitter: np.random.Generator,
+) -> tuple[np.ndarray, ...]:
+    """Sums of products moved by what rounding every partial sum makes, where they are added one after the other.
+
+    Partial sums of n terms walk: on average their square is half of ‖terms‖², and each is rounded by about a quarter
+    of a unit, so the total is about ε/4·√n·‖terms‖. The kernel itself, run on squares, gives ‖terms‖².
+    """
+    if any(r.dtype.kind != "f" for r in results):
+        return tuple(results)
+    if node.op == "Sum":
+        terms = arguments[0].size / max(1, results[0].size)
+    else:  # the second operand is the kernel: its last axis is the result's (a transposed one has as many elements)
+        terms = arguments[1].size / max(1, results[0].shape[-1])
+    with np.errstate(all="ignore"):
+        squares = run_kernel(entry, node, [np.square(a) if a.dtype.kind == "f" else a for a in arguments])
+        moved = []
+        for result, square in zip(results, squares, strict=True):
+            step = np.finfo(result.dtype).eps / 4 * np.sqrt(terms * np.maximum(square, 0))
+            sign = np.where(jitter.random(result.shape) < 0.5, -1, 1)
+            moved.append(np.where(np.isfinite(step), result + sign * step, result).astype(result.dtype))
+    return tuple(moved)
+
+
 def run_graph(
     graph: Graph,
     feeds: Mapping[str, np.ndarray],
@@ -64,8 +93,8 @@ def run_graph(
     GraphError when a placeholder is not fed or a kernel fails.
 
     With ``jitter`` every float that an op computes, and every term of a sum of products, is moved by one unit in its
-    last place, up or down at random (Monte Carlo arithmetic); the results of functions that runtimes approximate by
-    four. How far the outputs then move is what rounding explains.
+    last place, up or down at random (Monte Carlo arithmetic), a sum by what rounding its partial sums makes, the result
+    of a function that runtimes approximate by four units. How far the outputs then move is what rounding explains.
     """
     values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
     needed = graph.ancestors(fetch, stop=frozenset(split_ref(name)[0] for name in values))
@@ -85,6 +114,8 @@ def run_graph(
         if jitter is not None and node.op in _SUMS:
             arguments = [_moved(a, jitter) for a in arguments]
         results = run_kernel(entry, node, arguments)
+        if jitter is not None and node.op in _SUMS:
+            results = _added_up(entry, node, arguments, results, jitter)
         if jitter is not None and not entry.structural and node.op not in _EXACT:
             ulps = _APPROXIMATION_ULPS if node.op in _APPROXIMATED else 1
             results = tuple(_moved(r, jitter, ulps) for r in results)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,6 +19,9 @@ Types = dict[str, TensorType]
 _DATA = {"ConcatV2": slice(0, -1), "Pack": slice(None)}
 #: Folding may not make a constant of more elements than this out of smaller ones.
 _MAX_FOLD = 1 << 20
+#: No tensor may have more elements than this per row (256 MiB in float32), unless the op was given as many: a Fill,
+#: Tile, Pad, Range or OneHot of a few bytes may ask for any amount of memory.
+MAX_ELEMENTS = 1 << 26
 
 
 def infer_types(graph: Graph, *, partial: bool = False) -> Types:
@@ -69,6 +73,7 @@ def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols
             why=f"{type(error).__name__}: {error}",
             fix="the graph is damaged; freeze it again from its checkpoint",
         ) from error
+    _check_size(node, args, results)
     if op.kernel is None or not op.foldable or results[0].value is not None or not args:
         return results
     values = [a.value for a in args]
@@ -76,11 +81,26 @@ def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols
         return results
     known = [v for v in values if v is not None]
     if all(v.dtype != object for v in known):
-        sizes = [r.shape for r in results]
-        if any(s is not None and np.prod([d for d in s if isinstance(d, int)] or [1]) > _MAX_FOLD for s in sizes):
+        if any(_elements(r) > _MAX_FOLD for r in results):
             return results
         return [TensorType(v.dtype, tuple(int(d) for d in v.shape), v) for v in run_kernel(op, node, known)]
     return _symbolic(op, node, args, known, results, symbols)
+
+
+def _elements(kind: TensorType) -> int:
+    """Elements of a tensor; an axis that is free counts as one."""
+    return math.prod(abs(d) for d in kind.shape or () if isinstance(d, int))
+
+
+def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> None:
+    """Raise GraphError where a result is larger than any policy's, before anything of that size is allocated."""
+    largest = max(map(_elements, results), default=0)
+    if largest > max(MAX_ELEMENTS, sum(map(_elements, args)) if node.op != "Placeholder" else 0):
+        raise GraphError(
+            f"node {node.name!r} ({node.op}) makes a tensor of {largest} elements",
+            why=f"no policy has one of more than {MAX_ELEMENTS} per row",
+            fix="the graph is damaged, or is no policy; freeze it again from its checkpoint",
+        )
 
 
 def run_kernel(op: OpDef, node: Node, arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:

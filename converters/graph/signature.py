@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 from converters.graph.options import CompileOptions
+from converters.graph.passes.colours import highest_colour
 from converters.graph.passes.companions import LOG_PROBS
 from converters.graph.passes.stats import memory_layout, normaliser
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
 from signatures.eras import generation
 from signatures.errors import SignatureError
-from signatures.graph import Graph, Node, TensorShape
+from signatures.graph import Graph, Node, TensorShape, node_of
 from signatures.infer import ActionMeaning, Brain, Head, SourceFacts
-from signatures.roles import OBSERVATIONS, Role, canonical_name
+from signatures.labels import remaining
+from signatures.roles import OBSERVATIONS, Role, canonical_name, numbers
 from signatures.spec import Memory, PolicySignature, TensorSpec
 
 _INPUT_ORDER = (*OBSERVATIONS, Role.MASKS, Role.PREV_ACTION, Role.MEMORY_IN, Role.NOISE, Role.PARAMETER)
@@ -47,15 +51,22 @@ class Compiled:
     draws: Mapping[str, tuple[int | None, ...]]
     #: op types of the source
     ops: set[str]
+    #: sizes of a discrete action's branches
+    branches: tuple[int, ...] = ()
+    #: whether the source's action, chance included, is a tanh
+    squashed: bool = False
 
 
 def build_signature(compiled: Compiled) -> tuple[PolicySignature, dict[str, str], dict[str, str]]:
     """(signature, name → placeholder, name → tensor). Raises SignatureError."""
     types = infer_types(compiled.graph)
-    notes = list(compiled.facts.notes)
+    notes: list[str] = []
     if compiled.brain.left_out:
         notes.append(f"not exported: {', '.join(compiled.brain.left_out)}; name an output with --output NAME=ROLE")
     feeds, inputs = _inputs(compiled, types, notes)
+    # A bundle that is read back says what its first source drew, which may be gone by now (--deterministic).
+    told = (n for n in compiled.facts.notes if (lifted := _LIFTED.fullmatch(n)) is None or lifted[1] in feeds)
+    notes = [*told, *notes]
     outputs, named = _outputs(compiled, types)
     meanings = compiled.meanings.values()
     kinds = {m.role is Role.CONTINUOUS for m in meanings}
@@ -65,20 +76,70 @@ def build_signature(compiled: Compiled) -> tuple[PolicySignature, dict[str, str]
     signature = PolicySignature(
         inputs=tuple(inputs),
         outputs=tuple(outputs),
-        family=facts.family or generation(constants, bare, compiled.ops),
+        family=facts.family or generation(numbers(constants), bare, compiled.ops),
         action_space="hybrid" if len(kinds) > 1 else "continuous" if True in kinds else "discrete",
-        branches=_branch_sizes(types, [b for m in meanings for b in m.branches]),
-        algorithm=facts.algorithm or _algorithm(compiled, [s.role for s in inputs]),
+        branches=compiled.branches,
+        algorithm=_algorithm(compiled) if facts.algorithm is None else facts.algorithm or None,
         memory=_memory(compiled, inputs, outputs, feeds, notes),
         preprocess={
-            s.name: {"layout": facts.image_layout, "range": [0, 1], "from_bytes": "divide by 255"}
+            s.name: _preprocessing(facts.image_layout, highest_colour(compiled.graph, feeds[s.name]))
             for s in inputs
             if s.role is Role.VISUAL
         },
         constants=constants,
-        notes=tuple(notes),
+        notes=tuple(dict.fromkeys(notes)),
     )
+    if facts.labels:
+        signature = replace(signature, labels=remaining(_renamed(facts.labels, feeds), signature))
     return signature, feeds, named
+
+
+def _renamed(labels: Mapping[str, Any], feeds: Mapping[str, str]) -> dict[str, Any]:
+    """Labels whose observations are placeholders, under the names that the inputs have now."""
+    named = labels.get("observations", {})
+    return {**labels, "observations": {name: named[node] for name, node in feeds.items() if node in named}}
+
+
+def _preprocessing(layout: str, highest: int) -> dict[str, object]:
+    """What is done to a camera's image before it is fed."""
+    done = "divide by 255" if highest == 1 else "as they are: the policy divides by 255 itself"
+    return {"layout": layout, "range": [0, highest], "from_bytes": done}
+
+
+# ------------------------------------------------------------------ notes that follow from the signature
+
+
+_LIFTED = re.compile(r"the noise drawn inside the graph \(.*\) is now the input (.+); feed N\(0, 1\)")
+
+
+def _lifted(origin: object, name: str) -> str:
+    return f"the noise drawn inside the graph ({origin}) is now the input {name}; feed N(0, 1)"
+
+
+def _unknown_input(name: str) -> str:
+    return f"{name} is an input whose meaning is not known; it must be fed, or fixed with --set"
+
+
+def _no_memory_input(name: str) -> str:
+    return f"{name} is computed without a memory input"
+
+
+def _lost_memory(name: str) -> str:
+    return (
+        f"the source takes a memory ({name}) but does not give it back: its recurrent_out was lost in the export, so "
+        "every step starts from the memory that is fed"
+    )
+
+
+def derived_notes(signature: PolicySignature) -> set[str]:
+    """Notes that ``build_signature`` makes again wherever the policy is read back, under the names it then has."""
+    notes = {_unknown_input(s.name) for s in signature.inputs if s.role is Role.PARAMETER}
+    memory = signature.memory
+    if memory is not None and memory.input is None and memory.output is not None:
+        notes.add(_no_memory_input(memory.output))
+    if memory is not None and memory.input is not None and memory.output is None:
+        notes.add(_lost_memory(memory.input))
+    return notes
 
 
 # ------------------------------------------------------------------ outputs
@@ -119,8 +180,14 @@ def _output_name(compiled: Compiled, name: str) -> str:
     if compiled.options.names == "canonical":
         return name
     # A number is no trainer's name but PyTorch's way of counting, and TensorFlow.js sorts such keys.
-    own = {canonical: base for base, canonical in compiled.brain.canonical.items() if not base.isdigit()}
-    return compiled.brain.scope + own[name] if name in own else name
+    brain = compiled.brain
+    own = {
+        brain.canonical.get(base): (base, node_of(tensor)) for base, _, tensor in brain.outputs if not base.isdigit()
+    }
+    if name not in own:
+        return name
+    base, node = own[name]
+    return brain.scope + base if node.startswith(brain.scope) else base
 
 
 def _check_batch(name: str, shape: tuple[int | str, ...] | None, source: object) -> None:
@@ -133,7 +200,8 @@ def _check_batch(name: str, shape: tuple[int | str, ...] | None, source: object)
     )
 
 
-def _branch_sizes(types: Types, branches: list[str]) -> tuple[int, ...]:
+def branch_sizes(types: Types, branches: Sequence[str]) -> tuple[int, ...]:
+    """Lengths of the last axes of ``branches``; empty where one is not known."""
     sizes = [(types[b].shape or (None,))[-1] for b in branches if b in types]
     known = tuple(s for s in sizes if isinstance(s, int))
     return known if len(known) == len(branches) else ()
@@ -174,9 +242,9 @@ def _inputs(compiled: Compiled, types: Types, notes: list[str]) -> tuple[dict[st
         distribution = compiled.facts.distributions.get(node.name) or _distribution(graph, types, node, role)
         specs.append(TensorSpec(name, role, node.attrs["dtype"].name, _known_shape(node), node.origin, distribution))
         if node.name in compiled.draws:
-            notes.append(f"the noise drawn inside the graph ({node.origin}) is now the input {name}; feed N(0, 1)")
+            notes.append(_lifted(node.origin, name))
         if role is Role.PARAMETER:
-            notes.append(f"{name} is an input whose meaning is not known; it must be fed, or fixed with --set")
+            notes.append(_unknown_input(name))
     return feeds, specs
 
 
@@ -202,7 +270,7 @@ def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[st
     if role is Role.MASKS:
         return {"kind": "mask", "allowed": 1, "forbidden": 0}
     if role is Role.VISUAL:
-        return {"kind": "uniform", "low": 0.0, "high": 1.0}
+        return {"kind": "uniform", "low": 0.0, "high": float(highest_colour(graph, node.name))}
     if role is Role.VECTOR and node.attrs["dtype"].kind in "iu":
         depth = _one_hot_depth(graph, types, node)
         return None if depth is None else {"kind": "integer", "low": 0, "high": depth - 1}
@@ -222,7 +290,7 @@ def _one_hot_depth(graph: Graph, types: Types, node: Node) -> int | None:
 # ------------------------------------------------------------------ facts
 
 
-def _algorithm(compiled: Compiled, roles: list[Role]) -> str | None:
+def _algorithm(compiled: Compiled) -> str | None:
     """The trainer that writes such a graph, where only one does.
 
     SAC squashes its sample with tanh and has no critic in the export; PPO clips it (0.4 on) or not (0.1-0.3); cloned
@@ -236,9 +304,9 @@ def _algorithm(compiled: Compiled, roles: list[Role]) -> str | None:
         return "DQN" if meaning.branches else None
     if meaning.role is not Role.CONTINUOUS:
         return None
-    if not compiled.draws and Role.NOISE not in roles:
+    if not compiled.draws and Role.NOISE not in compiled.roles.values():
         return "BC" if head.base == "action" and compiled.facts.family is None else None
-    return "SAC" if compiled.graph.producer(compiled.fetches[head.name]).op == "Tanh" else "PPO"
+    return "SAC" if compiled.squashed else "PPO"
 
 
 def _memory(
@@ -252,13 +320,10 @@ def _memory(
     given = next((s for s in outputs if s.role is Role.MEMORY_OUT), None)
     if taken is None:
         if given is not None:
-            notes.append(f"{given.name} is computed without a memory input")
+            notes.append(_no_memory_input(given.name))
             return Memory(int(given.shape[-1] or 0), None, given.name)
         return None
     if given is None:
-        notes.append(
-            f"the source takes a memory ({taken.name}) but does not give it back: its recurrent_out was lost in the "
-            "export, so every step starts from the memory that is fed"
-        )
+        notes.append(_lost_memory(taken.name))
     layout = compiled.facts.memory_layout or memory_layout(compiled.graph, feeds[taken.name])
     return Memory(int(taken.shape[-1] or 0), taken.name, None if given is None else given.name, layout)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.bundle_source import Contract, contract_of, redrawn
+from converters.bundle_source import contract_of, redrawn
 from converters.bundle_source import facts_of as facts_of_contract
 from converters.onnx.reader import OnnxModel
 from converters.onnx.writer import CONTRACT_KEY
@@ -19,7 +19,7 @@ from converters.renaming import renamed
 from signatures.eras import torch_generation
 from signatures.graph import Graph, NameScope, Node, topological
 from signatures.infer import SourceFacts
-from signatures.roles import ACTION_NAMES, OUTPUT_NAMES, Role
+from signatures.roles import OUTPUT_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
 _ACTION = re.compile(r"actions?|action_mean|mean_actions?|outputs?|mean|mu|pi|policy")
@@ -33,8 +33,7 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     text = model.metadata.get(CONTRACT_KEY)
     if text is not None:
         contract = contract_of(text)
-        facts = facts_of_contract(model.graph, contract)
-        return redrawn(model.graph, contract), replace(facts, outputs=_roles_of_contract(model, contract))
+        return redrawn(model.graph, contract), facts_of_contract(model.graph, contract, model.outputs)
     version = model.graph.constant("version_number") if "version_number" in model.graph else None
     number = 0 if version is None or version.size != 1 else int(version.reshape(()))
     graph, notes = _with_rows_first(model)
@@ -59,21 +58,6 @@ def _image_layout(model: OnnxModel) -> str:
     if images and all(s[3] in _COLOURS and s[1] not in _COLOURS for s in images):
         return "NHWC"
     return "NCHW"
-
-
-# ------------------------------------------------------------------ this tool's own
-
-
-def _roles_of_contract(model: OnnxModel, contract: Contract) -> dict[str, Role | None]:
-    """Output node → its role, as the contract says it; None leaves it to the name."""
-    outputs = [s for s in contract.signature.outputs if s.name in model.outputs]
-    if any(s.name.rpartition("/")[2] in ACTION_NAMES for s in outputs):
-        return {model.outputs[s.name]: None for s in outputs}
-    roles: dict[str, Role | None] = {}
-    for position, spec in enumerate(outputs):
-        own = OUTPUT_NAMES.get(spec.name, spec.role)
-        roles[model.outputs[spec.name]] = Role.ACTION if position == 0 else own
-    return roles
 
 
 # ------------------------------------------------------------------ ML-Agents

@@ -1,12 +1,14 @@
 """Policy to ONNX: each node through its lowering in the op table.
 
 Canonical names for inputs and outputs, the batch axis symbolic, the contract in ``metadata_props``, checked by
-``onnx.checker`` with full shape inference before anything is written.
+``onnx.checker`` with full shape inference before anything is written. Values are called as the tensors of the graph
+that they are; where that cannot be, ``metadata_props`` says so (converters/onnx/tensor_map.py), so that verification
+can point at a tensor inside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,9 @@ from converters.graph.ops.table import op_of, unsupported
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
+from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
 from signatures.errors import GraphError, UsageError
-from signatures.graph import Node, ref
+from signatures.graph import Graph, Node, ref
 from signatures.spec import Policy, TensorSpec
 
 #: Opset → the IR version of the same ONNX release (onnx/helper.py, OP_SET_ID_VERSION_MAP).
@@ -29,15 +32,16 @@ CONTRACT_KEY = "export_model_contract"
 class _Builder:
     """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
 
-    def __init__(self, types: Types, opset: int) -> None:
+    def __init__(self, types: Types, opset: int, outputs: Collection[str]) -> None:
         import onnx
 
         self.onnx = onnx
         self.opset = opset
         self.types = types
+        self.outputs = frozenset(outputs)
         self.nodes: list[Any] = []
         self.initializers: list[Any] = []
-        self.sources: dict[str, str] = {}
+        self.turned: dict[str, View] = {}
         self._values: dict[str, str] = {}
         self._constants: dict[tuple[Any, ...], str] = {}
         self._taken: set[str] = set()
@@ -48,6 +52,9 @@ class _Builder:
 
     def type_of(self, reference: str) -> TensorType:
         return self.types[reference]
+
+    def holds(self, value: str, reference: str, axes: Sequence[int]) -> None:
+        self.turned[reference] = View(value, tuple(axes))
 
     def bind(self, reference: str, value: str) -> None:
         """Let ``value`` stand for a tensor of the graph."""
@@ -75,7 +82,7 @@ class _Builder:
     def const(self, array: np.ndarray, hint: str = "const") -> str:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
-            name = self.fresh(f"{self._prefix}/{hint}" if self._prefix else hint)
+            name = self.fresh("/".join(part for part in (self._prefix, hint) if part))
             self._constants[key] = name
             self.initializers.append(self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
         return self._constants[key]
@@ -85,7 +92,8 @@ class _Builder:
         self._prefix = node.name
         if node.op == "Const":
             assert node.value is not None
-            self.bind(node.name, self.const(node.value, "value"))
+            # An initializer that is an output is no valid model: that one gets another name, and an Identity.
+            self.bind(node.name, self.const(node.value, "value" if node.name in self.outputs else ""))
             return
         entry = op_of(node)
         if entry.lower is None:
@@ -99,8 +107,6 @@ class _Builder:
             if made is not None and reference not in self._taken:
                 self._rename(before, value, reference)
                 value = reference
-                if isinstance(node.origin, str) and index == 0:
-                    self.sources[value] = node.origin
             self.bind(reference, value)
 
     def _rename(self, start: int, old: str, new: str) -> None:
@@ -113,6 +119,26 @@ class _Builder:
                 node.name = new
         self._taken.discard(old)
         self._taken.add(new)
+
+    def tensors(self, graph: Graph, present: Collection[str]) -> TensorMap:
+        """What of ``graph``, as it was before anything was fused, is in the model under another name or not at all."""
+        views: dict[str, View | None] = {}
+        references = dict.fromkeys([*(n.name for n in graph.nodes), *(r for n in graph.nodes for r in n.inputs)])
+        for reference in references:
+            value = self._values.get(reference)
+            if value is not None and value in present:
+                if value != reference:
+                    views[reference] = View(value)
+            elif self.turned.get(reference, View("")).name in present:
+                views[reference] = self.turned[reference]
+            elif reference in present:
+                views[reference] = None
+        sources = {
+            n.name: n.origin
+            for n in graph.nodes
+            if isinstance(n.origin, str) and n.origin not in (n.name, f"{n.name}:0")
+        }
+        return TensorMap(views, sources)
 
 
 def _value_info(onnx: Any, spec: TensorSpec, batch: str = "batch") -> Any:
@@ -140,7 +166,7 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
     graph = fuse(policy.graph, policy.fetches.values(), activations=())
-    builder = _Builder(infer_types(graph), options.opset)
+    builder = _Builder(infer_types(graph), options.opset, [s.name for s in policy.signature.outputs])
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)
     for node in graph.nodes:
@@ -162,7 +188,9 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
         ir_version=IR_VERSIONS[options.opset],
         opset_imports=[onnx.helper.make_opsetid("", options.opset)],
     )
-    onnx.helper.set_model_props(model, {CONTRACT_KEY: options.contract})
+    present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
+    tensors = builder.tensors(policy.graph, present).dumps()
+    onnx.helper.set_model_props(model, {CONTRACT_KEY: options.contract, **({TENSORS_KEY: tensors} if tensors else {})})
     data: bytes = model.SerializeToString(deterministic=True)
     _check(onnx, data, policy.name)
     path = f"{policy.name}.onnx"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -58,7 +58,6 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
                 f"the signature's {key!r} is the tensor {tensor.name!r}, which is not in the graph",
                 fix="save the model again",
             )
-    graph, signature = _without_bundles(graph, signature)
     keep = [n.name for n in graph.nodes if n.name in (*CONSTANT_NAMES, CONTRACT_NODE)]
     graph = _with_placeholders(graph, signature)
     graph = graph.pruned([*signature.roots, *keep])
@@ -98,27 +97,6 @@ def _with_placeholders(graph: Graph, signature: ModelSignature) -> Graph:
             )
         nodes.append(node)
     return Graph(tuple(nodes))
-
-
-def _without_bundles(graph: Graph, signature: ModelSignature) -> tuple[Graph, ModelSignature]:
-    """Without IdentityN, which custom gradients (swish) leave: an Identity per output."""
-    several = {n.name: n for n in graph.nodes if n.op == "IdentityN" and n.inputs}
-    if not several:
-        return graph, signature
-    scope = NameScope(n.name for n in graph.nodes)
-    single: dict[str, str] = {}
-    nodes: list[Node] = []
-    for node in graph.nodes:
-        if node.name not in several:
-            nodes.append(node)
-            continue
-        for index, reference in enumerate(node.inputs):
-            name = scope.fresh(f"{node.name}/{index}") if index else node.name
-            single[ref(node.name, index)] = name
-            nodes.append(Node(name, "Identity", (reference,), origin=f"{node.name}:{index}"))
-    outputs = {k: replace(t, name=single.get(normal_ref(t.name), t.name)) for k, t in signature.outputs.items()}
-    graph = Graph(topological([n.with_inputs(single.get(r, r) for r in n.inputs) for n in nodes]))
-    return graph, replace(signature, outputs=outputs)
 
 
 def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:

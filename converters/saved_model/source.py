@@ -30,10 +30,10 @@ def read(path: Path, options: ReadOptions) -> list[SourceModel]:
     checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
     training = training_graph(saved.graph_def)
     frozen = freeze(training, checkpoint, saved.signature.roots or None)
-    graph, roles = expose(frozen, saved.signature)
-    graph, contract = recalled(graph)
+    graph, contract = recalled(frozen)
     facts = facts_of(graph, contract)
     if contract is None:
+        graph, roles = expose(frozen, saved.signature)
         facts = SourceFacts(roles=roles, notes=_notes(saved))
     files = (file, *(() if checkpoint is None else checkpoint.files))
     original = OriginalRun("tensorflow", folder, {"kind": "variables", "tags": list(saved.tags)})

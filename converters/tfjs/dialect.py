@@ -6,7 +6,6 @@
   condition.
 - Softsign does not exist. Cast from float to bool cuts (0.6 is false on wasm). A stride beside a shrunk axis of a
   StridedSlice gives other elements. A SAME convolution whose windows leave a rest is all zeros on wasm.
-- A seed other than 0 on a sampler makes *every* run draw the same numbers.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 
 from converters.graph.editor import Editor
-from converters.graph.ops.chance import SAMPLERS
 from converters.graph.ops.convolution import window_padding
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import BOOL, INT32
@@ -26,14 +24,12 @@ from signatures.graph import Graph, Node
 
 def for_tfjs(graph: Graph) -> Graph:
     """See the module; names of the nodes that stay are kept."""
-    if not any(n.op in _REWRITES or n.op in SAMPLERS for n in graph.nodes):
+    if not any(n.op in _REWRITES for n in graph.nodes):
         return graph
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
-        if node.op in SAMPLERS:
-            editor.keep(replace(node, attrs={**node.attrs, "seed": 0, "seed2": 0}))
-        elif node.op in _REWRITES:
+        if node.op in _REWRITES:
             _REWRITES[node.op](editor, node, types)
         else:
             editor.keep(node)

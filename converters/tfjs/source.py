@@ -15,8 +15,9 @@ from signatures.infer import SourceFacts
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:
     """The model's signature as a policy; one that this tool wrote is what its contract says."""
     model = read_model(path / MODEL if path.is_dir() else path)
-    graph, roles = expose(unfuse(model.graph), model.signature)
+    graph = unfuse(model.graph)
     if model.contract is None:
+        graph, roles = expose(graph, model.signature)
         return [SourceModel(graph, model.files, SourceFacts(roles=roles))]
     contract = contract_of(model.contract)
     graph = retyped(redrawn(graph, contract), contract)

@@ -8,17 +8,20 @@ are then zero, masks allow everything. Arrays under the names of outputs are the
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from exporter.parity.compare import Difference
 from signatures.errors import UsageError
 from signatures.roles import Role
 from signatures.sampling import Case
 from signatures.spec import PolicySignature, TensorSpec
 
+Feeds = Mapping[str, np.ndarray]
+Check = Callable[[str, Feeds, np.ndarray], Difference]
 #: Rows that are run at once; a recording may hold thousands.
 _ROWS = 64
 _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
@@ -28,8 +31,26 @@ _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
 class Golden:
     """What was recorded: cases to run, and for each the recorded outputs (by canonical name; none may be there)."""
 
-    cases: tuple[Case, ...]
-    answers: tuple[Mapping[str, np.ndarray], ...]
+    cases: tuple[Case, ...] = ()
+    answers: tuple[Mapping[str, np.ndarray], ...] = ()
+    #: noise that was not recorded, so that what depends on it cannot be held against the recording
+    noiseless: frozenset[str] = frozenset()
+
+    def compared(self, expected: Sequence[Feeds], check: Check) -> list[tuple[str, Difference, str]]:
+        """(output, its worst difference, the case) of the reference's answers to ``cases`` against the recording.
+
+        ``check`` compares (output, reference's answers, recorded array).
+        """
+        worst: dict[str, tuple[Difference, str]] = {}
+        for case, answers, recorded in zip(self.cases, expected, self.answers, strict=True):
+            for name in (n for n in recorded if n in answers):
+                found = check(name, answers, recorded[name])
+                if name not in worst or (not found.passed, found.max_abs) > (
+                    not worst[name][0].passed,
+                    worst[name][0].max_abs,
+                ):
+                    worst[name] = (found, case.name)
+        return [(name, *found) for name, found in worst.items()]
 
 
 def read_golden(path: Path, signature: PolicySignature) -> Golden:
@@ -37,6 +58,7 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
     arrays = _arrays(path)
     specs = {**_by_name(signature.outputs), **_by_name(signature.inputs)}
     given: dict[str, np.ndarray] = {}
+    noiseless: set[str] = set()
     for name, array in arrays.items():
         spec = specs.get(name) or specs.get(name.removesuffix(":0"))
         if spec is None:
@@ -52,6 +74,8 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
             continue
         if spec.role not in _DEFAULTS:
             raise UsageError(f"--golden: the input {spec.name!r} was not recorded", where=str(path))
+        if spec.role is Role.NOISE:
+            noiseless.add(spec.name)
         shape = tuple(rows if i == 0 else n or 1 for i, n in enumerate(spec.shape))
         given[spec.name] = np.full(shape, _DEFAULTS[spec.role], spec.dtype)
     outputs = [s.name for s in signature.outputs if s.name in given]
@@ -61,15 +85,17 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
         feeds = {s.name: _part(s, given[s.name], first, last) for s in signature.inputs}
         cases.append(Case(f"golden, rows {first}-{last - 1}", feeds, last - first))
         answers.append({name: given[name][first:last] for name in outputs})
-    return Golden(tuple(cases), tuple(answers))
+    return Golden(tuple(cases), tuple(answers), frozenset(noiseless))
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
+        with path.open("rb") as file:  # numpy leaves a file open that it opened itself and cannot read
+            archive = np.load(file, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
                 raise UsageError("--golden: is one array, not an archive", where=str(path), fix="numpy.savez(FILE, …)")
-            return {name: archive[name] for name in archive.files}
+            with archive:
+                return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UsageError(
             "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"

@@ -15,8 +15,9 @@ from exporter.parity.pool import RuntimePool
 from exporter.pipeline import ExportOptions, export
 from exporter.summary import failure_lines
 from tests.barracuda.cases import Case, all_cases
-from tests.barracuda.conftest import BROKEN, NEEDED, UNSLICED, genuine_files, params, public_files
+from tests.barracuda.conftest import BROKEN, UNSLICED, genuine_files, params, public_files
 from tests.barracuda.test_layers import expected_of, feeds_of, policy_of
+from tests.conftest import NEEDED
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +30,7 @@ SOURCES = [
 @pytest.mark.corpus
 @pytest.mark.parametrize("path", params(SOURCES, lambda p: f"{p.parent.name}-{p.name}"[:90]))
 def test_a_nn_exports_to_four_formats_that_agree(path: Path, shared: Path, tmp_path: Path, pool: RuntimePool) -> None:
-    (result,) = export([path], ExportOptions(tmp_path), pool=pool)
+    (result,) = export([path], ExportOptions(tmp_path, verify=NEEDED), pool=pool)
     assert result.report is not None
     assert result.report.passed is True, "\n".join(failure_lines(result.report))
     ran = {c.runtime for c in result.report.comparisons}

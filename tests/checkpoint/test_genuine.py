@@ -11,17 +11,14 @@ import pytest
 
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from exporter.parity.compare import compare
 from exporter.parity.pool import RuntimePool
-from exporter.parity.tolerances import Tolerance, tolerance_for
 from exporter.pipeline import ExportOptions, export
 from exporter.sources import read_source
 from exporter.summary import failure_lines
-from signatures.graph import node_of
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy
-from tests.corpus.conftest import NEEDED, SHARED, pool  # noqa: F401  a fixture
+from tests.conftest import NEEDED
+from tests.corpus.conftest import SHARED
 
 pytestmark = pytest.mark.corpus
 
@@ -53,53 +50,6 @@ def options_for(path: Path) -> CompileOptions:
 
 def test_none_is_missing() -> None:
     assert (len(indexes("corpus/ckpt")), len(indexes("genuine"))) == (9, 40)
-
-
-def rows(arrays: dict[str, np.ndarray], step: int, steps: int, memory: str | None) -> dict[str, np.ndarray]:
-    """The rows of one step out of sequences laid end to end."""
-    return {name: a if name == memory else a[step::steps] for name, a in arrays.items()}
-
-
-@pytest.mark.parametrize("index", params(indexes("genuine")))
-def test_golden_values_agree(index: Path) -> None:
-    archive = dict(np.load(index.parent / "golden.npz"))
-    compared = 0
-    for policy in read_source(index).policies():
-        for run in sorted({key.split("/")[0] for key in archive}):
-            compared += check_run(policy, archive, run)
-    assert compared >= 3
-
-
-def check_run(policy: Policy, archive: dict[str, np.ndarray], run: str) -> int:
-    signature = policy.signature
-    feeds, memory = {}, signature.memory
-    for spec in signature.inputs:
-        assert isinstance(spec.source, str)
-        key = f"{run}/in/{node_of(spec.source)}"
-        feeds[spec.name] = archive[key if key in archive else f"{run}/rand/{node_of(spec.source)}"]
-    draws = {
-        n.name: archive[f"{run}/rand/{node_of(str(n.origin))}"] for n in policy.graph.nodes if n.op == "Multinomial"
-    }
-    wanted = {
-        s.name: archive[key]
-        for s in signature.outputs
-        if isinstance(s.source, str) and (key := f"{run}/out/{node_of(s.source)}") in archive
-    }
-    assert "action" in wanted
-    steps = 4 if run.endswith("s4") else 1
-    into, out = (memory.input, memory.output) if memory is not None else (None, None)
-    state = feeds[into] if into is not None else None
-    for step in range(steps):
-        current = rows(feeds, step, steps, into)
-        if into is not None and state is not None:
-            current[into] = state
-        got = run_graph(policy.graph, {**current, **rows(draws, step, steps, None)}, list(wanted))
-        state = got[out] if out is not None else None
-        for name, value in rows(wanted, step, steps, out).items():
-            if name != out or step == steps - 1:  # the golden has the memory after the last step
-                difference = compare(value, got[name], tolerance_for(signature, name, Tolerance()))
-                assert difference.passed, f"{policy.name}, {run}, step {step}: {name}: {difference}"
-    return steps
 
 
 def frozen_beside(index: Path) -> Path | None:
@@ -147,9 +97,9 @@ def test_the_case_that_the_trainer_could_not_export() -> None:
 def test_agrees_in_all_runtimes_with_the_restored_original(
     index: Path,
     tmp_path: Path,
-    pool: RuntimePool,  # noqa: F811
+    pool: RuntimePool,
 ) -> None:
-    for result in export([index], ExportOptions(tmp_path, compile=options_for(index)), pool=pool):
+    for result in export([index], ExportOptions(tmp_path, compile=options_for(index), verify=NEEDED), pool=pool):
         assert result.report is not None
         assert result.report.passed is True, "\n".join(failure_lines(result.report))
         assert result.report.reference == "source/tensorflow"

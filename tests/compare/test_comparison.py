@@ -18,6 +18,7 @@ from exporter.parity.report import Comparison, ParityReport
 from exporter.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
+from tests.commands import export_model, is_refused
 
 RUNTIMES = "tensorflow,onnxruntime,tfjs-cpu"
 
@@ -216,3 +217,43 @@ def test_where_nothing_ran_nothing_is_said_to_agree(bundles: Bundles, pool: Runt
     file = bundles("discrete") / "discrete.onnx"
     with pytest.raises(RuntimeUnavailableError, match="nothing was compared"):
         compare_artefacts(fixture("discrete"), [file], runtimes="numpy", pool=pool)
+
+
+def test_the_command_line_compares_and_reports(bundles: Bundles, tmp_path: Path) -> None:
+    folder = bundles("discrete")
+    lost = edited(folder / "discrete.onnx", tmp_path / "lost.onnx", lambda m: renamed(m, "action", "Identity"))
+    command = ("compare", fixture("discrete"), lost, "--runtimes", "onnxruntime,tensorflow")
+    ran = export_model(*command, "--junit", tmp_path / "j.xml", "--html", tmp_path / "p.html", "--markdown", "-")
+    assert ran.status == 1
+    assert "--map action=Identity" in ran.out
+    assert "action" in (tmp_path / "p.html").read_text()
+    right = export_model(*command, "--map", "action=Identity", "--max-size", "1MB", "--json")
+    assert right.status == 0
+    (report,) = right.json["reports"]
+    assert report["verdict"] == "passed"
+    assert [c["kind"] for c in report["comparisons"] if c["output"] == "size"] == ["size"]
+    is_refused(export_model(*command, "--map", "action"), "NAME=VALUE")
+
+
+def test_recorded_samples_are_run_and_held_against(bundles: Bundles, tmp_path: Path) -> None:
+    folder = bundles("continuous")
+    with np.load(fixture("continuous.npz")) as known:
+        arrays = {k.rpartition("/")[2]: known[k] for k in known.files if k.startswith("b7/")}
+    np.savez(tmp_path / "right.npz", **arrays)
+    command = ("verify", folder, "--runtimes", "onnxruntime", "--json", "--golden")
+    right = export_model(*command, tmp_path / "right.npz")
+    assert right.status == 0
+    comparisons = right.json["reports"][0]["comparisons"]
+    assert {c["output"] for c in comparisons if c["format"] == "golden"} >= {"action", "value_estimate"}
+    arrays["value_estimate"] = arrays["value_estimate"] + np.float32(0.01)
+    np.savez(tmp_path / "wrong.npz", **arrays)
+    wrong = export_model(*command, tmp_path / "wrong.npz")
+    assert wrong.status == 1
+    failed = [c for c in wrong.json["reports"][0]["comparisons"] if not c["passed"]]
+    assert [(c["format"], c["output"], c["worst_input"]) for c in failed] == [
+        ("golden", "value_estimate", "golden, rows 0-6")
+    ]
+    del arrays["epsilon"]
+    np.savez(tmp_path / "partly.npz", state=arrays["state"], action=arrays["action"])
+    partly = export_model(*command, tmp_path / "partly.npz")
+    assert partly.status == 0, "an action that was drawn is not held against one without its noise"

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from exporter.parity.pool import RuntimePool
-from exporter.runtimes import available_runtimes
-
 SHARED = Path(__file__).resolve().parents[3] / "shared"
-NEEDED = ("tensorflow", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
 
 
 def frozen_corpus() -> list[Path]:
@@ -32,12 +27,3 @@ def genuine_cases() -> list[tuple[Path, dict[str, Any]]]:
 def _shared_data() -> None:
     if not SHARED.is_dir():
         pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
-
-
-@pytest.fixture(scope="session")
-def pool() -> Iterator[RuntimePool]:
-    missing = [i for i in available_runtimes() if i.name in NEEDED and not i.installed]
-    if missing:
-        pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
-    with RuntimePool() as opened:
-        yield opened

@@ -10,7 +10,8 @@ from exporter.inspection import inspect_source
 from exporter.parity.pool import RuntimePool
 from exporter.pipeline import ExportOptions, export
 from exporter.summary import failure_lines
-from tests.corpus.conftest import NEEDED, SHARED, frozen_corpus, genuine_cases
+from tests.conftest import NEEDED
+from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
 
 pytestmark = [pytest.mark.corpus, pytest.mark.slow]
 
@@ -22,7 +23,7 @@ SOURCES = [
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_exports_to_four_formats_that_agree(source: Path, tmp_path: Path, pool: RuntimePool) -> None:
-    results = list(export([source], ExportOptions(tmp_path), pool=pool))
+    results = list(export([source], ExportOptions(tmp_path, verify=NEEDED), pool=pool))
     assert results
     for result in results:
         assert result.report is not None

@@ -93,6 +93,23 @@ def with_default() -> Case:
     return [constant("d", f32(2, 3)), default, placeholder("x", (None, 2)), made], {"x": floats(3, 2)}, None
 
 
+def bundled() -> Case:
+    """tf.nn.swish as frozen graphs have it (an IdentityN with its custom gradient), and one behind its outputs."""
+    fed = placeholder("x", (None, 3))
+    nodes = [fed, node("s", "Sigmoid", "x", T=F32), node("m", "Mul", "x", "s", T=F32)]
+    swish = node("swish", "IdentityN", "m", "x", T=(F32, F32))
+    count = node("count", "Shape", "x", T=F32, out_type=np.int32)
+    both = node("both", "IdentityN", "swish:1", "count", "swish", T=(F32, np.int32, F32))
+    sized = node("size", "Cast", "both:1", SrcT=np.int32, DstT=F32)
+    difference = node("d", "Sub", "both", "both:2", T=F32)
+    extra = [constant("axis", 0), node("sum", "Sum", "size", "axis", T=F32, Tidx=np.int32)]
+    return (
+        [*nodes, swish, count, both, sized, difference, *extra, node("y", "Add", "d", "sum", T=F32)],
+        {"x": floats(2, 3)},
+        None,
+    )
+
+
 def divided(x: Array, y: Array) -> Case:
     nodes = [placeholder("a", (None, *x.shape[1:])), placeholder("b", (None, *y.shape[1:]))]
     return [*nodes, node("y", "DivNoNan", "a", "b", T=F32)], {"a": x, "b": y}, None
@@ -131,6 +148,7 @@ CASES: Mapping[str, Case] = {
     "FusedBatchNormV3": batch_norm("FusedBatchNormV3", IMAGE, epsilon=0.01),
     "FusedBatchNormV3, NCHW": batch_norm("FusedBatchNormV3", TURNED, epsilon=0.01, data_format="NCHW"),
     "Concat": concat(),
+    "IdentityN": bundled(),
     "Conv2D, NCHW": window("Conv2D", "NCHW", kernel=KERNEL, **STRIDED),
     "Conv2D, NCHW, dilated": window(
         "Conv2D", "NCHW", kernel=KERNEL, strides=(1, 1, 1, 1), dilations=(1, 1, 2, 1), padding="VALID"

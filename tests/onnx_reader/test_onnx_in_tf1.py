@@ -13,14 +13,14 @@ from converters.frozen_graph.writer import write
 from converters.graph.run import run_graph
 from converters.runner.process import RuntimeProcess
 from exporter.parity.compare import compare, floored
+from exporter.parity.pool import RuntimePool
 from exporter.parity.tolerances import Tolerance
 from exporter.sources import read_source
 from fixtures.sb3 import FOLDER, POLICIES
-from signatures.errors import RuntimeUnavailableError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 from tests.corpus.conftest import SHARED
-from tests.legacy.runtime import WHEELS, legacy_process, unsupported_reason
+from tests.legacy.installed import VERSIONS, ensure
 
 pytestmark = [pytest.mark.legacy, pytest.mark.slow]
 
@@ -29,20 +29,11 @@ SOURCES = [*(FOLDER / f"{n}.onnx" for n in POLICIES), *sorted(SHARED.glob("corpu
 CLOSE = Tolerance(5e-4, 1e-5)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(v, id=f"tf{v}", marks=pytest.mark.xdist_group(f"tf{v}")) for v in WHEELS],
-)
+@pytest.fixture(scope="module", params=VERSIONS)
 def legacy(request: pytest.FixtureRequest) -> Iterator[RuntimeProcess]:
-    reason = unsupported_reason()
-    if reason is not None:
-        pytest.skip(reason)
-    try:
-        process = legacy_process(request.param)
-    except RuntimeUnavailableError as error:
-        pytest.skip(f"{error.what}: {error.why}")
-    with process:
-        yield process
+    name = ensure(request.param)
+    with RuntimePool() as pool:
+        yield pool.process(name)
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem[:80])

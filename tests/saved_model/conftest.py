@@ -5,13 +5,9 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from exporter.parity.pool import RuntimePool
-from exporter.runtimes import available_runtimes
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,13 +21,3 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", errors="replace")
     assert done.returncode == 0, done.stderr[-3000:]
     return folder
-
-
-@pytest.fixture(scope="session")
-def pool() -> Iterator[RuntimePool]:
-    needed = ("tensorflow", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
-    missing = [i for i in available_runtimes() if i.name in needed and not i.installed]
-    if missing:
-        pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
-    with RuntimePool() as opened:
-        yield opened

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from signatures.roles import Role
-from signatures.sampling import BATCHES, Case, draw_cases, draw_rollout
+from signatures.sampling import BATCHES, LARGE_BATCH, Case, draw_cases, draw_rollout
 from signatures.spec import Memory, PolicySignature, TensorSpec
 
 ACTION = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
@@ -64,10 +64,16 @@ def test_every_batch_size_is_tried() -> None:
     typical = [c for c in cases if c.name.startswith("typical")]
     assert [c.batch for c in typical] == [b for b in BATCHES for _ in range(3)]
     assert [c.name for c in cases[len(typical) :]] == [
-        *("zeros", "clip edges", "beyond the clip", "1e3"),
+        *("zeros", "clip edges", "beyond the clip", "1e3", "denormals"),
         *("all but one action masked", "random masks"),
     ]
     assert len({c.name for c in cases}) == len(cases)
+
+
+def test_a_large_batch_is_tried_once_and_never_with_images() -> None:
+    plain = draw_cases(signature(spec("state", Role.VECTOR, None, 3)), samples=3)
+    assert [c.name for c in plain if c.batch == LARGE_BATCH] == ["typical, batch 64"]
+    assert all(c.batch < LARGE_BATCH for c in draw_cases(EVERYTHING, samples=3))
 
 
 def test_masks_are_tried_only_where_there_are_some() -> None:
@@ -101,6 +107,8 @@ def test_values_are_drawn_around_the_policys_own_statistics() -> None:
     np.testing.assert_allclose(np.abs(cases["clip edges"].feeds["state"][:, 1] - 100), 50)
     np.testing.assert_allclose(np.abs(cases["beyond the clip"].feeds["state"][:, 3] - 0.5), 16)
     assert (np.abs(cases["1e3"].feeds["state"]) == 1e3).all()
+    denormal = cases["denormals"].feeds["state"]
+    assert ((denormal != 0) & (np.abs(denormal) < np.finfo(np.float32).tiny)).all()
 
 
 def test_each_input_is_in_its_range() -> None:

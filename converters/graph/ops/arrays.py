@@ -28,6 +28,8 @@ from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_ar
 from signatures.graph import Node, TensorShape
 
 T = type_attr()
+#: Outputs that a Split or Unpack may have.
+_MAX_PIECES = 1 << 16
 
 
 # ------------------------------------------------------------------ sources and pass-throughs
@@ -298,8 +300,16 @@ def _unpack(node: Node, x: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.take(x, i, axis=axis) for i in range(x.shape[axis]))
 
 
+def _pieces(node: Node, args: Sequence[TensorType], attribute: str) -> int:
+    """How many outputs a node says it has; GraphError where no policy's node has as many."""
+    count = int(node.attrs[attribute])
+    if not 0 < count <= _MAX_PIECES:
+        raise shape_error(node, args, f"it says that it makes {count} pieces; 1 to {_MAX_PIECES} are read")
+    return count
+
+
 def _infer_unpack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape, axis, count = args[0].shape, node.attrs["axis"], node.attrs["num"]
+    shape, axis, count = args[0].shape, node.attrs["axis"], _pieces(node, args, "num")
     if shape is None:
         return [TensorType(args[0].dtype, None)] * count
     axis %= len(shape)
@@ -321,7 +331,7 @@ def _split_sizes(node: Node, length: Dim, args: Sequence[TensorType]) -> list[Di
             others = sum(int(s) for s in sizes if s != -1)
             sizes[sizes.index(-1)] = length - others if isinstance(length, int) else f"{length}-{others}"
         return sizes
-    count = node.attrs["num_split"]
+    count = _pieces(node, args, "num_split")
     if isinstance(length, int) and length % count:
         raise shape_error(node, args, f"a length of {length} does not split into {count}")
     return [length // count if isinstance(length, int) else f"{length}/{count}"] * count
@@ -341,7 +351,7 @@ def _split_v(node: Node, x: np.ndarray, sizes: np.ndarray, axis: np.ndarray) -> 
 def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     data, axis_at = (args[1], 0) if node.op == "Split" else (args[0], 2)
     if data.shape is None:
-        return [TensorType(data.dtype, None)] * node.attrs["num_split"]
+        return [TensorType(data.dtype, None)] * _pieces(node, args, "num_split")
     axis = int(require_constant(node, args, axis_at, "an axis")) % len(data.shape)
     sizes = _split_sizes(node, data.shape[axis], args)
     return [TensorType(data.dtype, (*data.shape[:axis], size, *data.shape[axis + 1 :])) for size in sizes]

@@ -45,6 +45,10 @@ class OnnxBuilder(Protocol):
         """An initializer; equal arrays share one."""
         ...
 
+    def holds(self, value: str, reference: str, axes: Sequence[int]) -> None:
+        """Note that ``value`` is a tensor of the graph with its axes in another order (numpy's ``transpose``)."""
+        ...
+
 
 Lower = Callable[[Node, OnnxBuilder], Any]
 

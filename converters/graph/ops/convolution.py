@@ -23,6 +23,7 @@ from signatures.graph import Node
 
 T = type_attr()
 _TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]
+_TO_OIHW = (3, 2, 0, 1)
 
 
 def window_padding(size: int, window: int, stride: int, padding: str) -> tuple[int, int, int]:
@@ -135,7 +136,8 @@ def _lower_window(node: Node, builder: OnnxBuilder, onnx_op: str, inputs: list[s
 
 def _lower_conv2d(node: Node, builder: OnnxBuilder) -> Any:
     kernel = constant_input(node, builder, 1, "a kernel")
-    weights = builder.const(np.ascontiguousarray(kernel.transpose(3, 2, 0, 1)), "kernel")
+    weights = builder.const(np.ascontiguousarray(kernel.transpose(_TO_OIHW)), "kernel")
+    builder.holds(weights, node.inputs[1], _TO_OIHW)
     inputs = [weights] + [builder.value(r) for r in node.inputs[2:]]
     value = _lower_window(node, builder, "Conv", inputs, kernel_shape=list(kernel.shape[:2]))
     for name in node.attrs.get("fused_ops", ())[1:]:

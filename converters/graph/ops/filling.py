@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
-from converters.graph.types import INT32, Symbols, TensorType, broadcast, of_array, product
+from converters.graph.types import INT32, Symbols, TensorType, broadcast, product
 from signatures.graph import Node
 
 T = type_attr()
@@ -72,10 +73,14 @@ def _range(node: Node, start: np.ndarray, limit: np.ndarray, delta: np.ndarray) 
 
 
 def _infer_range(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    values = [a.constant for a in args]
-    if any(v is None for v in values):
+    """The length alone: the values are folded where they are few (shapes.py)."""
+    known = [a.constant for a in args]
+    if any(v is None for v in known):
         return [TensorType(args[0].dtype, (symbols.fresh(),))]
-    return [of_array(_range(node, *(v for v in values if v is not None)))]
+    start, limit, delta = (v.item() for v in known if v is not None)
+    if delta == 0 or not all(map(math.isfinite, (start, limit, delta))):
+        raise ValueError(f"from {start} to {limit} in steps of {delta}")
+    return [TensorType(args[0].dtype, (max(0, math.ceil((limit - start) / delta)),))]
 
 
 def _lower_range(node: Node, builder: OnnxBuilder) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -10,8 +11,9 @@ import numpy as np
 from converters.graph.editor import Editor
 from converters.graph.ops.convolution import window_padding
 from converters.graph.passes.normalise import as_placeholder
+from converters.graph.shapes import MAX_ELEMENTS
 from converters.graph.types import INT32
-from signatures.errors import UsageError
+from signatures.errors import GraphError, UsageError
 from signatures.graph import Graph, Node, TensorShape, node_of
 from signatures.infer import placeholder_rank
 from signatures.roles import OBSERVATIONS, Role
@@ -43,6 +45,12 @@ def constant_value(node: Node, value: float) -> np.ndarray:
     shape: TensorShape | None = node.attrs.get("shape")
     dims = () if shape is None or shape.dims is None else tuple(1 if d is None else d for d in shape.dims)
     dtype = node.attrs["dtype"]
+    if math.prod(dims) > MAX_ELEMENTS:
+        raise GraphError(
+            f"the placeholder {node.name!r} takes {math.prod(dims)} elements",
+            why=f"no policy has a tensor of more than {MAX_ELEMENTS} per row",
+            fix="the graph is damaged, or is no policy; freeze it again from its checkpoint",
+        )
     if dtype.kind in "iu":
         limits = np.iinfo(dtype)
         possible = float(value).is_integer() and limits.min <= value <= limits.max

@@ -7,12 +7,13 @@ repeated in any runtime by feeding the same draws.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from converters.graph.editor import Editor
-from converters.graph.ops.chance import NORMAL_SAMPLERS
+from converters.graph.ops.chance import NORMAL_SAMPLERS, SAMPLERS
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
 from signatures.errors import UnsupportedOpError
@@ -24,6 +25,14 @@ NoiseMode = Literal["lift", "keep", "zero"]
 def samplers(graph: Graph) -> list[Node]:
     """The nodes that draw from N(0, 1), in graph order."""
     return [n for n in graph.nodes if n.op in NORMAL_SAMPLERS]
+
+
+def unseeded(graph: Graph) -> Graph:
+    """Samplers without the seed that the trainer's run had: with it, a game draws the same actions after every start,
+    and TensorFlow.js, which starts its generator anew for every run, the same one each time.
+    """
+    nodes = [replace(n, attrs={**n.attrs, "seed": 0, "seed2": 0}) if n.op in SAMPLERS else n for n in graph.nodes]
+    return Graph(tuple(nodes))
 
 
 def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> Graph:

@@ -16,9 +16,9 @@ import numpy as np
 from converters.graph.editor import Editor
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of, unsupported
-from converters.graph.types import BOOL, FLOAT32
+from converters.graph.types import BOOL, FLOAT32, INT64
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.graph import Graph, Node, TensorShape, normal_ref
+from signatures.graph import Graph, Node, TensorShape, normal_ref, ref
 
 #: Ops that later versions renamed; the meaning is the same for the inputs that policies give them.
 RENAMED = {
@@ -91,6 +91,9 @@ def _completed(node: Node) -> Node:
 
 def _take(editor: Editor, node: Node) -> None:
     """Keep a node, its padding and layout brought to the one form that all targets share."""
+    if node.op == "Multinomial" and node.attrs["output_dtype"] != INT64:
+        _draw_int64(editor, node)
+        return
     if node.attrs.get("padding") == "EXPLICIT":
         node = _split_padding(editor, node)
     if node.op in _WINDOW_OPS and node.attrs.get("data_format") == "NCHW":
@@ -103,6 +106,14 @@ def _take(editor: Editor, node: Node) -> None:
         )
     else:
         editor.keep(node)
+
+
+def _draw_int64(editor: Editor, node: Node) -> None:
+    """A draw of int32 as a Cast of one of int64: TF 1.4 has no output_dtype."""
+    wide = {**node.attrs, "output_dtype": INT64}
+    drawn = editor.add("Multinomial", node.inputs, f"{node.name}/int64", node.origin, **wide)
+    narrow = editor.add("Cast", [drawn], f"{node.name}/narrow", node.origin, DstT=node.attrs["output_dtype"])
+    editor.redirect(node.name, narrow)
 
 
 def _split_padding(editor: Editor, node: Node) -> Node:
@@ -228,6 +239,14 @@ def _concat_v1(editor: Editor, node: Node) -> str:
     return editor.add("ConcatV2", [*node.inputs[1:], node.inputs[0]], f"{node.name}/v2", node.origin)
 
 
+def _identity_n(editor: Editor, node: Node) -> str:
+    """IdentityN (TF 1.6), which custom gradients (tf.nn.swish) leave: each output is the input of its number."""
+    first, *rest = (normal_ref(r) for r in node.inputs)
+    for index, reference in enumerate(rest, 1):
+        editor.redirect(ref(node.name, index), editor.resolve(reference))
+    return editor.resolve(first)
+
+
 def _default(editor: Editor, node: Node) -> str:
     """A PlaceholderWithDefault that is no input of the policy: its default."""
     return editor.resolve(normal_ref(node.inputs[0]))
@@ -242,6 +261,7 @@ DECOMPOSED: dict[str, Rewrite] = {
     "FusedBatchNormV2": _batch_norm,
     "FusedBatchNormV3": _batch_norm,
     "Concat": _concat_v1,
+    "IdentityN": _identity_n,
     "PlaceholderWithDefault": _default,
 }
 

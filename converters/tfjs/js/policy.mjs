@@ -310,6 +310,10 @@ function arrayOf(dtype) {
 /** Nested arrays, a flat typed array or { data, shape } as { data, shape, dtype } for one input. */
 function fitting({ name, shape: wanted, dtype }, value, rows) {
   const flat = (value?.data ?? (ArrayBuffer.isView(value) ? value : [value].flat(Infinity)));
+  if (wanted.length === 0) {
+    if (flat.length !== 1) throw new Error(`'${name}' has ${flat.length} numbers; it is a single one`);
+    return { data: arrayOf(dtype).from(flat), shape: [], dtype };
+  }
   const inner = wanted.slice(1);
   let shape = value?.shape;
   if (shape === undefined) {

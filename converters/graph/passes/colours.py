@@ -1,0 +1,52 @@
+"""How large the colours of an image are that a policy takes.
+
+ML-Agents divides bytes by 255 outside of the policy, so its images are 0 to 1. Stable-Baselines3 (preprocessing.py,
+``normalize_images``) and CleanRL (``x / 255.0``) divide inside: fed 0 to 1, such a policy sees black.
+"""
+
+from __future__ import annotations
+
+import math
+
+from signatures.graph import Graph, Node
+from signatures.infer import TRANSPARENT
+
+BYTE = 255.0
+#: A divisor may be repeated for each colour.
+_CHANNELS = 16
+_PASSED = TRANSPARENT | {"Cast", "Transpose"}
+
+
+def highest_colour(graph: Graph, name: str) -> int:
+    """255 where everything that reads the image divides it by 255 first, else 1."""
+    readers = _readers(graph, graph[name])
+    return int(BYTE) if readers and all(_divides(graph, reader, source) for reader, source in readers) else 1
+
+
+def _readers(graph: Graph, image: Node) -> list[tuple[Node, str]]:
+    """(what reads the image, behind what only passes it on; the name under which it reads it)."""
+    consumers, found, stack = graph.consumers(), [], [image.name]
+    seen: set[str] = set()
+    while stack:
+        name = stack.pop()
+        for reader in consumers[name]:
+            if reader.op in _PASSED and reader.inputs[0] == name:
+                if reader.name not in seen:
+                    seen.add(reader.name)
+                    stack.append(reader.name)
+            elif reader.op != "Shape":
+                found.append((reader, name))
+    return found
+
+
+def _divides(graph: Graph, reader: Node, source: str) -> bool:
+    if reader.op not in ("RealDiv", "Div", "Mul") or len(reader.inputs) != 2:
+        return False
+    other = reader.inputs[1] if reader.inputs[0] == source else reader.inputs[0]
+    value = graph.constant(other)
+    if value is None or value.dtype.kind not in "iuf" or not 0 < value.size <= _CHANNELS:
+        return False
+    if reader.op != "Mul" and other != reader.inputs[1]:
+        return False  # 255 / image
+    wanted = 1 / BYTE if reader.op == "Mul" else BYTE
+    return all(math.isclose(float(v), wanted, rel_tol=1e-5) for v in value.reshape(-1))

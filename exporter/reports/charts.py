@@ -1,0 +1,178 @@
+"""Pictures as inline SVG, without scripts: spread of differences, drift of the memory, the policy's layers.
+
+Colours and fonts come from the page's style sheet, so that light and dark follow the reader.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+from exporter.parity.histogram import BINS, FIRST, LAST
+from exporter.parity.report import Comparison
+from exporter.reports.layers import Block
+from exporter.reports.layout import layout
+from exporter.reports.markup import Markup, el
+
+_BAR, _STRIP, _ZERO_GAP = 17.0, 46.0, 18.0
+#: Lines have this many colours; a second round of them is dashed.
+_COLOURS = 6
+
+
+def histograms(output: str, comparisons: Sequence[Comparison]) -> Markup:
+    """One strip per comparison of ``output``: how many elements differ by how much, the bound marked."""
+    names = [f"{c.format} · {c.runtime}" for c in comparisons]
+    left = 2.0
+    right = left + BINS * _BAR + _ZERO_GAP
+    bottom = 8 + _STRIP * len(comparisons)
+
+    def edge(exponent: float) -> float:
+        """Where the decade from 10^exponent begins; equal elements stand apart, to its left."""
+        return left + (1 + exponent - FIRST) * _BAR + _ZERO_GAP
+
+    parts: list[Markup] = []
+    for decade in range(FIRST, LAST + 1, 3):
+        x = edge(decade)
+        parts.append(el("line", class_="grid", x1=x, x2=x, y1=6.0, y2=bottom))
+        parts.append(el("text", _power(decade), class_="tick", x=x, y=bottom + 14, text_anchor="middle"))
+    parts.append(el("text", "0", class_="tick", x=left + _BAR / 2, y=bottom + 14, text_anchor="middle"))
+    for row, (c, name) in enumerate(zip(comparisons, names, strict=True)):
+        base = 8 + _STRIP * (row + 1) - 2
+        parts.append(el("text", name, class_="label", x=left, y=base - 25))
+        parts.append(el("line", class_="axis", x1=left, x2=right, y1=base, y2=base))
+        total, most = sum(c.histogram), max(c.histogram)
+        for place, count in enumerate(c.histogram):
+            if count:
+                # Square roots: a few elements that are far off must be seen beside thousands that are not.
+                height = max(2.0, 20 * math.sqrt(count / most))
+                bar = el(
+                    "rect",
+                    el("title", f"{count} of {total} elements: {_bin_text(place)}"),
+                    class_="bar" if c.passed else "bar bad",
+                    x=(edge(FIRST + place - 1) if place else left) + 1,
+                    y=base - height,
+                    width=_BAR - 2,
+                    height=height,
+                )
+                parts.append(bar)
+        if c.tolerance.atol > 0:
+            x = edge(min(max(math.log10(c.tolerance.atol), FIRST), LAST + 1))
+            parts.append(el("line", class_="bound", x1=x, x2=x, y1=base - 20, y2=base))
+    described = f"{output}: histogram of absolute differences for {len(comparisons)} comparisons, in decades"
+    return _svg(parts, right + 12, bottom + 22, described)
+
+
+def drift(output: str, comparisons: Sequence[Comparison], pairs: Sequence[tuple[str, str]]) -> Markup:
+    """Lines of the worst difference per step with the memory fed back, on a logarithmic axis.
+
+    A line has the colour of its (format, runtime) in ``pairs``, the same in every chart.
+    """
+    steps = max(len(c.drift) for c in comparisons)
+    shown = [d for c in comparisons for d in c.drift if math.isfinite(d) and d > 0]
+    shown += [c.tolerance.atol for c in comparisons if c.tolerance.atol > 0]
+    low, high = math.floor(math.log10(min(shown, default=1e-8))), math.ceil(math.log10(max(shown, default=1e-4)))
+    low, high = low - 1, max(high, low + 1)  # the lowest line is zero's
+    left, right, top, bottom = 40.0, 314.0, 12.0, 160.0
+
+    def x(step: int) -> float:
+        return left + (right - left) * (step / max(steps - 1, 1))
+
+    def y(value: float) -> float:
+        place = math.log10(value) if 0 < value < math.inf else high if value else low
+        return bottom - (bottom - top) * (min(max(place, low), high) - low) / (high - low)
+
+    parts: list[Markup] = []
+    every = max(1, math.ceil((high - low) / 6))
+    for decade in range(high, low - 1, -every):
+        here = y(10.0**decade)
+        parts.append(el("line", class_="grid", x1=left, x2=right, y1=here, y2=here))
+        parts.append(
+            el(
+                "text",
+                _power(decade) if decade > low else "0",
+                class_="tick",
+                x=left - 6,
+                y=here + 4,
+                text_anchor="end",
+            )
+        )
+    marked = range(0, steps, max(1, math.ceil(steps / 8)))
+    parts += [el("text", s + 1, class_="tick", x=x(s), y=bottom + 16, text_anchor="middle") for s in marked]
+    parts.append(el("text", "step", class_="tick", x=(left + right) / 2, y=bottom + 30, text_anchor="middle"))
+    bound = max(c.tolerance.atol for c in comparisons)
+    if bound > 0:
+        parts.append(el("line", class_="bound", x1=left, x2=right, y1=y(bound), y2=y(bound)))
+    for c in comparisons:
+        colour = colour_of(pairs.index((c.format, c.runtime)))
+        points = [(x(i), y(d if math.isfinite(d) else 10.0**high)) for i, d in enumerate(c.drift)]
+        title = el("title", f"{c.format} in {c.runtime}: {', '.join(f'{d:.1e}' for d in c.drift)}")
+        parts.append(
+            el("polyline", title, class_=f"line {colour}", points=" ".join(f"{a:.1f},{b:.1f}" for a, b in points))
+        )
+        parts += [el("circle", class_=f"dot {colour}", cx=a, cy=b, r=2.5) for a, b in points]
+    return _svg(parts, right + 8, bottom + 38, f"{output}: worst difference per step with the memory fed back")
+
+
+def colour_of(number: int) -> str:
+    """The class of a line's colour, dashed from the seventh on."""
+    return f"c{number % _COLOURS}" + (" dashed" if number >= _COLOURS else "")
+
+
+def diagram(blocks: Sequence[Block]) -> Markup:
+    """The layers of a policy as boxes, from its inputs at the top to its outputs at the bottom."""
+    titles = [b.title if len(b.title) <= 34 else f"{b.title[:33]}…" for b in blocks]
+    placed = layout([b.before for b in blocks], [max(84.0, 7.3 * len(t) + 26) for t in titles])
+    parts: list[Markup] = []
+    for chain in placed.edges:
+        points = [placed.places[i] for i in chain]
+        path = []
+        for a, b in itertools.pairwise(points):
+            start = placed.y(a) + (20 if a.item is not None else 0)
+            end = placed.y(b) - (20 if b.item is not None else 0)
+            middle = (start + end) / 2
+            path.append(f"M{a.x:.1f} {start:.1f}C{a.x:.1f} {middle:.1f} {b.x:.1f} {middle:.1f} {b.x:.1f} {end:.1f}")
+        parts.append(el("path", class_="edge", d="".join(path)))
+    for place in placed.places:
+        if place.item is None:
+            continue
+        block, y = blocks[place.item], placed.y(place)
+        tip = el("title", block.detail or block.title)
+        box = el(
+            "rect",
+            x=round(place.x - place.width / 2, 1),
+            y=y - 18,
+            width=place.width,
+            height=36,
+            rx=18 if block.kind != "layer" else 6,
+        )
+        text = el("text", titles[place.item], x=round(place.x, 1), y=y + 4.5, text_anchor="middle")
+        parts.append(el("g", tip, box, text, class_=f"box {block.kind}"))
+    names = {kind: ", ".join(b.title for b in blocks if b.kind == kind) for kind in ("input", "output")}
+    layers = " → ".join(b.title for b in blocks if b.kind == "layer")
+    described = f"Layers from {names['input']} to {names['output']}: {layers}"
+    height = placed.height
+    return _svg(parts, math.ceil(placed.width), height, described)
+
+
+def _svg(parts: Sequence[Markup], width: float, height: float, described: str) -> Markup:
+    return el(
+        "svg",
+        parts,
+        viewBox=f"0 0 {width:g} {height:g}",
+        width=float(width),
+        height=float(height),
+        role="img",
+        aria_label=described,
+    )
+
+
+def _power(exponent: int) -> Markup:
+    return Markup(f'10<tspan dy="-4" font-size="8">{str(exponent).replace("-", "−")}</tspan>')
+
+
+def _bin_text(place: int) -> str:
+    if place == 0:
+        return "equal"
+    low = FIRST + place - 1
+    return f"below 1e{low + 1}" if place == 1 else f"1e{low} or more" if low == LAST else f"1e{low} to 1e{low + 1}"

@@ -1,0 +1,75 @@
+"""What a report is written from: a policy's parity report, and of the policy itself what can be shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.frozen_graph.reader import read_graph
+from converters.graph.compile import CONTRACT_NODE
+from exporter import bundle
+from exporter.parity.report import ParityReport
+from exporter.pipeline import ExportResult
+from signatures.errors import ExportModelError
+from signatures.graph import Graph
+from signatures.sampling import draw_cases, draw_rollout
+from signatures.spec import PolicySignature
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One policy in a report. ``signature`` and ``graph`` are None where there is no bundle to read them from."""
+
+    report: ParityReport
+    signature: PolicySignature | None = None
+    graph: Graph | None = None
+    #: policy.json, or what is known of it
+    contract: Mapping[str, Any] = field(default_factory=dict)
+    #: Steps of a rollout, to draw its inputs again.
+    steps: int = 4
+
+    @property
+    def name(self) -> str:
+        """The policy's name."""
+        return self.report.policy
+
+    def feeds(self, case: str) -> Mapping[str, np.ndarray]:
+        """The inputs of a case by its name in the report, drawn again from the seed; empty where they are unknown."""
+        if self.signature is None:
+            return {}
+        if case.startswith("step "):
+            rollout = draw_rollout(self.signature, seed=self.report.seed, steps=self.steps)
+            number = int(case.split()[1])
+            memory = self.signature.memory
+            fed_back = memory.input if memory is not None and number > 1 else None
+            return {k: v for k, v in rollout[number - 1].items() if k != fed_back} if number <= len(rollout) else {}
+        cases = draw_cases(self.signature, seed=self.report.seed, samples=self.report.samples)
+        return next((c.feeds for c in cases if c.name == case), {})
+
+
+def of_result(result: ExportResult, steps: int) -> Entry | None:
+    """The entry of an export; None where nothing was verified."""
+    if result.report is None:
+        return None
+    policy = result.policy
+    return Entry(result.report, policy.signature, policy.graph, result.contract, steps)
+
+
+def of_bundle(report: ParityReport, folder: Path, steps: int) -> Entry:
+    """The entry of a bundle that was verified again (so its files are what policy.json says)."""
+    content = bundle.read_policy_json(folder)
+    signature, _ = bundle.signature_of(content)
+    return Entry(report, signature, _graph_of(folder / f"{content['name']}.bytes"), content, steps)
+
+
+def _graph_of(file: Path) -> Graph | None:
+    """The graph of a bundle's .bytes; a report without a picture is better than none where it has gone since."""
+    try:
+        graph = read_graph(file.read_bytes())
+    except (OSError, ExportModelError):
+        return None
+    return Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE))

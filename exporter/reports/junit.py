@@ -1,0 +1,94 @@
+"""JUnit XML: one test suite per policy and format, one test case per runtime and output.
+
+The elements and attributes are those that pytest writes and Jenkins reads (its junit-10 schema). ``time`` is left out:
+comparisons share the runs that they are made of.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
+
+from exporter.parity.pool import RUNTIMES_OF
+from exporter.parity.report import Comparison
+from exporter.reports.entry import Entry
+from exporter.reports.markup import printable
+from exporter.summary import explanation, verdict
+
+
+def junit_xml(entries: Sequence[Entry]) -> bytes:
+    """The whole file, UTF-8."""
+    suites = [suite for entry in entries for suite in _suites(entry)]
+    root = ET.Element("testsuites", name="export-model")
+    root.extend(suites)
+    for key in ("tests", "failures", "errors"):
+        root.set(key, str(sum(int(s.get(key, "0")) for s in suites)))
+    ET.indent(root)
+    return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
+
+
+def _suites(entry: Entry) -> Iterable[ET.Element]:
+    report = entry.report
+    ran: dict[str, dict[tuple[str, str, str], list[Comparison]]] = {}
+    for c in report.comparisons:
+        # Signatures of a SavedModel are cases of its suite, told apart by their class name.
+        suite = ran.setdefault(c.format.partition(":")[0], {})
+        suite.setdefault((c.format, c.runtime, c.output), []).append(c)
+    missing = _not_run(entry)
+    for kind in dict.fromkeys([*ran, *missing]):
+        suite_element = ET.Element("testsuite", name=_text(f"{report.policy}.{kind}"))
+        properties = ET.SubElement(suite_element, "properties")
+        for name, value in _properties(entry, kind):
+            ET.SubElement(properties, "property", name=name, value=_text(value))
+        for (label, runtime, output), comparisons in ran.get(kind, {}).items():
+            place = f"{report.policy}.{label}.{runtime}"
+            case = ET.SubElement(suite_element, "testcase", classname=_text(place), name=_text(_case_name(output)))
+            _outcome(case, comparisons)
+        for runtime, reason in missing.get(kind, {}).items():
+            place = f"{report.policy}.{kind}.{runtime}"
+            case = ET.SubElement(suite_element, "testcase", classname=_text(place), name="not run")
+            ET.SubElement(case, "skipped", type="export-model.not-run", message=_text(reason))
+        for key, tag in (("tests", "testcase"), ("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
+            suite_element.set(key, str(len(list(suite_element.iter(tag)))))
+        yield suite_element
+
+
+def _properties(entry: Entry, kind: str) -> Iterable[tuple[str, str]]:
+    report = entry.report
+    yield from (("verdict", verdict(report)), ("reference", report.reference), ("seed", str(report.seed)))
+    if kind in report.sizes:
+        yield "bytes", str(report.sizes[kind])
+    for name in dict.fromkeys(c.runtime for c in report.comparisons if c.format.partition(":")[0] == kind):
+        version = report.runtimes.get(name, {}).get("version")
+        if version:
+            yield f"version.{name}", version
+
+
+def _case_name(output: str) -> str:
+    return "runs" if output == "*" else output
+
+
+def _outcome(case: ET.Element, comparisons: Sequence[Comparison]) -> None:
+    """At most one failure or error per case, as readers expect; its text has all that went wrong."""
+    failed = [c for c in comparisons if not c.passed]
+    lines = [line for c in failed for line in explanation(c)]
+    if failed:
+        kind = "error" if all(c.kind == "failure" for c in failed) else "failure"
+        element = ET.SubElement(case, kind, type=f"export-model.{failed[0].kind}", message=_text(lines[0]))
+        element.text = _text("\n".join(lines))
+
+
+def _not_run(entry: Entry) -> dict[str, dict[str, str]]:
+    """Format → runtime → why it did not run, for the formats of this policy."""
+    missing: dict[str, dict[str, str]] = {}
+    for runtime, state in entry.report.runtimes.items():
+        if state["status"] != "not run":
+            continue
+        formats = [f for f, names in RUNTIMES_OF.items() if runtime in names and f in entry.report.sizes]
+        for kind in formats:
+            missing.setdefault(kind, {})[runtime] = state["reason"] or "not run"
+    return missing
+
+
+def _text(text: str) -> str:
+    return printable(text)

@@ -1,0 +1,203 @@
+"""A policy's graph as the layers that a person would draw: "dense 64, swish", "LSTM 16", "conv 3×3 → 32, elu".
+
+Nodes are joined to blocks: a matrix product or a convolution starts one, and what follows it (bias, activation, the
+cell of an LSTM) belongs to it as long as no circle of blocks arises. It is a picture: nothing is computed from it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from signatures.graph import Graph, Node, node_of
+
+_STARTS = frozenset(
+    {"MatMul", "BatchMatMul", "BatchMatMulV2", "Conv2D", "Conv2DBackpropInput", "DepthwiseConv2dNative"}
+)
+_DRAWS = frozenset({"Multinomial", "RandomStandardNormal", "RandomUniform"})
+_ACTIVATIONS = {"Relu": "relu", "Elu": "elu", "LeakyRelu": "leaky relu", "Selu": "selu", "Softplus": "softplus"}
+_SMALL = frozenset({"ConcatV2", "StridedSlice", "Slice", "OneHot", "Reshape", "Mul", "Add", "Cast", "Split", "Pack"})
+_NORMALISERS = ({"Sub", "RealDiv"}, {"Sub", "Mul"})
+
+
+@dataclass
+class Block:
+    """Nodes that are drawn as one box. ``kind`` is ``input``, ``layer`` or ``output``."""
+
+    kind: str
+    nodes: list[Node] = field(default_factory=list)
+    before: set[int] = field(default_factory=set)
+    title: str = ""
+    detail: str = ""
+
+
+def blocks_of(graph: Graph, inputs: Iterable[str], outputs: Iterable[str]) -> list[Block]:
+    """Blocks in topological order; ``before`` holds the places of those that a block reads from."""
+    wanted = [o for o in outputs if o in graph]
+    needed = graph.ancestors(wanted)
+    blocks: list[Block] = []
+    home: dict[str, int] = {}
+    reach: list[set[int]] = []  # every block that comes before, directly or not
+    for node in graph.nodes:
+        if node.name not in needed or node.value is not None:
+            continue
+        sources = {home[n] for n in map(node_of, node.inputs) if n in home}
+        place = _home(node, sources, blocks, reach)
+        if place is None:
+            place = len(blocks)
+            blocks.append(Block("input" if node.op == "Placeholder" else "layer", before=set(sources)))
+            reach.append(set().union(*(reach[s] | {s} for s in sources)) if sources else set())
+        else:
+            new = sources - {place}
+            blocks[place].before |= new
+            added = set().union(*(reach[s] | {s} for s in new)) if new else set()
+            for i, r in enumerate(reach):
+                if i == place or place in r:
+                    r |= added
+        blocks[place].nodes.append(node)
+        home[node.name] = place
+    for block in blocks:
+        block.title, block.detail = _described(block, graph)
+    blocks += [Block("output", [], {home[name]}, name) for name in wanted if name in home]
+    while _joined(blocks, graph):
+        pass
+    return _ordered(blocks)
+
+
+def _joined(blocks: list[Block], graph: Graph) -> bool:
+    """Join one pair of boxes that say little apart; False where there is none left.
+
+    Twins (the same sources, the same ops) and a small box with the only reader it has: neither can make a circle.
+    """
+    live = [i for i, b in enumerate(blocks) if b.kind == "layer" and b.nodes]
+    twins = ((i, j) for i in live for j in live if i < j and _twins(blocks[i], blocks[j]))
+    pair = next(twins, None) or next(_followers(blocks, live), None)
+    if pair is None:
+        return False
+    gone, kept = blocks[pair[0]], blocks[pair[1]]
+    kept.nodes = [*gone.nodes, *kept.nodes]
+    kept.before = (kept.before | gone.before) - set(pair)
+    gone.nodes, gone.before = [], set()
+    for block in blocks:
+        if pair[0] in block.before:
+            block.before = (block.before - {pair[0]}) | {pair[1]}
+    kept.title, kept.detail = _described(kept, graph)
+    return True
+
+
+def _followers(blocks: list[Block], live: list[int]) -> Iterator[tuple[int, int]]:
+    """Boxes with the only box that reads them, one of the two being small and neither starting with weights."""
+    readers: dict[int, list[int]] = {i: [] for i in range(len(blocks))}
+    for j, block in enumerate(blocks):
+        for i in block.before:
+            readers[i].append(j)
+    for i in live:
+        if len(readers[i]) == 1 and blocks[readers[i][0]].kind == "layer":
+            a, b = blocks[i], blocks[readers[i][0]]
+            if (_small(a) or _small(b)) and not _starts(a) and not _starts(b):
+                yield i, readers[i][0]
+
+
+def _starts(block: Block) -> bool:
+    return any(n.op in _STARTS for n in block.nodes)
+
+
+def _small(block: Block) -> bool:
+    return {n.op for n in block.nodes} <= _SMALL
+
+
+def _twins(a: Block, b: Block) -> bool:
+    return a.before == b.before and {n.op for n in a.nodes} == {n.op for n in b.nodes} and not _starts(a)
+
+
+def _ordered(blocks: list[Block]) -> list[Block]:
+    """The boxes that are left, sources before their readers, ``before`` renumbered."""
+    places: dict[int, int] = {}
+    left = [i for i, b in enumerate(blocks) if b.nodes or b.kind == "output"]
+    while len(places) < len(left):
+        for i in left:
+            if i not in places and blocks[i].before <= set(places):
+                places[i] = len(places)
+    for i in left:
+        blocks[i].before = {places[j] for j in blocks[i].before}
+    return [blocks[i] for i in sorted(left, key=places.__getitem__)]
+
+
+def _home(node: Node, sources: set[int], blocks: list[Block], reach: list[set[int]]) -> int | None:
+    """The block that takes ``node`` in: the last of its sources that nothing else it reads comes after."""
+    if node.op == "Placeholder" or node.op in _STARTS or node.op in _DRAWS:
+        return None
+    for place in sorted(sources, reverse=True):
+        others = sources - {place}
+        if blocks[place].kind == "layer" and not any(place in reach[o] for o in others):
+            # A box that only prepares (normalises, joins) does not take in what several layers lead to.
+            if len(others) and not any(n.op in _STARTS for n in blocks[place].nodes) and _layers(others, blocks):
+                continue
+            return None if node.op == "ConcatV2" and _layers(others, blocks) else place
+    return None
+
+
+def _layers(places: Iterable[int], blocks: list[Block]) -> bool:
+    return any(blocks[p].kind == "layer" for p in places)
+
+
+def _described(block: Block, graph: Graph) -> tuple[str, str]:
+    ops = Counter(n.op for n in block.nodes)
+    if block.kind == "input":
+        return block.nodes[0].name, ""
+    first = block.nodes[0]
+    words = []
+    weights = graph.constant(first.inputs[1]) if first.op in _STARTS and len(first.inputs) > 1 else None
+    if weights is not None and first.op == "Conv2D" and weights.ndim == 4:
+        strides = first.attrs.get("strides")
+        step = f" /{strides[1]}" if isinstance(strides, tuple) and strides[1] != 1 else ""
+        words.append(f"conv {weights.shape[0]}×{weights.shape[1]} → {weights.shape[3]}{step}")
+    elif weights is not None and first.op == "MatMul":
+        width = weights.shape[0 if first.attrs.get("transpose_b") else -1]
+        if ops["Sigmoid"] >= 3 and ops["Tanh"] >= 2:
+            words.append(f"LSTM {width // 4}")
+        else:
+            words.append(f"dense {width}")
+    elif first.op in _STARTS:
+        words.append("matrix product" if "MatMul" in first.op else "convolution")
+    elif _normalises(ops):
+        words.append("normalise")
+    elif _DRAWS & set(ops):
+        words.append("draw")
+    words += _activations(ops, lstm=bool(words) and words[0].startswith("LSTM"))
+    if not words:
+        words = [_plain_title(ops)]
+    return ", ".join(words), " · ".join(op if n == 1 else f"{op} ×{n}" for op, n in ops.items())
+
+
+def _normalises(ops: Mapping[str, int]) -> bool:
+    return any(need <= set(ops) for need in _NORMALISERS) and sum(ops.values()) <= 6
+
+
+def _activations(ops: Mapping[str, int], *, lstm: bool) -> list[str]:
+    words = [word for op, word in _ACTIVATIONS.items() if ops.get(op)]
+    if not lstm:
+        if ops.get("Sigmoid"):
+            words.append("swish" if ops.get("Mul") else "sigmoid")
+        if ops.get("Tanh"):
+            words.append("tanh")
+    if ops.get("MaxPool"):
+        words.append("max pool")
+    if ops.get("Softmax") or ops.get("LogSoftmax"):
+        words.append("softmax")
+    if ops.get("Minimum") and ops.get("Maximum"):
+        words.append("clip")
+    if ops.get("Sum") and ops.get("Log") and ops.get("RealDiv"):
+        words.append("log-probabilities")
+    if ops.get("ArgMax"):
+        words.append("argmax")
+    return words
+
+
+def _plain_title(ops: Mapping[str, int]) -> str:
+    names = {"OneHot": "one-hot", "Reshape": "reshape", "Mul": "scale", "ConcatV2": "join"}
+    words = [word for op, word in names.items() if op in ops]
+    if set(ops) <= {"StridedSlice", "Slice", "Split"}:
+        return "slice"
+    return ", ".join(words) if words and set(ops) <= {*names, "StridedSlice", "Slice", "Add"} else next(iter(ops))

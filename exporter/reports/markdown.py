@@ -1,0 +1,87 @@
+"""A Markdown summary for a CI job's page: verdicts first, then failures, then who compared what."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+from exporter.reports.entry import Entry
+from exporter.reports.markup import printable
+from exporter.reports.matrix import matrix
+from exporter.summary import explanation, verdict
+from exporter.tables import size_text
+
+_MARKS = {"passed": "✅", "self-consistent": "✅", "failed": "❌", "not verified": "⚠️"}
+
+
+def markdown_text(entries: Sequence[Entry]) -> str:
+    """The whole document; failed policies come first."""
+    ordered = sorted(entries, key=lambda e: (e.report.passed is not False, e.report.passed is not None))
+    lines = ["## export-model", ""]
+    if len(entries) > 1:
+        rows = [[_mark(e), code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered]
+        lines += [*_table(("", "policy", "verdict", "disagreements"), rows), ""]
+    for entry in ordered:
+        lines += _policy(entry)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _policy(entry: Entry) -> list[str]:
+    report = entry.report
+    lines = [f"### {_mark(entry)} {code(report.policy)}", "", text(verdict(report)), ""]
+    for c in report.failures:
+        first, *rest = explanation(c)
+        lines += [f"- ❌ {text(first)}", *(f"  - {text(line)}" for line in rest)]
+    if report.failures:
+        lines.append("")
+    found = matrix(report)
+    head = ("format", "runtime", "size", *(code(o) for o in found.outputs), "verdict")
+    rows = []
+    for row in sorted(found.rows, key=lambda r: r.passed):
+        cells = [row.cells.get(o) for o in found.outputs]
+        shown = ["–" if c is None else c.text if c.passed else f"**{c.text}**" for c in cells]
+        size = "" if row.size is None else size_text(row.size)
+        rows.append([code(row.format), code(row.runtime), size, *shown, "ok" if row.passed else "**FAIL**"])
+    lines += [*_table(head, rows), ""]
+    tolerances = [
+        f"- {code(c.output)} in {code(f'{c.format}/{c.runtime}')}: atol {c.tolerance.atol:g}, "
+        f"rtol {c.tolerance.rtol:g}: {text(c.tolerance.reason)}"
+        for c in report.comparisons
+        if c.tolerance.reason
+    ]
+    lines += _folded("Tolerances other than the default", list(dict.fromkeys(tolerances)))
+    missing = [
+        f"- {code(name)}: {text(state['reason'] or '')}"
+        for name, state in report.runtimes.items()
+        if state["status"] == "not run"
+    ]
+    lines += _folded("Runtimes that did not run", missing)
+    return lines + _folded("Notes", [f"- {text(note)}" for note in report.notes])
+
+
+def _mark(entry: Entry) -> str:
+    return _MARKS[entry.report.verdict]
+
+
+def _folded(title: str, lines: Sequence[str]) -> list[str]:
+    """A section that opens on a click; nothing where it would be empty."""
+    return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""] if lines else []
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+
+
+def text(value: str) -> str:
+    """``value`` as words: nothing in it is markup, a table's bar or a line's end."""
+    flat = " ".join(printable(value).split())
+    marked = re.sub(r"([\\`*_{}\[\]()#!|~])", r"\\\1", flat)
+    return marked.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("@", "@\u200b")
+
+
+def code(value: str) -> str:
+    """``value`` as code, in a table cell too: a backslash before a bar is the table's, not the code's."""
+    flat = " ".join(printable(value).split())
+    fence = "`" * (max((len(m) for m in re.findall("`+", flat)), default=0) + 1)
+    pad = " " if flat.startswith("`") or flat.endswith("`") else ""
+    return f"{fence}{pad}{flat}{pad}{fence}".replace("|", "\\|") if flat else "``"

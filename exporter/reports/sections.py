@@ -1,0 +1,335 @@
+"""The parts of the HTML page: each takes an entry and gives its section, or None where it has nothing to say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from exporter.parity.report import Comparison
+from exporter.reports import charts
+from exporter.reports.entry import Entry
+from exporter.reports.layers import blocks_of
+from exporter.reports.markup import Child, Markup, el
+from exporter.reports.matrix import Cell, matrix
+from exporter.summary import allowed, explanation
+from exporter.tables import size_text
+from signatures.spec import TensorSpec
+
+_SHOWN_VALUES = 12
+#: More boxes than this are no picture any more.
+_MOST_BLOCKS = 90
+_MOST_NODES = 3000
+_MOST_FAILURES = 40
+
+
+def section(title: str, *content: Child) -> Markup:
+    """A heading and what is under it."""
+    return el("section", el("h3", title), content)
+
+
+def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Child]], numbers: Sequence[int] = ()) -> Markup:
+    """A table that scrolls in its own box; the first cell of a row is its heading. ``numbers`` are right-aligned."""
+    kinds = ["number" if i in numbers else None for i in range(len(head))]
+    heads = [el("th", h, scope="col", class_=k) for h, k in zip(head, kinds, strict=True)]
+    body = []
+    for row in rows:
+        first, *rest = row
+        cells: list[Child] = [el("th", first, scope="row")]
+        for cell, kind in zip(rest, kinds[1:], strict=True):
+            cells.append(cell if _is_cell(cell) else el("td", cell, class_=kind))
+        body.append(el("tr", cells))
+    small = "small" if len(head) < 4 else None
+    whole = el(
+        "table", el("caption", el("span", caption)), el("thead", el("tr", heads)), el("tbody", body), class_=small
+    )
+    return el("div", whole, class_="scroll", tabindex=0, role="region", aria_label=caption)
+
+
+def _is_cell(cell: Child) -> bool:
+    return isinstance(cell, Markup) and cell.startswith("<td")
+
+
+def _wide(*content: Child) -> Markup:
+    return el("td", content, class_="wide")
+
+
+def facts(entry: Entry) -> Markup:
+    """What the policy is and how it was verified."""
+    report, signature = entry.report, entry.signature
+    found: list[tuple[str, Child]] = []
+    if signature is not None:
+        found.append(("Trained with", signature.family))
+        branches = f", {' + '.join(map(str, signature.branches))}" if signature.branches else ""
+        found.append(("Actions", signature.action_space + branches))
+    source = entry.contract.get("source")
+    if isinstance(source, dict) and source.get("path"):
+        found.append(("Source", el("code", str(source["path"]))))
+    found += [
+        ("Reference", el("code", report.reference)),
+        ("Comparisons", f"{len(report.comparisons)} ({len(report.failures)} disagree)"),
+        ("Inputs", f"seed {report.seed}, {report.samples} typical per batch size"),
+    ]
+    return el("dl", [el("div", el("dt", k), el("dd", v)) for k, v in found], class_="facts")
+
+
+def failures(entry: Entry) -> Markup | None:
+    """Every comparison that failed, by format and runtime: by how much, the first tensor that differs, what passes."""
+    failed = entry.report.failures
+    if not failed:
+        return None
+    groups: dict[str, list[Child]] = {}
+    for c in failed[:_MOST_FAILURES]:
+        groups.setdefault(_where(c), []).append(_failure(c))
+    cards = [el("div", el("h4", where), content, class_="failure") for where, content in groups.items()]
+    more = len(failed) - _MOST_FAILURES
+    return section("What disagrees", cards, el("p", f"And {more} more: see parity.json.") if more > 0 else None)
+
+
+def _failure(c: Comparison) -> Markup:
+    first, *rest = explanation(c)
+    says = first.removeprefix(f"{_where(c)}: ")
+    name = None if c.output == "*" else el("code", c.output)
+    lines = [el("p", f"{line[:1].upper()}{line[1:]}.", class_="soft") for line in rest]
+    return el("div", el("p", name, says.removeprefix(c.output)), lines, class_="detail")
+
+
+def agreement(entry: Entry) -> Markup:
+    """Format × runtime × output, the worst difference of each."""
+    found = matrix(entry.report)
+    rows = []
+    for row in found.rows:
+        size = "" if row.size is None else size_text(row.size)
+        verdict = el("td", "✓ ok" if row.passed else "✗ fails", class_="ok" if row.passed else "fail")
+        cells: list[Child] = [_breakable(row.format), row.runtime, verdict, el("td", size, class_="number")]
+        cells += [_cell(row.cells.get(output)) for output in found.outputs]
+        rows.append(cells)
+    head = ("format", "runtime", "verdict", "size", *found.outputs)
+    caption = "Worst absolute difference from the reference over all inputs, per output"
+    return section("Agreement", table(caption, head, rows, range(3, len(head))))
+
+
+def _breakable(name: str) -> Child:
+    """A name that may be broken after a colon."""
+    head, colon, rest = name.partition(":")
+    return [head, colon, el("wbr"), rest] if colon else name
+
+
+def _cell(cell: Cell | None) -> Markup:
+    if cell is None:
+        return el("td", "–", class_="number soft")
+    return el("td", el("span", cell.text), class_="number" if cell.passed else "number fail")
+
+
+def spread(entry: Entry) -> Markup | None:
+    """Histograms of the differences."""
+    counted = [c for c in entry.report.comparisons if any(c.histogram)]
+    if not counted:
+        return None
+    figures = []
+    for output in dict.fromkeys(c.output for c in counted):
+        group = [c for c in counted if c.output == output]
+        equal = [c for c in group if not any(c.histogram[1:])]
+        differing = [c for c in group if c not in equal]
+        picture = charts.histograms(output, differing) if differing else None
+        figures.append(_figure(output, picture, _equal_text(equal, len(group))))
+    text = (
+        "How many elements differ by how much, over all inputs; each bar is a decade of |Δ|, its height the square "
+        "root of the count. The dashed line is the absolute tolerance."
+    )
+    return section("How the differences are spread", el("p", text, class_="soft"), el("div", figures, class_="figures"))
+
+
+def _equal_text(equal: Sequence[Comparison], of: int) -> str | None:
+    """Who was exactly the reference: they would be drawn as a line on the floor."""
+    names = ", ".join(dict.fromkeys(_where(c) for c in equal))
+    return (
+        None
+        if not equal
+        else "Equal to the last bit in all."
+        if len(equal) == of
+        else f"Equal to the last bit: {names}."
+    )
+
+
+def _figure(title: str, picture: Markup | None, caption: str | None) -> Markup:
+    label = f"Chart of {title}"
+    box = el("div", picture, class_="scroll", tabindex=0, role="region", aria_label=label) if picture else None
+    return el("figure", el("h4", el("code", title)), box, el("figcaption", caption) if caption else None)
+
+
+def memory(entry: Entry) -> Markup | None:
+    """Drift of the rollout, a chart per output."""
+    rolled = [c for c in entry.report.comparisons if c.kind == "rollout" and c.drift]
+    if not rolled:
+        return None
+    moving = [c for c in rolled if any(d > 0 and math.isfinite(d) for d in c.drift)]
+    if not moving:
+        return section(
+            "Memory", el("p", "Fed back in each runtime, every step is equal to the reference's.", class_="soft")
+        )
+    pairs = list(dict.fromkeys((c.format, c.runtime) for c in moving))
+    figures = []
+    for output in dict.fromkeys(c.output for c in rolled):
+        group = [c for c in rolled if c.output == output]
+        lines = [c for c in group if c in moving]
+        picture = charts.drift(output, lines, pairs) if lines else None
+        figures.append(_figure(output, picture, _equal_text([c for c in group if not any(c.drift)], len(group))))
+    key = [
+        el("li", el("i", class_=charts.colour_of(n)), f"{kind} · {runtime}") for n, (kind, runtime) in enumerate(pairs)
+    ]
+    bound = el("li", el("i", class_="dash"), "absolute tolerance")
+    return section(
+        "Memory",
+        el("p", "The worst |Δ| of each step, the memory fed back in each runtime.", class_="soft"),
+        el("ul", key, bound, class_="key"),
+        el("div", figures, class_="figures"),
+    )
+
+
+def policy_graph(entry: Entry) -> Markup | None:
+    """The layers as a picture, and every node in a list that opens."""
+    if entry.graph is None or entry.signature is None:
+        return None
+    inputs, outputs = ([s.name for s in specs] for specs in (entry.signature.inputs, entry.signature.outputs))
+    nodes = [n for n in entry.graph.nodes if n.value is None]
+    content: list[Child] = []
+    blocks = blocks_of(entry.graph, inputs, outputs) if len(nodes) <= _MOST_NODES else []
+    if 0 < len(blocks) <= _MOST_BLOCKS:
+        picture = el("div", charts.diagram(blocks), class_="scroll", tabindex=0, role="region", aria_label="Layers")
+        content.append(el("figure", picture, class_="diagram"))
+    else:
+        content.append(el("p", f"{len(nodes)} nodes: too many for a picture.", class_="soft"))
+    rows = [(el("code", n.name), n.op, _wide(el("code", ", ".join(n.inputs)))) for n in nodes[:_MOST_NODES]]
+    listing = table("Nodes in the order they are computed, constants left out", ("node", "op", "inputs"), rows)
+    content.append(el("details", el("summary", f"All {len(nodes)} nodes"), listing))
+    return section("The policy", content)
+
+
+def tensors(entry: Entry) -> Markup | None:
+    """Inputs and outputs, by name, role, dtype and shape."""
+    if entry.signature is None:
+        return None
+
+    def rows(specs: Iterable[TensorSpec]) -> list[Sequence[Child]]:
+        found: list[Sequence[Child]] = []
+        for s in specs:
+            shape = " × ".join(
+                "batch" if n is None and i == 0 else "any" if n is None else str(n) for i, n in enumerate(s.shape)
+            )
+            source = ", ".join(s.source) if isinstance(s.source, tuple) else s.source or "made here"
+            found.append(
+                (el("code", s.name), s.role.value.replace("_", " "), s.dtype, shape or "scalar", _wide(source))
+            )
+        return found
+
+    head = ("name", "role", "dtype", "shape", "in the source")
+    return section(
+        "Inputs and outputs",
+        table("What the policy is fed", head, rows(entry.signature.inputs)),
+        table("What it answers", head, rows(entry.signature.outputs)),
+    )
+
+
+def worst_inputs(entry: Entry) -> Markup | None:
+    """For each output the input that it differs most on, with the values that were fed."""
+    compared = [c for c in entry.report.comparisons if c.worst_input and c.kind in ("numbers", "rollout")]
+    worst: dict[str, Comparison] = {}
+    for c in compared:
+        if c.max_abs_diff > 0:
+            worst[c.output] = max(worst.get(c.output, c), c, key=lambda c: (not c.passed, c.max_abs_diff))
+    if not worst:
+        return None
+    rows = [
+        (
+            el("code", c.output),
+            _where(c),
+            _number(c.max_abs_diff),
+            c.worst_input,
+            _wide(_fed(entry, c)),
+        )
+        for c in worst.values()
+    ]
+    head = ("output", "where", "|Δ|", "input", "values of its first row")
+    return section("Worst inputs", table("The input on which each output differs most", head, rows))
+
+
+def _fed(entry: Entry, c: Comparison) -> Child:
+    lines = []
+    for name, array in entry.feeds(c.worst_input or "").items():
+        lines.append(el("div", el("code", name), f" {shortened(array)}"))
+    return lines or "–"
+
+
+def shortened(array: np.ndarray) -> str:
+    """The first values of the first row."""
+    row = np.asarray(array)[:1].reshape(-1)
+    values = [f"{float(v):.4g}" for v in row[:_SHOWN_VALUES]]
+    rest = f", … {row.size - _SHOWN_VALUES} more" if row.size > _SHOWN_VALUES else ""
+    return f"[{', '.join(values)}{rest}]"
+
+
+def _where(c: Comparison) -> str:
+    return f"{c.format} in {c.runtime}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def tolerances(entry: Entry) -> Markup:
+    """The default, what differs from it with its reason, and where rounding explains more."""
+    comparisons = entry.report.comparisons
+    plain = list(dict.fromkeys(allowed(c) for c in comparisons if not c.tolerance.reason and c.kind != "failure"))
+    content: list[Child] = []
+    if plain:
+        content.append(el("p", "|Δ| ≤ ", el("code", " or ".join(plain)), " for every element."))
+    special = [
+        (el("code", c.output), _where(c), el("code", allowed(c)), _wide(c.tolerance.reason))
+        for c in comparisons
+        if c.tolerance.reason
+    ]
+    if special:
+        bounds = ("output", "where", "bound", "reason")
+        content.append(table("Tolerances other than the default, with their reasons", bounds, dict.fromkeys(special)))
+    rounded = [
+        (
+            el("code", c.output),
+            _where(c),
+            _number(c.max_abs_diff),
+            _number(c.rounding),
+            c.worst_input,
+        )
+        for c in comparisons
+        if c.rounding and c.passed
+    ]
+    if rounded:
+        head = ("output", "where", "|Δ|", "rounding explains", "input")
+        content.append(table("Above the tolerance, but within what float32 rounding explains", head, rounded))
+    return section("Tolerances", content)
+
+
+def runtimes(entry: Entry) -> Markup:
+    """Which ran, in which version; why the others did not."""
+    rows = []
+    for name, state in entry.report.runtimes.items():
+        ran = state["status"] == "ran"
+        text = "ran" if ran else f"did not run: {state['reason'] or 'no reason given'}"
+        rows.append((name, state["version"] or "–", _wide(text)))
+    return section("Runtimes", table("Runtimes and their versions", ("runtime", "version", "state"), rows))
+
+
+def files(entry: Entry) -> Markup | None:
+    """Sizes of the formats."""
+    if not entry.report.sizes:
+        return None
+    rows = [(kind, size_text(size)) for kind, size in entry.report.sizes.items()]
+    return section("Sizes", table("Bytes of each format", ("format", "size"), rows, [1]))
+
+
+def notes(entry: Entry) -> Markup | None:
+    """What reading and verification found worth saying."""
+    if not entry.report.notes:
+        return None
+    return section("Notes", el("ul", [el("li", note) for note in entry.report.notes], class_="plain"))

@@ -1,0 +1,79 @@
+"""Where reports go: files that the command line names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from exporter.reports.entry import Entry
+from signatures.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Destinations:
+    """The files to write; ``markdown`` may be "-", which is stdout."""
+
+    junit: Path | None = None
+    markdown: Path | None = None
+    html: Path | None = None
+
+    def prepare(self) -> None:
+        """Make the folders, before anything that takes long. Raises UsageError where a file cannot be written."""
+        paths = [p for p in self._files() if p is not None]
+        for path in paths:
+            if path.is_dir():
+                raise UsageError("is a folder", where=str(path), fix="name a file for the report")
+            if paths.count(path) > 1:
+                raise UsageError("is named for two reports", where=str(path), fix="give each a file of its own")
+            with _reporting(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+
+    def _files(self) -> tuple[Path | None, ...]:
+        return (self.junit, None if self.markdown == Path("-") else self.markdown, self.html)
+
+    def write(self, entries: Sequence[Entry], echo: Callable[[str], None]) -> None:
+        """Write all of them, each whole; all are made before the first is written. Raises UsageError."""
+        content: list[tuple[Path, bytes]] = []
+        if self.junit is not None:
+            from exporter.reports.junit import junit_xml
+
+            content.append((self.junit, junit_xml(entries)))
+        if self.html is not None:
+            from exporter.reports.page import page
+
+            content.append((self.html, page(entries).encode("utf-8")))
+        if self.markdown is not None:
+            from exporter.reports.markdown import markdown_text
+
+            text = markdown_text(entries)
+            if self.markdown == Path("-"):
+                echo(text.rstrip("\n"))
+            else:
+                content.append((self.markdown, _appended(self.markdown, text.encode("utf-8"))))
+        for path, data in content:
+            with _reporting(path):
+                path.write_bytes(data)
+
+
+def _appended(path: Path, data: bytes) -> bytes:
+    """GitHub's summary of a job step is appended to, as its documentation asks; any other file is replaced."""
+    summary = os.environ.get("GITHUB_STEP_SUMMARY")
+    if not summary or path.absolute() != Path(summary).absolute() or not path.exists():
+        return data
+    with _reporting(path):
+        before = path.read_bytes()
+    return before + (b"\n" if before and not before.endswith(b"\n\n") else b"") + data
+
+
+@contextmanager
+def _reporting(path: Path) -> Iterator[None]:
+    """What the system refuses inside is a UsageError about ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(
+            "the report cannot be written", where=str(path), why=error.strerror, fix="name a file that can be"
+        ) from error

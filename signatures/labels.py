@@ -1,0 +1,119 @@
+"""Names that people give to the numbers of a policy: what each observation is, what each action does.
+
+As in policy.json: ``{"observations": {NAME: [text per number]}, "branches": [[text per action] per branch],
+"actions": [text per continuous action]}``; each part may be left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from signatures.errors import UsageError
+from signatures.roles import Role
+
+if TYPE_CHECKING:
+    from signatures.spec import PolicySignature
+
+#: What one text may hold: it is shown on a line, in a page and in comments of code.
+MAX_LENGTH = 120
+PARTS = ("observations", "actions", "branches")
+
+
+def parsed(content: Any) -> dict[str, Any]:
+    """Labels in their form, parts without a text left out. Raises ValueError that says what is wrong."""
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise ValueError("the labels are no table")
+    for key in content:
+        if key not in PARTS:
+            raise ValueError(f"{key!r} is none of {', '.join(PARTS)}")
+    named = content.get("observations", {})
+    if not isinstance(named, Mapping):
+        raise ValueError("'observations' is no table of lists, one per observation")
+    branches = content.get("branches", [])
+    if not isinstance(branches, Sequence) or isinstance(branches, str):
+        raise ValueError("'branches' is no list of lists, one per branch")
+    found: dict[str, Any] = {
+        "observations": {str(name): _texts(texts, f"observation {name!r}") for name, texts in named.items()},
+        "actions": _texts(content.get("actions", []), "'actions'"),
+        "branches": [_texts(texts, f"branch {i}") for i, texts in enumerate(branches)],
+    }
+    return {key: found[key] for key in PARTS if found[key]}
+
+
+def _texts(texts: Any, where: str) -> list[str]:
+    if not isinstance(texts, Sequence) or isinstance(texts, str):
+        raise ValueError(f"{where} has no list of texts")
+    for text in texts:
+        if not isinstance(text, str) or not text.strip() or not text.isprintable() or len(text) > MAX_LENGTH:
+            raise ValueError(f"{where}: {text!r} is no text of 1 to {MAX_LENGTH} printable characters on one line")
+    return list(texts)
+
+
+def checked(content: Any, signature: PolicySignature) -> dict[str, Any]:
+    """Labels that fit ``signature``. Raises UsageError that names the first which does not."""
+    try:
+        labels = parsed(content)
+    except ValueError as error:
+        raise UsageError(
+            f"labels: {error}",
+            fix='write {"observations": {NAME: [texts]}, "actions": [texts], "branches": [[texts], …]}',
+        ) from error
+    wanted = sizes(signature)
+    for name, texts in labels.get("observations", {}).items():
+        if name not in wanted["observations"]:
+            known = ", ".join(wanted["observations"]) or "none whose numbers can be named"
+            raise UsageError(f"labels: there is no vector observation {name!r}", fix=f"the policy has {known}")
+        _counted(texts, wanted["observations"][name], f"observation {name!r}", "numbers")
+    if "actions" in labels:
+        if not wanted["actions"]:
+            raise UsageError("labels: the policy has no continuous actions", fix="leave 'actions' out")
+        _counted(labels["actions"], wanted["actions"], "'actions'", "continuous actions")
+    if "branches" in labels:
+        if not wanted["branches"]:
+            raise UsageError("labels: the policy has no branches of discrete actions", fix="leave 'branches' out")
+        _counted(labels["branches"], len(wanted["branches"]), "'branches'", "branches")
+        for i, (texts, size) in enumerate(zip(labels["branches"], wanted["branches"], strict=True)):
+            _counted(texts, size, f"branch {i}", "actions")
+    return labels
+
+
+def remaining(labels: Mapping[str, Any], signature: PolicySignature) -> dict[str, Any]:
+    """The labels of what ``signature`` still has: an export with other options may have left something out."""
+    wanted = sizes(signature)
+    named = labels.get("observations", {})
+    kept: dict[str, Any] = {
+        "observations": {n: t for n, t in named.items() if wanted["observations"].get(n) == len(t)},
+        "actions": labels.get("actions", []) if len(labels.get("actions", [])) == wanted["actions"] else [],
+        "branches": labels.get("branches", []) if _lengths(labels) == wanted["branches"] else [],
+    }
+    return {key: kept[key] for key in PARTS if kept[key]}
+
+
+def sizes(signature: PolicySignature) -> dict[str, Any]:
+    """How many texts each part has: per vector observation, of the continuous actions, per branch."""
+    vectors = (s for s in signature.observations if s.role is not Role.VISUAL and s.shape)
+    heads = signature.outputs[: 2 if signature.action_space == "hybrid" else 1]
+    continuous = next((h for h in heads if h.dtype.startswith("float") and _is_continuous(h.role)), None)
+    return {
+        "observations": {s.name: s.shape[-1] for s in vectors if s.shape[-1] is not None},
+        "actions": 0 if continuous is None else continuous.shape[-1] or 0,
+        "branches": list(signature.branches),
+    }
+
+
+def _is_continuous(role: Role) -> bool:
+    return role in (Role.CONTINUOUS, Role.DETERMINISTIC)
+
+
+def _lengths(labels: Mapping[str, Any]) -> list[int]:
+    return [len(texts) for texts in labels.get("branches", [])]
+
+
+def _counted(texts: Sequence[object], size: int, where: str, of: str) -> None:
+    if len(texts) != size:
+        raise UsageError(
+            f"labels: {where} has {len(texts)} texts, the policy has {size} {of}", fix="give one text for each"
+        )

@@ -1,0 +1,114 @@
+"""The GitHub Action, run as the script that it is."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from exporter.pipeline import ExportOptions, export
+from fixtures import path as fixture
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform == "win32", reason="GitHub's Windows runners have bash; this machine need not"),
+]
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    return next(iter(export([fixture("continuous")], ExportOptions(out, verify="none")))).folder
+
+
+class Job:
+    """A runner of GitHub's: a folder, the files that steps write to."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.summary, self.output = folder, folder / "summary.md", folder / "output"
+
+    def run(self, **inputs: str) -> subprocess.CompletedProcess[str]:
+        environment = {
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+            "HOME": os.environ.get("HOME", str(self.folder)),
+            "GITHUB_STEP_SUMMARY": str(self.summary),
+            "GITHUB_OUTPUT": str(self.output),
+            "EXPORT_MODEL_INSTALL": "",
+            "EXPORT_MODEL_JAVASCRIPT": "false",
+            "EXPORT_MODEL_RUNTIMES": "onnxruntime",
+            **{f"EXPORT_MODEL_{name.upper()}": value for name, value in inputs.items()},
+        }
+        return subprocess.run(
+            ["bash", str(ROOT / ".ci" / "action.sh")],
+            cwd=self.folder,
+            env=environment,
+            capture_output=True,
+            encoding="utf-8",
+        )
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Job:
+    return Job(tmp_path)
+
+
+def test_a_bundle_is_verified_and_reported(job: Job, bundle: Path) -> None:
+    done = job.run(paths=f"\n  {bundle}  \n", arguments=f"--source={fixture('continuous')}\n\n--seed=3")
+    assert done.returncode == 0, done.stderr
+    assert "PASSED" in done.stdout
+    assert job.output.read_text() == "status=0\n"
+    assert "continuous" in job.summary.read_text()
+    assert ET.parse(job.folder / "parity" / "parity.xml").getroot().tag == "testsuites"
+    assert (job.folder / "parity" / "parity.html").read_text().lower().startswith("<!doctype html>")
+
+
+def test_a_disagreement_fails_the_step(job: Job, bundle: Path) -> None:
+    done = job.run(paths=str(bundle), arguments="--max-size=onnx=1kB", report="out/reports")
+    assert done.returncode == 1
+    assert job.output.read_text() == "status=1\n"
+    assert "::error" in done.stderr
+    assert "out/reports/parity.html" in done.stderr
+    assert ET.parse(job.folder / "out" / "reports" / "parity.xml").findall(".//failure")
+
+
+def test_artefacts_are_compared(job: Job, bundle: Path) -> None:
+    done = job.run(command="compare", paths=f"{fixture('continuous')}\n{bundle / 'continuous.onnx'}")
+    assert done.returncode == 0, done.stderr + done.stdout
+
+
+def test_a_source_is_exported(job: Job) -> None:
+    done = job.run(command="export", paths=str(fixture("discrete")), arguments="--out=models")
+    assert done.returncode == 0, done.stderr
+    assert (job.folder / "models" / "discrete" / "policy.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "words"),
+    [({"command": "rm -rf ."}, "it is verify, compare or export"), ({"paths": " \n "}, "paths is empty")],
+)
+def test_bad_inputs_are_status_2(job: Job, inputs: dict[str, str], words: str) -> None:
+    done = job.run(**{"paths": "bundle", **inputs})
+    assert done.returncode == 2
+    assert words in done.stderr
+
+
+def test_no_input_is_ever_shell_code(job: Job) -> None:
+    evil = "$(touch owned) `touch owned`; touch owned #"
+    done = job.run(paths=evil, arguments=f"--source={evil}")
+    assert done.returncode == 2
+    assert not (job.folder / "owned").exists()
+
+
+def test_every_input_of_the_action_reaches_the_script() -> None:
+    text = (ROOT / "action.yml").read_text()
+    inputs = set(re.findall(r"^  (\w+):\n    description", text.split("outputs:")[0], re.M))
+    passed = dict(re.findall(r"EXPORT_MODEL_(\w+): \$\{\{ inputs\.(\w+) \}\}", text))
+    assert {name.lower() for name in passed} == set(passed.values()) == inputs
+    script = (ROOT / ".ci" / "action.sh").read_text()
+    assert all(f"EXPORT_MODEL_{name}" in script for name in passed)

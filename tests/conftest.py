@@ -1,0 +1,47 @@
+"""What all tests share: the runtimes' processes, started once per session.
+
+Every policy.json and parity.json that a test in this process writes is held against its JSON Schema.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+
+from exporter.parity.pool import RuntimePool
+from exporter.runtimes import available_runtimes
+
+#: What the tests that compare all formats run them in.
+NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
+
+
+@pytest.fixture(scope="session")
+def pool() -> Iterator[RuntimePool]:
+    """A pool in which all of NEEDED can be started; skips, with how to install it, where one is not there."""
+    missing = [i for i in available_runtimes() if i.name in NEEDED and not i.installed]
+    if missing:
+        pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
+    with RuntimePool() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _what_is_written_fits_its_schema() -> Iterator[None]:
+    from exporter import bundle
+    from tests.reports.validation import check_parity, check_policy
+
+    written = bundle.dumps
+
+    def checked(content: Mapping[str, Any]) -> bytes:
+        data = written(content)
+        if "comparisons" in content:
+            check_parity(data)
+        elif "files" in content:
+            check_policy(data)
+        return data
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bundle, "dumps", checked)
+        yield

@@ -1,0 +1,128 @@
+"""The options on output: reports to files, quiet, verbose, colours, progress."""
+
+from __future__ import annotations
+
+import io
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from exporter import cli, pipeline
+from exporter.console import Console, Progress
+from fixtures import path as fixture
+from tests.commands import Ran, export_model, is_refused
+from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
+
+Exporting = Callable[..., Ran]
+
+
+def spoil(kind: str, runtime: str, answer: Tensors) -> Tensors:
+    return {n: a + np.float32(1) if kind == "onnx" and n == "value_estimate" else a for n, a in answer.items()}
+
+
+@pytest.fixture
+def exporting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Exporting:
+    """The export command on a fixture, the runtimes played."""
+
+    def run(*options: object, good: bool = True, command: tuple[object, ...] | None = None) -> Ran:
+        pool = ActingPool() if good else ActingPool(spoil)
+        monkeypatch.setattr(pipeline, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+        monkeypatch.setattr(pipeline, "RuntimePool", lambda: pool)
+        return export_model(*(command or (fixture("continuous"), "-o", tmp_path / "out")), *options)
+
+    return run
+
+
+@pytest.mark.parametrize("good", [True, False])
+def test_all_reports_are_written_whatever_the_verdict(exporting: Exporting, tmp_path: Path, good: bool) -> None:
+    folder = tmp_path / "deep" / "er"
+    options = ("--junit", folder / "j.xml", "--markdown", folder / "m.md", "--html", folder / "h.html")
+    ran = exporting(*options, good=good)
+    assert ran.status == (0 if good else 1)
+    assert int(ET.parse(folder / "j.xml").getroot().get("failures", "")) == (0 if good else 1)
+    assert ("PASSED" if good else "FAILED") in (folder / "m.md").read_text(encoding="utf-8")
+    assert ("Passed" if good else "What disagrees") in (folder / "h.html").read_text(encoding="utf-8")
+
+
+def test_verify_writes_the_same_reports(exporting: Exporting, tmp_path: Path) -> None:
+    assert exporting().status == 0
+    bundle = tmp_path / "out" / "continuous"
+    paths = [tmp_path / name for name in ("j.xml", "m.md", "h.html")]
+    ran = exporting("--junit", paths[0], "--markdown", paths[1], "--html", paths[2], command=("verify", bundle, bundle))
+    assert ran.status == 0
+    assert len(ET.parse(paths[0]).getroot()) == 10
+    assert paths[1].read_text(encoding="utf-8").count("### ") == 2
+    assert "dense 64, swish" in paths[2].read_text(encoding="utf-8")
+
+
+def test_markdown_on_stdout_is_all_that_is_there(exporting: Exporting) -> None:
+    ran = exporting("--markdown", "-")
+    assert ran.out.startswith("## export-model\n")
+    assert "next:" not in ran.out
+
+
+def test_what_contradicts_itself_is_refused(exporting: Exporting, tmp_path: Path) -> None:
+    is_refused(exporting("--quiet", "--verbose"), "contradict")
+    is_refused(exporting("--html", tmp_path / "x", "--verify", "none"), "needs a verification")
+    is_refused(exporting("--html", tmp_path / "x", "--junit", tmp_path / "x"), "two reports")
+    (tmp_path / "file").write_text("")
+    is_refused(exporting("--html", tmp_path / "file" / "x"), "cannot be written")
+    assert exporting("--html", tmp_path).status == 2
+    assert "both want stdout" in exporting("--markdown", "-", "--json").err
+    assert not (tmp_path / "out").exists()
+
+
+def test_quiet_says_only_what_disagrees(exporting: Exporting) -> None:
+    assert exporting("-q") == Ran(0, "", "")
+    bad = exporting("-q", good=False)
+    assert bad.status == 1
+    assert "value_estimate differs by" in bad.out
+    assert "FAILED" in bad.out
+    assert "format " not in bad.out
+
+
+def test_verbose_says_every_step_and_comparison(exporting: Exporting) -> None:
+    ran = exporting("-v")
+    assert "s  continuous: onnx in onnxruntime" in ran.err
+    row = next(line for line in ran.out.splitlines() if line.startswith("onnx") and "value_estimate" in line)
+    assert row.split()[-1] == "ok"
+    assert "numbers" in row
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("no_colour", ["", "1"])
+def test_colour_is_for_terminals_that_want_it(
+    exporting: Exporting, monkeypatch: pytest.MonkeyPatch, no_colour: str, tmp_path: Path
+) -> None:
+    plain = exporting()
+    assert "\x1b" not in plain.out
+    monkeypatch.setenv("NO_COLOR", no_colour)
+    shown: Any = Terminal()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stdout", shown)
+        cli.app.main([str(fixture("continuous")), "-o", str(tmp_path / "out")], standalone_mode=False)
+    assert ("\x1b[32mPASSED" in shown.getvalue()) is (no_colour == "")
+    assert "PASSED" in shown.getvalue()
+
+
+def test_progress_is_one_line_on_a_terminal_and_gone_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Terminal()
+    monkeypatch.setattr("sys.stderr", shown)
+    monkeypatch.setenv("COLUMNS", "20")
+    monkeypatch.setenv("TERM", "xterm")
+    with pytest.raises(ValueError, match="stop"), Progress(quiet=False, verbose=False) as progress:
+        progress("a step whose name is long")
+        raise ValueError("stop")
+    assert shown.getvalue() == "\r\x1b[2K  a step whose name\r\x1b[2K"
+    with Console(quiet=True).progress() as progress:
+        progress("nothing")
+    assert shown.getvalue().endswith("\r\x1b[2K")
+    assert "nothing" not in shown.getvalue()
