@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from exporter.console import Console, reporting
+from exporter.serve.command import serve_command
+from exporter.snippets.command import snippets_command
 from exporter.version import __version__
 from signatures.errors import ExportModelError, UsageError
 
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
     from exporter.parity.report import ParityReport
     from exporter.parity.subject import VerifyOptions
     from exporter.pipeline import ExportResult
+    from exporter.reports.entry import Entry
 
 _TARGETS = "bytes,saved_model,tfjs,onnx"
 
@@ -59,6 +64,18 @@ def _pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     return pairs
 
 
+def _shapes(text: str) -> tuple[tuple[int, ...], ...]:
+    """``"8,3x84x84"`` as the shapes of a vector of 8 and an image C, H, W."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    for part in parts:
+        if not re.fullmatch("[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}x[1-9][0-9]{0,6})?", part):
+            raise UsageError(
+                f"--sensors {text}: {part} is no shape of a sensor",
+                fix="give one shape per sensor: 8 for a vector, 3x84x84 (channels, height, width) for an image",
+            )
+    return tuple(tuple(int(n) for n in part.split("x")) for part in parts)
+
+
 def _numbers(values: Sequence[str]) -> dict[str, float]:
     numbers = {}
     words = {"true": 1.0, "false": 0.0}
@@ -91,6 +108,13 @@ def _parity_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--steps", type=click.IntRange(1), default=4, show_default=True, help="Steps with the memory fed back."
         ),
+        click.option("--max-size", "sizes", multiple=True, metavar="[FORMAT=]SIZE", help="Fail above this size: 1MB."),
+        click.option(
+            "--golden",
+            type=click.Path(path_type=Path, dir_okay=False),
+            metavar="FILE",
+            help="Recorded inputs (and outputs), an .npz.",
+        ),
         click.option("--atol", type=float, default=1e-5, show_default=True, help="Absolute tolerance."),
         click.option("--rtol", type=float, default=1e-5, show_default=True, help="Relative tolerance."),
     ):
@@ -98,11 +122,22 @@ def _parity_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def _verify_options(seed: int, samples: int, steps: int, atol: float, rtol: float) -> VerifyOptions:
+def _verify_options(
+    console: Console,
+    *,
+    seed: int,
+    samples: int,
+    steps: int,
+    atol: float,
+    rtol: float,
+    golden: Path | None,
+    sizes: Sequence[str],
+) -> VerifyOptions:
+    from exporter.parity.budget import parse_budget
     from exporter.parity.subject import VerifyOptions
     from exporter.parity.tolerances import Tolerance
 
-    return VerifyOptions(seed, samples, steps, Tolerance(atol, rtol))
+    return VerifyOptions(seed, samples, steps, Tolerance(atol, rtol), console.rules(), golden, parse_budget(sizes))
 
 
 def _compile_options(
@@ -149,6 +184,8 @@ def _compile_options(
 )
 @click.option("--deterministic", is_flag=True, help="Make 'action' the one without chance.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
+@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
+@click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, default=15, show_default=True, help="ONNX opset.")
 @click.option(
     "--verify",
@@ -158,7 +195,7 @@ def _compile_options(
     metavar="auto|none|full|RUNTIME,...",
     help="Runtimes to compare in.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+@reporting
 @_understanding
 @_parity_options
 def export_command(
@@ -171,95 +208,49 @@ def export_command(
     deterministic: bool,
     opset: int,
     runtimes: str,
-    as_json: bool,
     step: int | None,
+    sensors: str,
+    labels: Path | None,
     brain: str | None,
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
     values: tuple[str, ...],
-    seed: int,
-    samples: int,
-    steps: int,
-    atol: float,
-    rtol: float,
+    console: Console,
+    **parity: Any,
 ) -> None:
     """Export policies (the command that is meant where none is named)."""
     from converters.source import ReadOptions
     from exporter.pipeline import ExportOptions, export
 
+    console.prepare(verifies=runtimes != "none")
     options = ExportOptions(
         out,
         [t for t in targets.split(",") if t],
         name,
         _compile_options(brain, inputs, outputs, values, names=names, noise=noise, deterministic=deterministic),
-        ReadOptions(step),
+        ReadOptions(step, _shapes(sensors)),
         opset,
         runtimes,
-        _verify_options(seed, samples, steps, atol, rtol),
+        _verify_options(console, **parity),
+        labels,
     )
     results = []
-    for result in export(list(sources), options, _progress(as_json)):
-        results.append(result)
-        if not as_json:
-            _print_result(result)
-    if as_json:
-        click.echo(json.dumps({"policies": [_result_dict(r) for r in results]}, indent=1))
-    else:
-        _print_next(results, options.compile.names, options.targets)
+    with console.progress() as progress:
+        for result in export(list(sources), options, progress):
+            results.append(result)
+            progress.clear()
+            console.result(result)
+    console.json({"policies": [_result_dict(r) for r in results]})
+    console.next_step(results, options.compile.names, options.targets)
+    console.write_reports(lambda: _entries(results, parity["steps"]))
     if any(r.passed is False for r in results):
         sys.exit(1)
 
 
-def _progress(quiet: bool) -> Callable[[str], None]:
-    """One line that is overwritten, on a terminal only."""
-    if quiet or not sys.stderr.isatty():
-        return lambda text: None
-    return lambda text: click.echo(f"\r\x1b[2K  {text[:100]}", nl=False, err=True)
+def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:
+    from exporter.reports.entry import of_result
 
-
-def _print_result(result: ExportResult) -> None:
-    from exporter.summary import failure_lines, not_run_lines, parity_table, verdict
-    from exporter.tables import size_text, table
-
-    if sys.stderr.isatty():
-        click.echo("\r\x1b[2K", nl=False, err=True)
-    signature = result.policy.signature
-    click.echo(f"{result.policy.name}: {signature.family}, {signature.action_space} actions -> {result.folder}")
-    for note in signature.notes:
-        click.echo(f"  note: {note}")
-    if result.report is None:
-        rows = [[kind, size_text(size)] for kind, size in result.sizes.items()]
-        click.echo(table(("format", "size"), rows))
-        click.echo("NOT VERIFIED: --verify none")
-        return
-    _print_report(result.report, parity_table, failure_lines, not_run_lines, verdict)
-
-
-def _print_report(
-    report: ParityReport,
-    parity_table: Callable[[ParityReport], str],
-    failure_lines: Callable[[ParityReport], list[str]],
-    not_run_lines: Callable[[ParityReport], list[str]],
-    verdict: Callable[[ParityReport], str],
-) -> None:
-    click.echo(parity_table(report))
-    for line in [*failure_lines(report), *not_run_lines(report)]:
-        click.echo(line)
-    colour = {True: "green", False: "red", None: "yellow"}[report.passed]
-    click.secho(verdict(report), fg=colour)
-
-
-def _print_next(results: Sequence[ExportResult], names: str, targets: Sequence[str]) -> None:
-    """What to do next, in a line or two."""
-    if not results:
-        return
-    failed = next((r for r in results if r.passed is False), None)
-    if failed is not None:
-        click.echo(f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree")
-        return
-    if "bytes" in targets and names == "canonical":
-        click.echo("note: Unity looks nodes up by the trainer's names: export with --names source for Unity")
-    click.echo(f"next: export-model verify {results[-1].folder}    (policy.json there says what to feed)")
+    return [entry for entry in (of_result(result, steps) for result in results) if entry is not None]
 
 
 def _result_dict(result: ExportResult) -> dict[str, Any]:
@@ -275,70 +266,136 @@ def _result_dict(result: ExportResult) -> dict[str, Any]:
 @app.command("inspect")
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
+@click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
+@click.option("--svg", type=click.Path(path_type=Path), metavar="FILE", help="Write a picture of the policy.")
 @_understanding
 def inspect_command(
     source: Path,
+    step: int | None,
     as_json: bool,
+    logdir: Path | None,
+    svg: Path | None,
     brain: str | None,
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
     values: tuple[str, ...],
 ) -> None:
     """Show what is in a file: generation, brains, inputs and what to feed, outputs, ops, targets."""
+    from converters.source import ReadOptions
     from exporter.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, _compile_options(brain, inputs, outputs, values))
+    found = inspect_source(source, _compile_options(brain, inputs, outputs, values), ReadOptions(step))
+    written: list[Path] = []
+    if logdir is not None or svg is not None:
+        from exporter.pictures import write_pictures
+
+        written = write_pictures(found, logdir, svg)
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=1))
+        shown = {"written": [str(path) for path in written]} if written else {}
+        click.echo(json.dumps({**found.to_dict(), **shown}, indent=1))
         return
     click.echo(inspection_text(found))
-    click.echo(f"next: export-model {source} -o exported")
+    for path in written:
+        click.echo(f"wrote {path}")
+    click.echo(f"next: export-model {source}{'' if step is None else f' --step {step}'} -o exported")
 
 
 @app.command("verify")
 @click.argument("bundles", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="BUNDLE...")
 @click.option("--source", type=click.Path(path_type=Path), help="The file the bundle was exported from.")
+@click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
 @click.option(
     "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
 )
 @click.option("--allow-unverified", is_flag=True, help="Succeed although no independent runtime is installed.")
-@click.option("--json", "as_json", is_flag=True, help="Print the reports as JSON.")
+@reporting
 @_parity_options
 def verify_command(
     bundles: tuple[Path, ...],
     source: Path | None,
+    step: int | None,
     runtimes: str,
     allow_unverified: bool,
-    as_json: bool,
-    seed: int,
-    samples: int,
-    steps: int,
-    atol: float,
-    rtol: float,
+    console: Console,
+    **parity: Any,
 ) -> None:
     """Verify bundles again: hashes first, then every format in the runtimes."""
     from exporter.pipeline import verify_folder
-    from exporter.summary import failure_lines, not_run_lines, parity_table, verdict
 
+    console.prepare()
+    options = _verify_options(console, **parity)
     reports = []
-    for folder in bundles:
-        report = verify_folder(
-            folder,
-            source=source,
-            runtimes=runtimes,
-            options=_verify_options(seed, samples, steps, atol, rtol),
-            allow_unverified=allow_unverified,
-            progress=_progress(as_json),
-        )
-        reports.append(report)
-        if not as_json:
-            click.echo(f"{report.policy}: {folder}")
-            for note in report.notes:
-                click.echo(f"  note: {note}")
-            _print_report(report, parity_table, failure_lines, not_run_lines, verdict)
-    if as_json:
-        click.echo(json.dumps({"reports": [r.to_dict() for r in reports]}, indent=1))
+    with console.progress() as progress:
+        for folder in bundles:
+            report = verify_folder(
+                folder,
+                source=source,
+                step=step,
+                runtimes=runtimes,
+                options=options,
+                allow_unverified=allow_unverified,
+                progress=progress,
+            )
+            reports.append(report)
+            progress.clear()
+            console.verified(report, folder)
+    console.json({"reports": [r.to_dict() for r in reports]})
+    console.write_reports(lambda: _bundle_entries(reports, bundles, parity["steps"]))
     if any(r.passed is False for r in reports):
+        sys.exit(1)
+
+
+def _bundle_entries(reports: Sequence[ParityReport], bundles: Sequence[Path], steps: int) -> list[Entry]:
+    from exporter.reports.entry import of_bundle
+
+    return [of_bundle(report, folder, steps) for report, folder in zip(reports, bundles, strict=True)]
+
+
+@app.command("compare")
+@click.argument("reference", type=click.Path(path_type=Path))
+@click.argument("candidates", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CANDIDATE...")
+@click.option("--map", "names", multiple=True, metavar="NAME=OTHER", help="What the candidates call a name.")
+@click.option(
+    "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
+)
+@click.option("--allow-unverified", is_flag=True, help="Succeed although no runtime of theirs is installed.")
+@reporting
+@_understanding
+@_parity_options
+def compare_command(
+    reference: Path,
+    candidates: tuple[Path, ...],
+    names: tuple[str, ...],
+    runtimes: str,
+    allow_unverified: bool,
+    brain: str | None,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    values: tuple[str, ...],
+    console: Console,
+    **parity: Any,
+) -> None:
+    """Hold artefacts that any tool made against a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    from exporter.comparison import compare_artefacts
+    from exporter.reports.entry import Entry
+
+    console.prepare()
+    with console.progress() as progress:
+        report = compare_artefacts(
+            reference,
+            candidates,
+            names=_pairs(names, "--map"),
+            runtimes=runtimes,
+            options=_verify_options(console, **parity),
+            understanding=_compile_options(brain, inputs, outputs, values),
+            allow_unverified=allow_unverified,
+            progress=progress,
+        )
+    console.verified(report, ", ".join(map(str, candidates)))
+    console.json({"reports": [report.to_dict()]})
+    console.write_reports(lambda: [Entry(report, steps=parity["steps"])])
+    if report.passed is False:
         sys.exit(1)
 
 
@@ -367,7 +424,8 @@ def install_command(name: str) -> None:
     """Install a runtime into the user's cache folder; "tfjs" and "tf1" stand for all whose names begin so."""
     from exporter.runtimes import RUNTIMES
 
-    chosen = [r for r in RUNTIMES if r.name == name or r.name.startswith((f"{name}-", f"{name}."))]
+    chosen = [r for r in RUNTIMES if r.name == name]
+    chosen = chosen or [r for r in RUNTIMES if r.name.startswith((f"{name}-", f"{name}."))]
     steps = list(dict.fromkeys(r.install for r in chosen if r.install is not None))
     if steps:
         for install in steps:
@@ -379,6 +437,10 @@ def install_command(name: str) -> None:
         + ("there is no such runtime" if how is None else "this command does not install it"),
         fix=how or "export-model runtimes lists the runtimes and how to install each",
     )
+
+
+app.add_command(serve_command)
+app.add_command(snippets_command)
 
 
 def main(args: Sequence[str] | None = None) -> None:

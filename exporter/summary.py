@@ -28,6 +28,20 @@ def parity_table(report: ParityReport) -> str:
     return table(("format", "runtime", "size", "max |Δ| per output", "verdict"), rows)
 
 
+def comparison_table(report: ParityReport) -> str:
+    """Every comparison on a line of its own."""
+    rows = []
+    for c in report.comparisons:
+        sizes = [
+            f"{c.max_abs_diff:.2e}",
+            f"{c.max_rel_diff:.2e}",
+            allowed(c) if c.kind in ("numbers", "rollout") else "",
+        ]
+        rows.append([c.format, c.runtime, c.output, c.kind, *sizes, c.worst_input or "", "ok" if c.passed else "FAIL"])
+    head = ("format", "runtime", "output", "kind", "max |Δ|", "max |Δ| / |b|", "allowed", "worst input", "verdict")
+    return table(head, rows)
+
+
 def _groups(comparisons: Iterable[Comparison]) -> dict[tuple[str, str], list[Comparison]]:
     groups: dict[tuple[str, str], list[Comparison]] = {}
     for comparison in comparisons:
@@ -48,21 +62,69 @@ def _worst_by_output(group: Iterable[Comparison]) -> list[str]:
 
 
 def failure_lines(report: ParityReport) -> list[str]:
-    """One line per comparison that failed: where, by how much, what would pass."""
+    """What to read about every comparison that failed: where, by how much, what would pass."""
     lines = []
     for c in report.failures:
-        where = f"{c.format} in {c.runtime}"
-        if c.kind == "failure":
-            lines.append(f"  {where}: {c.reason}")
-            continue
-        text = f"  {where}: {c.output} differs"
-        if c.reason:
-            text += f": {c.reason}"
-        elif math.isfinite(c.max_abs_diff):
-            text += f" by {c.max_abs_diff:.3g} (relative {c.max_rel_diff:.3g}), allowed {c.tolerance.atol:g} + "
-            text += f"{c.tolerance.rtol:g}·|reference|"
-        lines.append(f"{text} [{c.kind}, {c.worst_input}]")
+        first, *rest = explanation(c)
+        lines.append(f"  {first}")
+        lines += [f"    {line}" for line in rest]
     return lines
+
+
+def explanation(c: Comparison) -> list[str]:
+    """Why a comparison failed, a line each: what and where, the first tensor that differs, what would pass."""
+    where = f"{c.format} in {c.runtime}"
+    if c.kind == "failure":
+        return [f"{where}: {c.reason}"]
+    text = f"{where}: {c.output} differs"
+    if c.reason:
+        text += f": {c.reason}"
+    elif math.isfinite(c.max_abs_diff):
+        text += f" by {c.max_abs_diff:.3g} (relative {c.max_rel_diff:.3g}), allowed {allowed(c)}"
+    return [line for line in (f"{text} [{c.kind}, {c.worst_input}]", first_difference(c), would_pass(c)) if line]
+
+
+def allowed(c: Comparison) -> str:
+    """The bound of a comparison, as a formula."""
+    return f"{c.tolerance.atol:g} + {c.tolerance.rtol:g}·|reference|"
+
+
+def first_difference(c: Comparison) -> str | None:
+    """Where a disagreement begins, in a line; None where it was not looked for."""
+    found = c.bisection
+    if found is None:
+        return None
+    if found.tensor is None:
+        return f"first difference: not found, {found.reason}"
+    text = f"first difference: {found.tensor}"
+    if found.op:
+        text += f" ({found.op})"
+    if found.source:
+        text += f", in the source {found.source if isinstance(found.source, str) else ', '.join(found.source)}"
+    if found.expected is not None and found.got is not None:
+        place = "" if found.index is None else f" at {list(found.index)}"
+        text += f":{place} expected {found.expected:.8g}, got {found.got:.8g}"
+    if found.input is not None:
+        text += f", fed {found.input}"
+    if found.hidden:
+        text += f"; not seen before it: {', '.join(found.hidden)}"
+    return f"{text}; {found.reason}" if found.reason else text
+
+
+def would_pass(c: Comparison) -> str | None:
+    """The smallest tolerance that would pass, where a comparison failed and one would."""
+    if c.passed or c.smallest_tolerance is None:
+        return None
+    return f"smallest tolerance that would pass: {_rounded_up(c.smallest_tolerance)}, as atol and rtol"
+
+
+def _rounded_up(value: float) -> str:
+    """Three digits, never less than ``value``: who gives it as a tolerance must pass."""
+    if value <= 0:
+        return "0"
+    digit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    text = f"{value:.3g}"
+    return text if float(text) >= value else f"{float(text) + digit:.3g}"
 
 
 def verdict(report: ParityReport) -> str:

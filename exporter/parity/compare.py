@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from exporter.parity.histogram import decades
 from exporter.parity.tolerances import Tolerance
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
@@ -25,6 +26,12 @@ class Difference:
     reason: str = ""
     #: What rounding explains at the element that differs most, where that was asked for.
     rounding: float = 0.0
+    #: Elements per decade of |a − b| (exporter/parity/histogram.py); empty where there are no numbers to compare.
+    histogram: tuple[int, ...] = ()
+    #: The smallest t with |a − b| ≤ t + t·|b| everywhere; None where no number would do.
+    smallest_tolerance: float | None = None
+    #: Where the element is that needs it, in C order; None where there is none.
+    worst: int | None = None
 
 
 def compare(
@@ -54,23 +61,39 @@ def compare(
     if odd.any():
         same = (np.isnan(a) & np.isnan(b)) | (a == b)
         if not same[odd].all():
-            return _wrong("NaN or infinity on one side only")
+            return replace(_wrong("NaN or infinity on one side only"), worst=int((odd & ~same).argmax()))
         a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)
     difference = np.abs(a - b)
     if free is not None:
         difference = np.where(free, 0.0, difference)
-    relative = difference / np.maximum(np.abs(b), np.finfo(np.float64).tiny)
+    with np.errstate(over="ignore"):  # beside a reference of zero; it is bounded below
+        relative = difference / np.maximum(np.abs(b), np.finfo(np.float64).tiny)
     bound = tolerance.atol + tolerance.rtol * np.abs(b) if reference.dtype.kind == "f" else np.zeros_like(b)
     if rounding is not None:
         bound = np.maximum(bound, rounding)
     passed = bool((difference <= bound).all())
     worst_relative = float(np.where(difference > 0, np.minimum(relative, 1e30), 0.0).max())
     explained = 0.0 if rounding is None else float(rounding.reshape(-1)[int(difference.argmax())])
-    return Difference(float(difference.max()), worst_relative, passed, rounding=explained)
+    needed = difference / (1 + np.abs(b))
+    if rounding is not None:
+        needed = np.where(difference <= rounding, 0.0, needed)
+    worst = int(needed.argmax())
+    # A little more than the quotient: it was rounded, and a user who gives it must pass.
+    smallest = float(needed.reshape(-1)[worst]) * (1 + 1e-12) if reference.dtype.kind == "f" else None
+    histogram = decades(difference)
+    return Difference(float(difference.max()), worst_relative, passed, "", explained, histogram, smallest, worst)
 
 
 def _wrong(reason: str) -> Difference:
     return Difference(float("inf"), float("inf"), False, reason)
+
+
+def row_steps(exact: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """How far a value moved, element by element: the largest of a row counts for all of it, what is not finite not."""
+    with np.errstate(invalid="ignore"):
+        step = np.abs(moved.astype(np.float64) - exact)
+    row = step.max(axis=tuple(range(1, step.ndim)), keepdims=True)
+    return np.broadcast_to(np.where(np.isfinite(row), row, 0.0), step.shape)
 
 
 def floored(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from converters.runner.process import LoadedModel, RunFailedError
 from exporter.parity.pool import RUNTIMES_OF, RuntimePool
+from exporter.parity.report import Comparison
 from exporter.parity.subject import Subject
 
+#: The runtime that takes longest to start, by far.
+_SLOWEST = "tensorflow"
+
 Feeds = Mapping[str, np.ndarray]
+#: (format, runtime, error, the output or "*" for all): what did not run goes here.
+Failure = Callable[[str, str, RunFailedError, str], None]
 Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
 
 
@@ -25,6 +32,24 @@ class Entrant:
     run: Run
     outputs: Sequence[str]
     model: LoadedModel
+    #: what the report calls it, where the format is not enough
+    label: str = ""
+    #: outputs that it draws by itself, though the reference is fed the noise: their shape is all that can be compared
+    drawn: frozenset[str] = frozenset()
+    #: what the loader was given; None where there is nothing to look into when it fails
+    path: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """What the report calls it."""
+        return self.label or self.format
+
+
+def needed_runtimes(subject: Subject, runtimes: Sequence[str]) -> list[str]:
+    """Those of ``runtimes`` that run something of this subject, the reference's first."""
+    source = () if subject.source is None else (subject.source.runtime,)
+    useful = ["numpy", *source, *(r for kind in subject.artefacts for r in RUNTIMES_OF[kind])]
+    return [r for r in dict.fromkeys(useful) if r == "numpy" or r in runtimes]
 
 
 def entrants(
@@ -32,34 +57,48 @@ def entrants(
     runtimes: Sequence[str],
     pool: RuntimePool,
     reference: LoadedModel,
-    failure: Callable[[str, str, RunFailedError], None],
+    failure: Failure,
 ) -> Iterator[Entrant]:
     """The numpy reference, then every format in every runtime, loaded one at a time.
 
     What does not load goes to ``failure`` (format, runtime, error) and takes no part.
     """
     outputs = [s.name for s in subject.signature.outputs]
-    yield Entrant("reference", "numpy", reference.run, outputs, reference)
-    for kind, path in subject.artefacts.items():
-        for runtime in RUNTIMES_OF[kind]:
-            if runtime not in runtimes or runtime == "numpy":
+    yield Entrant("reference", "numpy", reference.run, outputs, reference, path=subject.reference)
+    pairs = [(kind, runtime) for kind in subject.artefacts for runtime in RUNTIMES_OF[kind]]
+    taking_part = [(kind, runtime) for kind, runtime in pairs if runtime in runtimes and runtime != "numpy"]
+    # The others run while TensorFlow is still being imported; ``in_order`` puts the report right again.
+    for kind, runtime in sorted(taking_part, key=lambda pair: pair[1] == _SLOWEST):
+        path = subject.artefacts[kind]
+        loads = {"": list(outputs)}
+        if kind == "saved_model":
+            loads = {key: list(names[1]) for key, names in subject.signatures.items()}
+        for key, names in loads.items():
+            label = kind if key in ("", "serving_default") else f"{kind}:{key}"
+            try:
+                shape = {"kind": "saved_model", "signature": key} if kind == "saved_model" else {"kind": "graph"}
+                model = pool.process(runtime).load(str(path), **shape)
+            except RunFailedError as error:
+                failure(label, runtime, error, "*")
                 continue
-            loads = {"": list(outputs)}
-            if kind == "saved_model":
-                loads = {key: list(names[1]) for key, names in subject.signatures.items()}
-            for key, names in loads.items():
-                label = kind if key in ("", "serving_default") else f"{kind}:{key}"
-                try:
-                    shape = {"kind": "saved_model", "signature": key} if kind == "saved_model" else {"kind": "graph"}
-                    model = pool.process(runtime).load(str(path), **shape)
-                except RunFailedError as error:
-                    failure(label, runtime, error)
-                    continue
-                run = _limited(model.run, subject.signatures.get(key))
-                if kind == "tfjs":
-                    run = _predicting(model, names)
-                yield Entrant(label, runtime, run, names, model)
-                unload(model)
+            run = _limited(model.run, subject.signatures.get(key))
+            if kind == "tfjs":
+                run = _predicting(model, names)
+            yield Entrant(label, runtime, run, names, model, path=path)
+            unload(model)
+
+
+def in_order(results: Iterable[Comparison], subject: Subject) -> tuple[Comparison, ...]:
+    """Results as they are reported: by format and runtime, whichever was ready first. The reference's come first."""
+    kinds = list(subject.artefacts)
+
+    def place(result: Comparison) -> tuple[int, int]:
+        kind = result.format.partition(":")[0]
+        if kind not in kinds or result.runtime not in RUNTIMES_OF[kind]:
+            return (-1, 0)
+        return kinds.index(kind), RUNTIMES_OF[kind].index(result.runtime)
+
+    return tuple(sorted(results, key=place))
 
 
 def unload(model: LoadedModel) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 
 from converters.runner.process import RuntimeProcess
@@ -52,11 +52,24 @@ class RuntimePool:
         self._commands = commands
         self._processes: dict[str, RuntimeProcess] = {}
 
+    def start(self, names: Iterable[str]) -> None:
+        """Start these runtimes' processes side by side; ``process`` waits for one, when it is needed.
+
+        Raises RuntimeUnavailableError where a program is not there; the processes that were started stay.
+        """
+        for name in names:
+            self._launched(name)
+
     def process(self, name: str) -> RuntimeProcess:
-        """The runtime's process, started."""
+        """The runtime's process, started and ready. Raises RuntimeUnavailableError."""
+        process = self._launched(name)
+        process.start()
+        return process
+
+    def _launched(self, name: str) -> RuntimeProcess:
         if name not in self._processes:
             self._processes[name] = RuntimeProcess(name, self._commands[name]())
-        self._processes[name].start()
+        self._processes[name].launch()
         return self._processes[name]
 
     def versions(self) -> dict[str, str]:
@@ -69,5 +82,7 @@ class RuntimePool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for process in self._processes.values():
+            process.hang_up()
         for process in self._processes.values():
             process.close()

@@ -7,7 +7,51 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from exporter.parity.histogram import to_dict
 from exporter.parity.tolerances import Tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class Bisection:
+    """Where a disagreement begins: the first tensor in graph order that differs in that runtime.
+
+    ``source`` is the tensor of the source that it stands for. ``index`` is where the worst element is, ``expected`` and
+    ``got`` its values. ``hidden`` are tensors right before it that the format does not have, because they were fused
+    into its op: they may be the first as well. Where nothing could be named, ``tensor`` is None; ``reason`` says why.
+    """
+
+    tensor: str | None
+    op: str | None = None
+    source: str | tuple[str, ...] | None = None
+    index: tuple[int, ...] | None = None
+    expected: float | None = None
+    got: float | None = None
+    max_abs_diff: float | None = None
+    smallest_tolerance: float | None = None
+    hidden: tuple[str, ...] = ()
+    #: What was fed where that is not the comparison's worst input: the first step that differs.
+    input: str | None = None
+    reason: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in parity.json."""
+        if self.tensor is None:
+            return {"tensor": None, "reason": self.reason}
+        numbers = {k: getattr(self, k) for k in ("expected", "got", "max_abs_diff", "smallest_tolerance")}
+        entry: dict[str, Any] = {
+            "tensor": self.tensor,
+            "op": self.op,
+            "source": list(self.source) if isinstance(self.source, tuple) else self.source,
+            "index": None if self.index is None else list(self.index),
+            **{k: None if v is None else _number(v) for k, v in numbers.items()},
+        }
+        if self.hidden:
+            entry["hidden"] = list(self.hidden)
+        if self.input is not None:
+            entry["input"] = self.input
+        if self.reason:
+            entry["reason"] = self.reason
+        return entry
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +75,12 @@ class Comparison:
     reason: str = ""
     drift: tuple[float, ...] = ()
     rounding: float = 0.0
+    #: Elements of all inputs per decade of |a − b|, see exporter/parity/histogram.py.
+    histogram: tuple[int, ...] = ()
+    #: The smallest t that would pass as atol and rtol; None where no tolerance would, or none is needed.
+    smallest_tolerance: float | None = None
+    #: Where a disagreement begins; None where it was not looked for (nothing failed, or the reason says it all).
+    bisection: Bisection | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As in parity.json."""
@@ -54,6 +104,12 @@ class Comparison:
             entry["reason"] = self.reason
         if self.drift:
             entry["drift"] = [_number(d) for d in self.drift]
+        if any(self.histogram):
+            entry["histogram"] = to_dict(self.histogram)
+        if self.smallest_tolerance is not None and not self.passed:
+            entry["smallest_tolerance"] = self.smallest_tolerance
+        if self.bisection is not None:
+            entry["bisection"] = self.bisection.to_dict()
         return entry
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from converters.source import OriginalRun
-from exporter.parity.tolerances import Tolerance
+from exporter.parity.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
 from signatures.graph import Graph
 from signatures.spec import PolicySignature, SourceMap
@@ -40,6 +40,12 @@ class VerifyOptions:
     samples: int = 2
     steps: int = 4
     tolerance: Tolerance = field(default_factory=Tolerance)
+    #: Other tolerances with their reasons (``--tolerances``); the last rule that covers a comparison decides.
+    rules: Sequence[ToleranceRule] = ()
+    #: Recorded samples (``--golden``, see exporter/parity/golden.py).
+    golden: Path | None = None
+    #: The most bytes of a format, or of ``total`` (``--max-size``).
+    budget: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from signatures.spec import PolicySignature
@@ -17,6 +18,23 @@ class Tolerance:
     atol: float = ATOL
     rtol: float = RTOL
     reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ToleranceRule:
+    """A tolerance for some comparisons; None stands for every policy, format, runtime or output."""
+
+    tolerance: Tolerance
+    policy: str | None = None
+    format: str | None = None
+    runtime: str | None = None
+    output: str | None = None
+
+    def covers(self, policy: str, kind: str, runtime: str, output: str) -> bool:
+        """Whether this rule is for the comparison; a format covers all signatures of a SavedModel."""
+        wanted = (self.policy, self.format, self.runtime, self.output)
+        found = (policy, kind.partition(":")[0], runtime, output)
+        return all(w is None or w == f for w, f in zip(wanted, found, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,3 +59,8 @@ def tolerance_for(signature: PolicySignature, output: str, default: Tolerance) -
         if entry.output == output and entry.algorithm == signature.algorithm and entry.tolerance.atol > default.atol:
             return entry.tolerance
     return default
+
+
+def ruled(rules: Sequence[ToleranceRule], policy: str, kind: str, runtime: str, output: str) -> Tolerance | None:
+    """What a user's rules say of a comparison: the last one that covers it decides; None where none does."""
+    return next((r.tolerance for r in reversed(rules) if r.covers(policy, kind, runtime, output)), None)

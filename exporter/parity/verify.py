@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from converters.graph.ops.chance import SAMPLERS
+from converters.graph.run import run_graph
 from converters.runner.process import LoadedModel, RunFailedError
+from exporter.parity.bisect import Bisector
+from exporter.parity.budget import held_to
 from exporter.parity.compare import Difference, compare, floored, ties
-from exporter.parity.entrants import Entrant, Feeds, entrants, unload
+from exporter.parity.entrants import Entrant, Failure, Feeds, entrants, in_order, needed_runtimes, unload
+from exporter.parity.golden import Golden, read_golden
+from exporter.parity.histogram import added
 from exporter.parity.original import Original
 from exporter.parity.pool import INDEPENDENT, RuntimePool
-from exporter.parity.report import Comparison, ParityReport
+from exporter.parity.report import Bisection, Comparison, ParityReport
+from exporter.parity.rounding import Rounding
 from exporter.parity.statistics import FALSE_ALARM, fit
 from exporter.parity.subject import Subject, VerifyOptions
-from exporter.parity.tolerances import Tolerance, tolerance_for
+from exporter.parity.tolerances import Tolerance, ruled, tolerance_for
 from exporter.runtimes import RuntimeInfo
 from signatures.graph import Graph
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
 
-#: A difference is rounding if it is at most this many times what moving every intermediate result by one unit in its
-#: last place makes (Monte Carlo arithmetic in the numpy reference, the largest of ``_ROUNDING_RUNS``). It matters for
-#: inputs of 1e3 and where a formula cancels; elsewhere the default tolerance is larger.
-ROUNDING_FACTOR = 4
-_ROUNDING_RUNS = 6
+#: Who takes part beside the reference: given the numpy reference and where failures go.
+Field = Callable[[LoadedModel, Failure], Iterable[Entrant]]
 #: Rows that a sampler is drawn for.
 DRAWS = 512
 
@@ -37,9 +41,15 @@ def verify(
     pool: RuntimePool,
     options: VerifyOptions | None = None,
     progress: Callable[[str], None] = lambda text: None,
+    field: Field | None = None,
 ) -> ParityReport:
-    """The report on one policy. A runtime that fails is a failed comparison, not an exception."""
-    return _Verification(subject, tuple(runtimes), tuple(known), pool, options or VerifyOptions(), progress).report()
+    """The report on one policy. A runtime that fails is a failed comparison, not an exception.
+
+    ``field`` says who takes part, given the numpy reference; without it, the subject's artefacts do.
+    """
+    options = options or VerifyOptions()
+    verification = _Verification(subject, tuple(runtimes), tuple(known), pool, options, progress)
+    return held_to(verification.report(field), options.budget)
 
 
 class _Verification:
@@ -57,17 +67,23 @@ class _Verification:
         self.signature = subject.signature
         self.results: list[Comparison] = []
         self.notes: list[str] = []
-        self.cases = draw_cases(self.signature, seed=options.seed, samples=options.samples)
+        self.golden = Golden() if options.golden is None else read_golden(options.golden, self.signature)
+        drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
+        self.cases = [*drawn, *self.golden.cases]
         self.steps = self._rollout_feeds()
         self.random = random_outputs(subject.graph, [s.name for s in self.signature.outputs])
         self.expected: list[dict[str, np.ndarray]] = []
         self.unloads: list[LoadedModel] = []
         self._reference = "numpy"
-        self._floors: dict[str, dict[str, np.ndarray]] = {}
+        numbers = [s.name for s in self.signature.outputs if s.name not in self.random and s.dtype == "float32"]
+        self.rounding = Rounding(options.seed, numbers, self._settled)
+        self.bisector = Bisector(subject, pool, self._is_right, self.rounding.inside)
 
-    def report(self) -> ParityReport:
+    def report(self, field: Field | None = None) -> ParityReport:
         if not self.runtimes:
             return self._finished("none")
+        self.progress(f"{self.subject.name}: starting the runtimes, running the source")
+        self.pool.start(needed_runtimes(self.subject, self.runtimes))
         reference, original = self._references()
         try:
             self.expected = [self._answers(reference, original, case.feeds) for case in self.cases]
@@ -75,8 +91,14 @@ class _Verification:
         except RunFailedError as error:
             self._failure("reference" if original is None else "source", self._reference.split("/")[-1], error)
             return self._finished(self._reference)
-        for entrant in entrants(self.subject, self.runtimes, self.pool, reference, self._failure):
-            self.progress(f"{self.subject.name}: {entrant.format} in {entrant.runtime}")
+        self._recorded(reference)
+        taking_part: Iterable[Entrant]
+        if field is None:
+            taking_part = entrants(self.subject, self.runtimes, self.pool, reference, self._failure)
+        else:
+            taking_part = field(reference, self._failure)
+        for entrant in taking_part:
+            self.progress(f"{self.subject.name}: {entrant.name} in {entrant.runtime}")
             self._examine(entrant)
         for model in self.unloads:
             unload(model)
@@ -111,51 +133,89 @@ class _Verification:
 
     # ---- comparisons
 
+    def _recorded(self, reference: LoadedModel) -> None:
+        """The reference's answers against what the user recorded."""
+        names = [s.name for s in self.signature.outputs if s.name not in self.random]
+        names = [n for n in names if not self.subject.graph.ancestors([n]) & self.golden.noiseless]
+        runtime = self._reference.split("/")[-1]
+        entrant = Entrant("golden", runtime, reference.run, names, reference)
+        answers = self.expected[len(self.cases) - len(self.golden.cases) :]
+        known = [{n: a[n] for n in names if n in a} for a in answers]
+        for name, difference, case in self.golden.compared(
+            known, lambda name, expected, recorded: self._difference(name, expected, recorded, entrant)
+        ):
+            self._add(entrant, name, "numbers", difference, case)
+
     def _examine(self, entrant: Entrant) -> None:
         try:
             self._numbers(entrant)
             self._rollout(entrant)
             self._draws(entrant)
         except RunFailedError as error:
-            self._failure(entrant.format, entrant.runtime, error)
+            self._failure(entrant.name, entrant.runtime, error)
+        finally:
+            self.bisector.close()
 
-    def _tolerance(self, output: str) -> Tolerance:
-        return tolerance_for(self.signature, output, self.options.tolerance)
+    def _tolerance(self, output: str, entrant: Entrant) -> Tolerance:
+        found = ruled(self.options.rules, self.subject.name, entrant.format, entrant.runtime, output)
+        return found or tolerance_for(self.signature, output, self.options.tolerance)
 
     def _numbers(self, entrant: Entrant) -> None:
-        worst: dict[str, tuple[Difference, str]] = {}
+        worst: dict[str, tuple[Difference, Case]] = {}
+        needed: dict[str, list[float | None]] = {}
+        spread: dict[str, tuple[int, ...]] = {}
         for case, expected in zip(self.cases, self.expected, strict=True):
             got = entrant.run(case.feeds, list(entrant.outputs))
             for name in entrant.outputs:
-                if name in self.random:
+                if name in self.random or name in entrant.drawn:
                     difference = self._plausible(name, got[name], case)
                 elif name in expected:
                     difference = self._difference(name, expected, got[name], entrant)
                     if not difference.passed and not difference.reason and got[name].dtype.kind == "f":
-                        rounding = self._rounding(case)[name]
-                        difference = self._difference(name, expected, got[name], entrant, rounding)
+                        explained = self._explained(name, case)
+                        difference = self._difference(name, expected, got[name], entrant, explained)
                 else:
                     continue
+                spread[name] = added(spread.get(name, ()), difference.histogram)
+                needed.setdefault(name, []).append(difference.smallest_tolerance)
                 if name not in worst or _rank(difference) > _rank(worst[name][0]):
-                    worst[name] = (difference, case.name)
-        for name, (difference, case_name) in worst.items():
-            self._add(entrant, name, "numbers" if name not in self.random else "shape", difference, case_name)
+                    worst[name] = (difference, case)
+        for name, (difference, case) in worst.items():
+            kind = "shape" if name in self.random or name in entrant.drawn else "numbers"
+            difference = replace(difference, smallest_tolerance=_largest(needed[name]), histogram=spread[name])
+            self._add(
+                entrant,
+                name,
+                kind,
+                difference,
+                case.name,
+                bisection=self._bisect(entrant, name, difference, case.feeds),
+            )
 
-    def _rounding(self, case: Case) -> dict[str, np.ndarray]:
-        """Per output, what rounding explains, element by element (the largest of a row counts for all of it)."""
-        if case.name not in self._floors:
-            names = [s.name for s in self.signature.outputs if s.name not in self.random and s.dtype == "float32"]
-            exact = self._settled(self.numpy_model.run(case.feeds, names))
-            floors = {name: np.zeros(exact[name].shape) for name in names}
-            for run in range(_ROUNDING_RUNS):
-                jitter = self.options.seed * _ROUNDING_RUNS + run
-                moved = self._settled(self.numpy_model.run(case.feeds, names, jitter=jitter))
-                for name in names:
-                    step = np.abs(moved[name].astype(np.float64) - exact[name])
-                    row = step.max(axis=tuple(range(1, step.ndim)), keepdims=True)
-                    floors[name] = np.maximum(floors[name], np.where(np.isfinite(row), row, 0.0))
-            self._floors[case.name] = {name: ROUNDING_FACTOR * floor for name, floor in floors.items()}
-        return self._floors[case.name]
+    def _explained(self, name: str, case: Case) -> np.ndarray | None:
+        return self.rounding.outputs(self.numpy_model, case).get(name)
+
+    def _is_right(self, graph: Graph) -> bool:
+        """Whether ``graph``, run by the numpy kernels, gives what the reference does."""
+        numpy = Entrant("reference", "numpy", self.numpy_model.run, [], self.numpy_model)
+        for case, expected in zip(self.cases, self.expected, strict=True):
+            got = run_graph(graph, case.feeds, list(expected))
+            for name in expected:
+                difference = self._difference(name, expected, got[name], numpy)
+                if not difference.passed and not difference.reason and got[name].dtype.kind == "f":
+                    difference = self._difference(name, expected, got[name], numpy, self._explained(name, case))
+                if not difference.passed:
+                    return False
+        return True
+
+    def _bisect(
+        self, entrant: Entrant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
+    ) -> Bisection | None:
+        """Where a difference begins; None where there is none, or its reason says all there is to say."""
+        if difference.passed:
+            return None
+        found = self.bisector.find(entrant, output, feeds, self._tolerance(output, entrant), branch)
+        return None if found.tensor is None and difference.reason else found
 
     def _difference(
         self, name: str, expected: Feeds, got: np.ndarray, entrant: Entrant, rounding: np.ndarray | None = None
@@ -163,8 +223,8 @@ class _Verification:
         return compare(
             self._settled(expected)[name],
             self._settled({name: got})[name],
-            self._tolerance(name),
-            free=self._ties(name, expected),
+            self._tolerance(name, entrant),
+            free=self._ties(name, expected, entrant),
             narrowed=entrant.format == "tfjs",
             rounding=rounding,
         )
@@ -177,7 +237,7 @@ class _Verification:
             for n, a in values.items()
         }
 
-    def _ties(self, name: str, expected: Feeds) -> np.ndarray | None:
+    def _ties(self, name: str, expected: Feeds, entrant: Entrant) -> np.ndarray | None:
         """Where an argmax is not decided, because the scores of the reference are too close."""
         spec = self.signature.output(name)
         if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
@@ -185,7 +245,7 @@ class _Verification:
         scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
         if scores is None or scores not in expected:
             return None
-        found = ties(expected[scores], self.signature.branches, self._tolerance(scores))
+        found = ties(expected[scores], self.signature.branches, self._tolerance(scores, entrant))
         return found if found.shape == expected[name].shape else None
 
     def _plausible(self, name: str, got: np.ndarray, case: Case) -> Difference:
@@ -221,14 +281,32 @@ class _Verification:
         memory = self.signature.memory
         if not self.steps or memory is None or memory.output not in entrant.outputs:
             return
-        got = self._roll(lambda feeds: entrant.run(feeds, list(entrant.outputs)))
-        for name in entrant.outputs:
-            if name in self.random or name not in self.expected_steps[0]:
-                continue
-            steps = [self._difference(name, e, g[name], entrant) for e, g in zip(self.expected_steps, got, strict=True)]
-            worst = max(steps, key=_rank)
-            drift = tuple(d.max_abs for d in steps)
-            self._add(entrant, name, "rollout", worst, f"step {steps.index(worst) + 1} of {len(steps)}", drift)
+        fed: list[Feeds] = []
+
+        def step(feeds: Feeds) -> dict[str, np.ndarray]:
+            fed.append(feeds)
+            return entrant.run(feeds, list(entrant.outputs))
+
+        got = self._roll(step)
+        names = [n for n in entrant.outputs if n in self.expected_steps[0] and n not in entrant.drawn | self.random]
+        steps = {
+            n: [self._difference(n, e, g[n], entrant) for e, g in zip(self.expected_steps, got, strict=True)]
+            for n in names
+        }
+        where = [f"step {i + 1} of {len(fed)}" for i in range(len(fed))]
+        for name, differences in steps.items():
+            worst = max(range(len(fed)), key=lambda i: _rank(differences[i]))
+            least = _largest([d.smallest_tolerance for d in differences])
+            difference = replace(differences[worst], smallest_tolerance=least, histogram=())
+            bisection = None
+            if not difference.passed:
+                # An output that goes wrong after the memory did goes wrong because of it.
+                output = min((n for n in (name, memory.output) if n in steps), key=lambda n: _first(steps[n]))
+                first = _first(steps[output])
+                bisection = self._bisect(entrant, output, steps[output][first], fed[first])
+                bisection = bisection and replace(bisection, input=where[first])
+            drift = tuple(d.max_abs for d in differences)
+            self._add(entrant, name, "rollout", difference, where[worst], drift, bisection)
 
     def _draws(self, entrant: Entrant) -> None:
         """Draw many times for one input and test the counts against the reference's log-probabilities."""
@@ -237,27 +315,35 @@ class _Verification:
         scores = next((s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS), None)
         if action.role is not Role.SAMPLED or action.name not in entrant.outputs or scores is None:
             return
-        case = next((c for c in self.cases if c.name.startswith("random masks")), self.cases[0])
-        expected = self.expected[self.cases.index(case)].get(scores)
-        if expected is None or action.name not in self.random:
+        if action.name not in self.random:
             return
-        row = {name: array[:1] for name, array in case.feeds.items()}
-        if entrant.runtime == "tfjs-cpu":
-            # Its Multinomial restarts its generator for every row of a batch: one row at a time.
-            drawn = np.concatenate([entrant.run(row, [action.name])[action.name] for _ in range(DRAWS)])
-        else:
-            drawn = entrant.run({n: np.repeat(a, DRAWS, axis=0) for n, a in row.items()}, [action.name])[action.name]
-        edges = np.cumsum(self.signature.branches)[:-1]
-        parts = np.split(expected[0], edges)
-        columns = drawn.reshape(len(drawn), -1)
-        p_values = [fit(columns[:, i], part) for i, part in enumerate(parts)]
-        lowest = min(p_values)
+        trials = [c for c in self.cases if c.name == "random masks"] + self.cases[:1]
+        fits = []
+        for case in trials:
+            expected = self.expected[self.cases.index(case)].get(scores)
+            if expected is None:
+                return
+            row = {name: array[:1] for name, array in case.feeds.items()}
+            p_values = self._fits(entrant, action.name, row, expected[0])
+            fits.append((min(p_values), p_values.index(min(p_values)), case, row))
+        lowest, branch, case, row = min(fits, key=lambda f: f[0])
         reason = (
             "" if lowest >= FALSE_ALARM else f"the draws do not have the distribution they should (p = {lowest:.1e})"
         )
-        self._add(
-            entrant, action.name, "draws", Difference(1 - lowest, 1 - lowest, lowest >= FALSE_ALARM, reason), case.name
-        )
+        difference = Difference(1 - lowest, 1 - lowest, lowest >= FALSE_ALARM, reason)
+        bisection = self._bisect(entrant, action.name, difference, row, branch)
+        self._add(entrant, action.name, "draws", difference, case.name, bisection=bisection)
+
+    def _fits(self, entrant: Entrant, action: str, row: Feeds, log_probs: np.ndarray) -> list[float]:
+        """The p-value of each branch, of ``DRAWS`` draws for one row of inputs."""
+        if entrant.runtime.startswith("tfjs-cpu"):  # in Node and in Chromium
+            # Its Multinomial restarts its generator for every row of a batch: one row at a time.
+            drawn = np.concatenate([entrant.run(row, [action])[action] for _ in range(DRAWS)])
+        else:
+            drawn = entrant.run({n: np.repeat(a, DRAWS, axis=0) for n, a in row.items()}, [action])[action]
+        parts = np.split(log_probs, np.cumsum(self.signature.branches)[:-1])
+        columns = drawn.reshape(len(drawn), -1)
+        return [fit(columns[:, i], part) for i, part in enumerate(parts)]
 
     # ---- results
 
@@ -269,29 +355,33 @@ class _Verification:
         difference: Difference,
         where: str,
         drift: tuple[float, ...] = (),
+        bisection: Bisection | None = None,
     ) -> None:
         self.results.append(
             Comparison(
-                entrant.format,
+                entrant.name,
                 entrant.runtime,
                 output,
                 kind,
                 difference.max_abs,
                 difference.max_rel,
-                self._tolerance(output),
+                self._tolerance(output, entrant),
                 difference.passed,
                 where,
                 difference.reason,
                 drift,
                 difference.rounding,
+                difference.histogram,
+                None if difference.passed else difference.smallest_tolerance,
+                bisection,
             )
         )
 
-    def _failure(self, kind: str, runtime: str, error: RunFailedError) -> None:
+    def _failure(self, kind: str, runtime: str, error: RunFailedError, output: str = "*") -> None:
         text = error.what if error.why is None else f"{error.what}: {error.why}"
         self.results.append(
             Comparison(
-                kind, runtime, "*", "failure", float("inf"), float("inf"), Tolerance(), False, None, text.strip()
+                kind, runtime, output, "failure", float("inf"), float("inf"), Tolerance(), False, None, text.strip()
             )
         )
 
@@ -318,7 +408,7 @@ class _Verification:
             self.options.samples,
             reference,
             states,
-            tuple(self.results),
+            in_order(self.results, self.subject),
             self.subject.sizes,
             (*self.signature.notes, *self.notes),
             self_consistent=self.subject.source is None,
@@ -333,3 +423,14 @@ def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:
 
 def _rank(difference: Difference) -> tuple[bool, float]:
     return not difference.passed, difference.max_abs
+
+
+def _largest(needed: Sequence[float | None]) -> float | None:
+    """The tolerance that all need; None where one of them has none."""
+    known = [t for t in needed if t is not None]
+    return max(known) if len(known) == len(needed) else None
+
+
+def _first(steps: Sequence[Difference]) -> int:
+    """The first step that differs; their number where none does."""
+    return next((i for i, d in enumerate(steps) if not d.passed), len(steps))

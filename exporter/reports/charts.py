@@ -121,6 +121,12 @@ def colour_of(number: int) -> str:
 
 def diagram(blocks: Sequence[Block]) -> Markup:
     """The layers of a policy as boxes, from its inputs at the top to its outputs at the bottom."""
+    parts, width, height, described = diagram_parts(blocks)
+    return _svg(parts, width, height, described)
+
+
+def diagram_parts(blocks: Sequence[Block]) -> tuple[list[Markup], float, float, str]:
+    """(elements, width, height, description) of such a picture."""
     titles = [b.title if len(b.title) <= 34 else f"{b.title[:33]}…" for b in blocks]
     placed = layout([b.before for b in blocks], [max(84.0, 7.3 * len(t) + 26) for t in titles])
     parts: list[Markup] = []
@@ -152,7 +158,7 @@ def diagram(blocks: Sequence[Block]) -> Markup:
     layers = " → ".join(b.title for b in blocks if b.kind == "layer")
     described = f"Layers from {names['input']} to {names['output']}: {layers}"
     height = placed.height
-    return _svg(parts, math.ceil(placed.width), height, described)
+    return parts, math.ceil(placed.width), height, described
 
 
 def _svg(parts: Sequence[Markup], width: float, height: float, described: str) -> Markup:

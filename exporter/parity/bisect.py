@@ -1,0 +1,229 @@
+"""Where a disagreement begins: the first tensor in graph order that differs in that runtime.
+
+Expected values are those of the numpy kernels on a graph that agrees with the reference, the candidate's are fetched
+from the runtime, for the same inputs. A constant must be the same to the bit; of everything else as much as of the
+outputs is asked, rounding allowed for. What comes after a sampler in the graph cannot be compared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from converters.frozen_graph.reader import read_graph
+from converters.graph.ops.chance import SAMPLERS
+from converters.graph.passes.normalise import normalise
+from converters.graph.run import run_graph
+from converters.runner.process import RunFailedError
+from exporter.parity.compare import Difference, compare
+from exporter.parity.entrants import Entrant, Feeds
+from exporter.parity.inside import Inside, inside, onnx_sources, outputs_read, saved_graph
+from exporter.parity.pool import RuntimePool
+from exporter.parity.report import Bisection
+from exporter.parity.subject import Subject
+from exporter.parity.tolerances import Tolerance
+from signatures.errors import ExportModelError
+from signatures.graph import Graph, Node, split_ref
+
+#: Bytes of expected values that one fetch may ask for: what a runtime holds and sends at a time.
+FETCH_BYTES = 64 << 20
+
+Rounding = Callable[[Graph, Feeds, str], np.ndarray]
+
+
+class Bisector:
+    """Bisects the failures of one policy. ``agrees`` says whether a graph, run by the numpy kernels, is right;
+    ``rounding`` what rounding explains of a tensor of it.
+    """
+
+    def __init__(
+        self, subject: Subject, pool: RuntimePool, agrees: Callable[[Graph], bool], rounding: Rounding
+    ) -> None:
+        self.subject, self.pool = subject, pool
+        self._agrees, self._rounding = agrees, rounding
+        self._graph: Graph | None = None
+        self._looked = False
+        self._opened: tuple[tuple[str, str], Inside] | None = None
+        self._stack = contextlib.ExitStack()
+        self._sources: dict[str, str] | None = None
+
+    def close(self) -> None:
+        """Free what was loaded to look inside."""
+        self._opened = None
+        self._stack.close()
+
+    def find(self, entrant: Entrant, output: str, feeds: Feeds, tolerance: Tolerance, branch: int = 0) -> Bisection:
+        """Where ``output`` of ``entrant`` begins to differ for ``feeds``; ``branch`` is the one drawn wrongly."""
+        graph = None if entrant.path is None else self.graph()
+        if graph is None:
+            return Bisection(None, reason="no graph at hand computes what the reference does")
+        try:
+            search = _Search(graph, self._inside(entrant), feeds, tolerance, self._rounding, self._source)
+            return search.first(output, branch)
+        except (ExportModelError, OSError) as error:
+            why = getattr(error, "why", None)
+            return Bisection(None, reason=f"the inside could not be looked at: {error if why is None else why}")
+
+    def graph(self) -> Graph | None:
+        """The first graph that agrees with the reference: the policy's, the .bytes', the SavedModel's."""
+        if not self._looked:
+            self._looked = True
+            self._graph = next((g for g in self._graphs() if self._agrees(g)), None)
+        return self._graph
+
+    def _graphs(self) -> Iterator[Graph]:
+        yield plain(self.subject.graph)
+        with contextlib.suppress(ExportModelError, OSError):
+            yield plain(read_graph(self.subject.reference.read_bytes()))
+        saved = self.subject.artefacts.get("saved_model")
+        if saved is not None:
+            with contextlib.suppress(ExportModelError, OSError):
+                yield plain(saved_graph(saved))
+
+    def _inside(self, entrant: Entrant) -> Inside:
+        key = (entrant.name, entrant.runtime)
+        if self._opened is None or self._opened[0] != key:
+            self.close()
+            assert entrant.path is not None
+            found = self._stack.enter_context(inside(entrant, entrant.path, self.pool))
+            self._opened = (key, found)
+        return self._opened[1]
+
+    def _source(self, node: Node) -> str | tuple[str, ...] | None:
+        """The source's tensor: what the graph knows of it, else what the bundle's .onnx does."""
+        if self._sources is None:
+            path = self.subject.artefacts.get("onnx")
+            self._sources = {} if path is None else dict(_noted(path))
+        if node.origin is None or node.origin == f"{node.name}:0":
+            return self._sources.get(node.name, node.origin)
+        return node.origin
+
+
+class _Search:
+    """One failure."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        candidate: Inside,
+        feeds: Feeds,
+        tolerance: Tolerance,
+        rounding: Rounding,
+        source: Callable[[Node], str | tuple[str, ...] | None],
+    ) -> None:
+        self.graph, self.candidate, self.feeds = graph, candidate, feeds
+        self.tolerance, self.rounding, self.source = tolerance, rounding, source
+
+    def first(self, output: str, branch: int) -> Bisection:
+        upstream = self.graph.ancestors([output])
+        nodes = [n for n in self.graph.nodes if n.name in upstream]
+        drawn = self._drawn(nodes)
+        read = outputs_read([n.name for n in nodes], [output, *(r for n in nodes for r in n.inputs)])
+        tensors = [t for n in nodes if n.name not in drawn for t in read[n.name]]
+        expected = run_graph(self.graph, self.feeds, tensors)
+        seen: set[str] = set()
+        for chunk in _chunks(tensors, expected):
+            got = self._fetched(chunk)
+            seen |= got.keys()
+            for tensor in chunk:
+                if tensor in got and (found := self._wrong(tensor, expected[tensor], got[tensor], seen)) is not None:
+                    return found
+        samplers = [n for n in nodes if n.op in SAMPLERS]
+        if samplers:  # one for each branch, in their order; a joint one for all
+            sampler = samplers[min(branch, len(samplers) - 1)]
+            reason = "what it draws from agrees, what it draws does not"
+            return Bisection(sampler.name, sampler.op, self.source(sampler), reason=reason)
+        return Bisection(None, reason="no tensor that leads to it differs by more than the tolerance")
+
+    def _drawn(self, nodes: Sequence[Node]) -> set[str]:
+        """The samplers, and what depends on them."""
+        drawn: set[str] = set()
+        for node in nodes:
+            if node.op in SAMPLERS or any(split_ref(r)[0] in drawn for r in node.inputs):
+                drawn.add(node.name)
+        return drawn
+
+    def _fetched(self, tensors: Sequence[str]) -> dict[str, np.ndarray]:
+        """The candidate's values; one that it cannot give is left out, as one that it has not."""
+        try:
+            return self.candidate.fetch(self.feeds, tensors)
+        except RunFailedError:
+            if len(tensors) == 1:
+                return {}
+            half = len(tensors) // 2
+            return {**self._fetched(tensors[:half]), **self._fetched(tensors[half:])}
+
+    def _wrong(self, tensor: str, expected: np.ndarray, got: np.ndarray, seen: set[str]) -> Bisection | None:
+        node = self.graph.producer(tensor)
+        if got.dtype != expected.dtype:  # int64 as int32 in TensorFlow.js; the outputs' dtypes are compared elsewhere
+            narrow = np.promote_types(got.dtype, expected.dtype)
+            got, expected = got.astype(narrow), expected.astype(narrow)
+        exact = node.op in ("Const", "Placeholder")
+        difference = compare(expected, got, Tolerance(0, 0) if exact else self.tolerance)
+        if difference.passed:
+            return None
+        if not exact and not difference.reason and expected.dtype.kind == "f":
+            rounding = self.rounding(self.graph, self.feeds, tensor)
+            difference = compare(expected, got, self.tolerance, rounding=rounding)
+            if difference.passed:
+                return None
+        hidden = tuple(r for r in dict.fromkeys(node.inputs) if r not in seen and not self._is_setting(r))
+        return self._found(tensor, node, expected, got, difference, hidden)
+
+    def _is_setting(self, tensor: str) -> bool:
+        """An axis, a shape: other formats have it as an attribute."""
+        value = self.graph.producer(tensor).value
+        return value is not None and value.dtype.kind != "f"
+
+    def _found(
+        self,
+        tensor: str,
+        node: Node,
+        expected: np.ndarray,
+        got: np.ndarray,
+        difference: Difference,
+        hidden: tuple[str, ...],
+    ) -> Bisection:
+        at = difference.worst
+        index = None if at is None else tuple(int(i) for i in np.unravel_index(at, expected.shape))
+        return Bisection(
+            tensor,
+            node.op,
+            self.source(node),
+            index,
+            None if index is None else float(expected[index]),
+            None if index is None else float(got[index]),
+            difference.max_abs,
+            difference.smallest_tolerance,
+            hidden,
+            reason=difference.reason,
+        )
+
+
+def plain(graph: Graph) -> Graph:
+    """The graph as the numpy kernels run it: without the contract's string, in one spelling."""
+    return normalise(Graph(tuple(n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S")))
+
+
+def _chunks(tensors: Sequence[str], values: dict[str, np.ndarray]) -> Iterator[list[str]]:
+    """``tensors`` in order, as many at a time as ``FETCH_BYTES`` hold."""
+    chunk: list[str] = []
+    size = 0
+    for tensor in tensors:
+        if chunk and size + values[tensor].nbytes > FETCH_BYTES:
+            yield chunk
+            chunk, size = [], 0
+        chunk.append(tensor)
+        size += values[tensor].nbytes
+    if chunk:
+        yield chunk
+
+
+def _noted(path: Path) -> dict[str, str]:
+    try:
+        return dict(onnx_sources(path))
+    except (ValueError, OSError):
+        return {}

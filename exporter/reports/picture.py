@@ -1,0 +1,75 @@
+"""A policy's picture as an SVG file of its own: light or dark as the reader's system is, nothing outside of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from exporter.reports.charts import diagram_parts
+from exporter.reports.layers import Block, blocks_of
+from exporter.reports.markup import Markup, el
+from signatures.errors import UsageError
+from signatures.spec import Policy, TensorSpec
+
+_MARGIN, _HEAD = 24, 78
+#: More would be no picture.
+_MOST_NODES, _MOST_BLOCKS = 1500, 120
+#: Width of a letter of the title and of the line under it, in pixels, on the wide side.
+_TITLE, _LINE = 11.5, 7.2
+_STYLE = """
+svg { --paper: #fff; --ink: #16191d; --soft: #5a626c; --rule: #c9ced6; --box: #f6f7f9; --accent: #2f5fb3;
+  --wash: #e9eff9; --good: #1b7443; --good-wash: #e7f4ec; color-scheme: light dark;
+  font: 12px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+@media (prefers-color-scheme: dark) { svg { --paper: #14171b; --ink: #e7e9ec; --soft: #a0a8b3; --rule: #414955;
+  --box: #1c2026; --accent: #8fb4f5; --wash: #1e2a3f; --good: #69d19a; --good-wash: #14301f; } }
+.paper { fill: var(--paper); }
+text { fill: var(--ink); }
+.name { font-size: 19px; font-weight: 650; }
+.line { fill: var(--soft); font-size: 13px; }
+.edge { fill: none; stroke: var(--soft); stroke-opacity: .55; stroke-width: 1.25; }
+.box rect { fill: var(--box); stroke: var(--rule); }
+.box.input rect { fill: var(--wash); stroke: var(--accent); }
+.box.output rect { fill: var(--good-wash); stroke: var(--good); }
+"""
+
+
+def picture(policy: Policy) -> str:
+    """The layers of ``policy`` from its inputs to its outputs, with its name and what it is. Raises UsageError."""
+    signature = policy.signature
+    specs = {s.name: s for s in (*signature.inputs, *signature.outputs)}
+    nodes = sum(node.value is None for node in policy.graph.nodes)
+    names = ([s.name for s in side] for side in (signature.inputs, signature.outputs))
+    blocks = blocks_of(policy.graph, *names) if nodes <= _MOST_NODES else []
+    if not 0 < len(blocks) <= _MOST_BLOCKS:
+        raise UsageError(
+            f"--svg: the policy {policy.name!r} is too large for a picture ({nodes} nodes)",
+            fix="look at it in TensorBoard: --logdir DIR",
+        )
+    parts, inner, height, described = diagram_parts([_sized(b, specs) if b.kind != "layer" else b for b in blocks])
+    line = f"{signature.family}, {signature.action_space} actions"
+    width = max(inner, _TITLE * len(policy.name), _LINE * len(line)) + 2 * _MARGIN
+    height += _HEAD + _MARGIN
+    drawing = el(
+        "svg",
+        el("title", f"{policy.name}: {line}"),
+        el("desc", described),
+        el("style", Markup(_STYLE)),
+        el("rect", class_="paper", width=width, height=height),
+        el("text", policy.name, class_="name", x=_MARGIN, y=34),
+        el("text", line, class_="line", x=_MARGIN, y=55),
+        el("g", parts, transform=f"translate({(width - inner) / 2:g} {_HEAD})"),
+        xmlns="http://www.w3.org/2000/svg",
+        viewBox=f"0 0 {width:g} {height:g}",
+        width=width,
+        height=height,
+        role="img",
+    )
+    return f"{drawing}\n"
+
+
+def _sized(block: Block, specs: Mapping[str, TensorSpec]) -> Block:
+    """An input or output with its size beside its name, and its role and labels where the pointer rests on it."""
+    spec = specs[block.title]
+    size = "×".join("any" if n is None else str(n) for n in spec.shape[1:]) or "1"
+    detail = f"{spec.name}: {spec.role.value.replace('_', ' ')}, {spec.dtype}, {size} per agent"
+    return replace(block, title=f"{spec.name} · {size}", detail=detail)

@@ -1,0 +1,102 @@
+"""``compare`` on what the official converters make: it passes where they are right, and names what is wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.frozen_graph.encode import encode
+from exporter.comparison import compare_artefacts
+from exporter.parity.pool import RuntimePool
+from exporter.pipeline import ExportResult
+from signatures.graph import Graph, Node, TensorShape
+from tests.peers.agreement import POLICIES
+from tests.peers.environment import Peers
+
+pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peers")]
+RUNTIMES = "tensorflow,onnxruntime,tfjs-cpu"
+
+
+def to_tfjs(peers: Peers, source: Path, out: Path, *options: str) -> Path:
+    peers.run([*peers.tensorflowjs_converter(), "--input_format=tf_saved_model", *options, str(source), str(out)])
+    return out
+
+
+def to_onnx(peers: Peers, graph: Path, inputs: list[str], outputs: list[str], out: Path) -> Path:
+    names = ["--inputs", ",".join(f"{n}:0" for n in inputs), "--outputs", ",".join(f"{n}:0" for n in outputs)]
+    peers.run([*peers.tf2onnx(), "--graphdef", str(graph), *names, "--output", str(out)])
+    return out
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_right_conversions_pass(
+    name: str, tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], pool: RuntimePool
+) -> None:
+    bundle = bundles[name]
+    signature = bundle.policy.signature
+    theirs = to_tfjs(peers, bundle.folder / "saved_model", tmp_path / "tfjs")
+    inputs, outputs = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
+    onnx = to_onnx(peers, bundle.folder / f"{name}.bytes", inputs, outputs, tmp_path / "theirs.onnx")
+    report = compare_artefacts(bundle.folder / "saved_model", [theirs, onnx], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is True, report.failures
+    assert {c.runtime for c in report.comparisons} == {"tfjs-cpu", "onnxruntime"}
+    assert {c.output for c in report.comparisons} == set(outputs)
+
+
+def test_lost_signature_names_are_named(
+    tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], pool: RuntimePool
+) -> None:
+    """What converters of old did to a SavedModel of TensorFlow 2: its keys gone, Identity nodes in their place."""
+    bundle = bundles["discrete"]
+    theirs = to_tfjs(peers, bundle.folder / "saved_model", tmp_path / "tfjs")
+    model = json.loads((theirs / "model.json").read_text())
+    for place in (model, model.get("userDefinedMetadata", {})):
+        outputs = place.get("signature", {}).get("outputs", {})
+        if outputs:
+            place["signature"]["outputs"] = {f"Identity_{i}": info for i, info in enumerate(outputs.values())}
+    model.get("userDefinedMetadata", {}).pop("structuredOutputKeys", None)
+    (theirs / "model.json").write_text(json.dumps(model))
+    report = compare_artefacts(bundle.folder / "saved_model", [theirs], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    assert "there is no output 'action'; there are 'Identity_0'" in next(
+        f.reason for f in report.failures if f.output == "action"
+    )
+
+
+def test_an_op_that_tf2onnx_writes_all_the_same_is_named(tmp_path: Path, peers: Peers, pool: RuntimePool) -> None:
+    """tf2onnx logs that it does not know Expm1, writes it, and ends with status 0."""
+    float32 = np.dtype(np.float32)
+    weights = np.random.default_rng(0).standard_normal((4, 2)).astype(np.float32) * 0.3
+    nodes = [
+        Node("vector_observation", "Placeholder", (), {"dtype": float32, "shape": TensorShape((None, 4))}),
+        Node("kernel", "Const", (), {}, weights),
+        Node("dense", "MatMul", ("vector_observation", "kernel"), {"transpose_a": False, "transpose_b": False}),
+        Node("action", "Expm1", ("dense",)),
+    ]
+    source = tmp_path / "policy.bytes"
+    source.write_bytes(encode(Graph(tuple(nodes))).SerializeToString(deterministic=True))
+    theirs = to_onnx(peers, source, ["vector_observation"], ["action"], tmp_path / "theirs.onnx")
+    report = compare_artefacts(source, [theirs], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    (failure,) = report.failures
+    assert (failure.runtime, failure.kind) == ("onnxruntime", "failure")
+    assert "Expm1" in failure.reason
+
+
+def test_a_conversion_of_other_weights_differs(
+    tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], pool: RuntimePool
+) -> None:
+    bundle = bundles["continuous"]
+    theirs = to_tfjs(peers, bundle.folder / "saved_model", tmp_path / "tfjs")
+    shard = next(theirs.glob("*.bin"))
+    shutil.copy(shard, tmp_path / "kept")
+    values = np.frombuffer(shard.read_bytes(), np.uint8).copy()
+    values[: len(values) // 2] = 0
+    shard.write_bytes(values.tobytes())
+    report = compare_artefacts(bundle.folder / "saved_model", [theirs], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    assert all(f.kind in ("numbers", "failure") for f in report.failures)
