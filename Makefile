@@ -6,13 +6,14 @@ STAMP := $(VENV)/.installed
 JS := converters/runner/js
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: install demo test lint types bench clean help
+.PHONY: install browser demo test lint types bench train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
 	@echo "make demo      export a fixture to four formats and compare them in every runtime"
-	@echo "make test      lint, types and all tests"
+	@echo "make test      lint, types and all tests (installs Chromium where apt-get can, for those in a browser)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
+	@echo "make train     the policies of fixtures/trained anew, in an environment of its own (minutes)"
 
 install: $(STAMP)
 
@@ -21,6 +22,18 @@ $(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
 	cd $(JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	@touch $(STAMP)
+
+# Without it the tests in a browser are skipped, so a Debian machine that may install it does.
+APT_CHROMIUM := apt-get update -qq && \
+	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null
+browser:
+	@for name in "$$EXPORT_MODEL_CHROMIUM" chromium chromium-browser google-chrome google-chrome-stable; do \
+	  if command -v "$$name" >/dev/null; then exit 0; fi; \
+	done; \
+	if ! command -v apt-get >/dev/null; then echo "no Chromium here: the tests in a browser will be skipped"; \
+	elif [ "$$(id -u)" = 0 ]; then $(APT_CHROMIUM); \
+	elif command -v sudo >/dev/null; then sudo sh -c '$(APT_CHROMIUM)'; \
+	else echo "no Chromium, and no right to install it: the tests in a browser will be skipped"; fi
 
 demo: install
 	$(BIN)/export-model fixtures/recurrent.bytes fixtures/continuous.bytes -o exported --verify auto
@@ -34,11 +47,22 @@ lint: install
 types: install
 	$(BIN)/mypy
 
-test: install lint types
+test: install browser lint types
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90
 
 bench: install
 	$(BIN)/python -m tests.bench
+	$(BIN)/python -m tests.bench.verification
+
+train: install .venv-train/.installed
+	OMP_NUM_THREADS=1 PYTHONPATH=. .venv-train/bin/python -m fixtures.train
+	$(BIN)/python -m fixtures.trained.write_run
+	$(BIN)/python -m fixtures.trained.scores
+
+.venv-train/.installed: fixtures/train/requirements.txt
+	$(PYTHON) -m venv .venv-train
+	.venv-train/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
 
 clean:
-	rm -rf $(VENV) exported .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-train exported .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from converters.graph.options import CompileOptions
 from converters.graph.passes.noise import NoiseMode
 from converters.registry import TARGETS
 from converters.source import ReadOptions
 from exporter.inspection import Inspection, inspect_source
+from exporter.labels import Labels
 from exporter.parity.report import ParityReport
 from exporter.parity.subject import VerifyOptions
 from exporter.pipeline import ExportOptions, ExportResult, export, verify_folder
+from exporter.sources import Source, live_source
 from signatures.errors import ParityError, UsageError
 from signatures.roles import Role, parse_role
 
@@ -54,9 +58,12 @@ def _compile_options(
 
 
 def export_model(
-    source: Path | str | Sequence[Path | str],
+    source: Path | str | Sequence[Path | str] | None = None,
     out: Path | str = "exported",
     *,
+    session: Any = None,
+    tf_function: Any = None,
+    keras_model: Any = None,
     to: str | Sequence[str] = TARGETS,
     name: str | None = None,
     brain: str | None = None,
@@ -67,28 +74,37 @@ def export_model(
     outputs: Mapping[str, str | Role] | None = None,
     values: Mapping[str, float] | None = None,
     step: int | None = None,
+    sensors: Sequence[Sequence[int]] = (),
     opset: int = 15,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
+    labels: Labels | None = None,
     strict: bool = True,
 ) -> list[ExportResult]:
-    """Export every policy of ``source`` (one path or several) to ``out/<policy>/``.
+    """Export every policy of a source to ``out/<policy>/``.
 
-    The parameters are the flags of the command line. Raises ExportModelError and its subclasses; ParityError (after
-    everything is written) when formats disagree and ``strict`` is set.
+    The source is one of: ``source``, one path or several; in a training script, ``session``, the tf.compat.v1.Session
+    that the policy was trained in; ``tf_function``, a tf.function that has an ``input_signature`` (or was traced once),
+    or a ConcreteFunction; ``keras_model``. Nothing of a live object is changed. Its policy is called ``policy``, or as
+    the function or the model is; ``name`` gives another.
+
+    The other parameters are the flags of the command line. Raises ExportModelError and its subclasses; ParityError
+    (after everything is written) when formats disagree and ``strict`` is set.
     """
     options = ExportOptions(
         Path(out),
         tuple(t for t in to.split(",") if t) if isinstance(to, str) else tuple(to),
         name,
         _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
-        ReadOptions(step),
+        ReadOptions(step, tuple(tuple(s) for s in sensors)),
         opset,
         verify,
         parity or VerifyOptions(),
+        labels,
     )
-    sources = [source] if isinstance(source, str | Path) else list(source)
-    results = list(export(sources, options))
+    live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
+    with _sources(source, live, step) as sources:
+        results = list(export(sources, options))
     failed = [r for r in results if r.passed is False]
     if failed and strict:
         raise ParityError(
@@ -100,6 +116,27 @@ def export_model(
     return results
 
 
+@contextmanager
+def _sources(
+    source: Path | str | Sequence[Path | str] | None, objects: Mapping[str, Any], step: int | None
+) -> Iterator[Sequence[Path | str | Source]]:
+    """What the pipeline is given, for as long as the context lasts. Raises UsageError unless there is one source."""
+    live = {key: given for key, given in objects.items() if given is not None}
+    given = [*(["source"] if source is not None else []), *live]
+    if len(given) != 1:
+        raise UsageError(
+            f"{' and '.join(given)} were given" if given else "no source was given",
+            fix=f"give one of: source, {', '.join(objects)}",
+        )
+    if source is not None:
+        yield [source] if isinstance(source, str | Path) else list(source)
+        return
+    if step is not None:
+        raise UsageError(f"step={step} goes with a folder", fix=f"leave it out: {given[0]} has the values of now")
+    with live_source(given[0], live[given[0]]) as found:
+        yield [found]
+
+
 def inspect_model(
     source: Path | str,
     *,
@@ -107,23 +144,33 @@ def inspect_model(
     inputs: Mapping[str, str | Role] | None = None,
     outputs: Mapping[str, str | Role] | None = None,
     values: Mapping[str, float] | None = None,
+    step: int | None = None,
 ) -> Inspection:
-    """What is in a source: its policies with their signatures. Raises ExportModelError."""
-    return inspect_source(source, _compile_options("canonical", "lift", False, brain, inputs, outputs, values))
+    """What is in a source: its policies with their signatures. Raises ExportModelError.
+
+    ``step`` asks for a checkpoint of a run's folder; the default is what an export would take.
+    """
+    options = _compile_options("canonical", "lift", False, brain, inputs, outputs, values)
+    return inspect_source(source, options, ReadOptions(step))
 
 
 def verify_bundle(
     bundle: Path | str,
     *,
     source: Path | str | None = None,
+    step: int | None = None,
     runtimes: str | Sequence[str] = "auto",
     options: VerifyOptions | None = None,
     allow_unverified: bool = False,
 ) -> ParityReport:
-    """Verify a bundle again. Raises BundleError, RuntimeUnavailableError; a disagreement is ``passed`` False."""
+    """Verify a bundle again. Raises BundleError, RuntimeUnavailableError; a disagreement is ``passed`` False.
+
+    ``step`` says which checkpoint of ``source`` it was exported from; the default is the step of the export.
+    """
     return verify_folder(
         Path(bundle),
         source=None if source is None else Path(source),
+        step=step,
         runtimes=runtimes,
         options=options,
         allow_unverified=allow_unverified,

@@ -19,6 +19,8 @@ from converters.registry import TARGETS, writer
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from exporter import bundle
+from exporter.labels import Labels, labelled, read_labels
+from exporter.parity.inside import saved_graph
 from exporter.parity.pool import RuntimePool, chosen_runtimes
 from exporter.parity.report import ParityReport
 from exporter.parity.subject import Subject, VerifyOptions
@@ -43,6 +45,7 @@ class ExportOptions:
     opset: int = 15
     verify: str | Sequence[str] = "auto"
     parity: VerifyOptions = field(default_factory=VerifyOptions)
+    labels: Labels | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +74,12 @@ class _Job:
 
 
 def export(
-    paths: Sequence[Path | str],
+    paths: Sequence[Path | str | Source],
     options: ExportOptions,
     progress: Progress = lambda text: None,
     pool: RuntimePool | None = None,
 ) -> Iterator[ExportResult]:
-    """Export every policy of every source, one after the other.
+    """Export every policy of every source, one after the other; a path is read, a Source was read already.
 
     All sources are read and compiled before the first is written, so a bad one leaves nothing behind. Raises
     ExportModelError; a disagreement is in the result, not an exception. A ``pool`` that is given stays open, for
@@ -88,15 +91,18 @@ def export(
     if not writers:
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(TARGETS)}")
     runtimes, known = chosen_runtimes(options.verify, list(writers))
+    labels = read_labels(options.labels)
     jobs: list[_Job] = []
     origins: list[tuple[str, str]] = []
     for path in paths:
-        source = read_source(path, options.read)
+        progress(f"reading {path.path if isinstance(path, Source) else path}")
+        source = path if isinstance(path, Source) else read_source(path, options.read)
         compiled = list(source.compiled(options.compile))
         named = _named([policy for _, policy in compiled], options, len(paths))
         jobs.extend(_Job(source, model, p) for (model, _), p in zip(compiled, named, strict=True))
-        origins.extend((p.name, f"{path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
+        origins.extend((p.name, f"{source.path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
     bundle.distinct_names(origins)
+    jobs = [replace(j, policy=p) for j, p in zip(jobs, labelled([j.policy for j in jobs], labels), strict=True)]
     for policy in (j.policy for j in jobs):
         bundle.recover(options.out / policy.name)
         bundle.check_replaceable(options.out / policy.name)
@@ -126,9 +132,11 @@ def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list
 
 
 def _write(job: _Job, writers: Mapping[str, Any], options: ExportOptions) -> tuple[dict[str, Any], list[Artifact]]:
-    origin = {"path": job.source.path.name, "sha256": job.source.sha256}
+    origin: dict[str, Any] = {"path": job.source.path.name, "sha256": job.source.sha256}
     if job.model.name is not None:
         origin["model"] = job.model.name
+    if options.read.step is not None:
+        origin["step"] = options.read.step
     content = bundle.contract(job.policy, origin)
     with naming(job.source.path):
         how = WriteOptions(bundle.compact(content), options.opset)
@@ -173,6 +181,7 @@ def verify_folder(
     folder: Path,
     *,
     source: Path | None = None,
+    step: int | None = None,
     runtimes: str | Sequence[str] = "auto",
     options: VerifyOptions | None = None,
     allow_unverified: bool = False,
@@ -183,6 +192,8 @@ def verify_folder(
     Without ``source`` the reference is the bundle's own ``.bytes``. Raises BundleError, and RuntimeUnavailableError
     when no independent runtime ran (unless ``allow_unverified``).
     """
+    if step is not None and source is None:
+        raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
     content = bundle.read_policy_json(folder)
     bundle.check_hashes(folder, content)
     name = content["name"]
@@ -194,9 +205,10 @@ def verify_folder(
             where=str(folder),
             fix="export the policy again with bytes among --to",
         )
-    original = None if source is None else _original_of(source, content)
-    graph = _checked_graph(folder, graph_file, content)
+    original = None if source is None else _original_of(source, content, step)
     signature, source_map = bundle.signature_of(content)
+    names = [s.name for s in (*signature.inputs, *signature.outputs)]
+    graph = _whole_graph(_checked_graph(folder, graph_file, content), names, artefacts)
     policy = Policy(
         name,
         graph,
@@ -233,6 +245,26 @@ def _checked_graph(folder: Path, file: Path, content: Mapping[str, Any]) -> Grap
     return Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE))
 
 
+def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Path]) -> Graph:
+    """A graph that has all inputs and outputs: the .bytes', else the SavedModel's.
+
+    A .bytes that lacks one is what the comparison is to find; raises BundleError where there is no SavedModel either.
+    """
+    missing = [name for name in names if name not in graph]
+    if missing and "saved_model" in artefacts:
+        with naming(artefacts["saved_model"]):
+            graph = saved_graph(artefacts["saved_model"])
+        missing = [name for name in names if name not in graph]
+    if missing:
+        raise BundleError(
+            f"has no tensor {missing[0]!r}",
+            where=str(artefacts["bytes"]),
+            why=f"{bundle.POLICY} names it",
+            fix="export the policy again",
+        )
+    return graph
+
+
 def _artefacts(folder: Path, content: Mapping[str, Any]) -> dict[str, Path]:
     """Format → what a loader is given, for the formats whose files policy.json names."""
     name, files = content["name"], content["files"]
@@ -254,15 +286,19 @@ def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
     return sizes
 
 
-def _original_of(source: Path, content: Mapping[str, Any]) -> OriginalRun | None:
-    """How to run the source of a bundle; raises BundleError where ``source`` is another file."""
-    found = read_source(source)
+def _original_of(source: Path, content: Mapping[str, Any], step: int | None) -> OriginalRun | None:
+    """How to run the source of a bundle; raises BundleError where ``source`` is another file.
+
+    A run's folder is read at ``step``, by default at the one that the export asked for.
+    """
+    asked = content["source"].get("step")
+    found = read_source(source, ReadOptions(step if step is not None or not isinstance(asked, int) else asked))
     if found.sha256 != content["source"]["sha256"]:
         raise BundleError(
             "is not the source of this bundle",
             where=str(source),
             why=f"its sha256 differs from that of {content['source']['path']} in {bundle.POLICY}",
-            fix="give the file it was exported from, or export it again",
+            fix="give the file it was exported from (a checkpoint of a run's folder: its --step), or export it again",
         )
     named = [m for m in found.models if m.name == content["source"].get("model")]
     return (named or list(found.models))[0].original

@@ -18,7 +18,7 @@ Shape = Sequence[int | None] | None
 
 
 def node(name: str, op: str, *inputs: str, **attributes: Any) -> NodeDef:
-    """A node of any op. Attributes by their Python type; a tuple is a list of integers."""
+    """A node of any op. Attributes by their Python type; a tuple is a list of integers or dtypes."""
     made = schema.NodeDef(name=name, op=op)
     made.input.extend(inputs)
     for key, value in attributes.items():
@@ -35,6 +35,8 @@ def _set(attribute: Any, value: Any) -> None:
         attribute.f = value
     elif isinstance(value, str):
         attribute.s = value.encode()
+    elif isinstance(value, tuple) and value and isinstance(value[0], type):
+        attribute.list.type.extend(schema.dtype_number(np.dtype(v)) for v in value)
     elif isinstance(value, tuple):
         attribute.list.i.extend(value)
     elif isinstance(value, TensorShape):

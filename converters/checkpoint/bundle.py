@@ -72,6 +72,23 @@ class Checkpoint:
     def __contains__(self, name: str) -> bool:
         return name.encode() in self._entries
 
+    @property
+    def place(self) -> str:
+        """What errors call it."""
+        return self.prefix.name
+
+    def missing(self, keys: Sequence[str]) -> NotAPolicyError:
+        """The error for variables that the policy needs, and that have no value here."""
+        if self.of_objects:
+            return of_objects(self)
+        alike = [n for n in self.names if n.rpartition("/")[2] == keys[0].rpartition("/")[2]]
+        return NotAPolicyError(
+            f"the checkpoint has no value for the variable {several(keys)}",
+            where=self.place,
+            why=f"the policy needs it; what it does have: {', '.join((alike or self.names)[:4]) or 'nothing'}",
+            fix="give the checkpoint of this graph, or another step: --step N",
+        )
+
     def read(self, name: str, extents: Extents | None = None) -> np.ndarray:
         """The tensor ``name``, or the part of it that ``extents`` say.
 
@@ -209,6 +226,21 @@ def version_1(where: str) -> NotAPolicyError:
         why="TensorFlow before 1.0 wrote it, or Saver(write_version=V1); its slices of tensors are not read here",
         fix="in any TensorFlow: restore it with tf.compat.v1.train.Saver, save it again (V2 is the default), give that",
     )
+
+
+def of_objects(checkpoint: Checkpoint) -> NotAPolicyError:
+    """The refusal of what ``tf.train.Checkpoint`` writes."""
+    return NotAPolicyError(
+        "is a checkpoint of Python objects",
+        where=checkpoint.place,
+        why="TensorFlow 2's tf.train.Checkpoint wrote it; what is computed with its values is in the Python code only",
+        fix="save the model as a SavedModel (tf.saved_model.save, model.export), and give that",
+    )
+
+
+def several(keys: Sequence[str]) -> str:
+    """The first of the names, and how many more there are."""
+    return f"{keys[0]!r}" + (f" (and {len(keys) - 1} more)" if len(keys) > 1 else "")
 
 
 def _extents_text(extents: Extents) -> str:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from converters.checkpoint.bundle import Checkpoint
+from converters.checkpoint.bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.graph import Graph, NameScope, Node, TensorShape, node_of, topological
@@ -24,23 +25,39 @@ _PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
 _EFFECTS = ("Assign", "Apply", "ResourceApply", "SparseApply", "Scatter", "ResourceScatter", "Save", "Restore")
 
 
+class Values(Protocol):
+    """Where the values of variables are: a checkpoint, or what a session holds."""
+
+    @property
+    def place(self) -> str:
+        """What errors call it."""
+
+    def __contains__(self, name: str, /) -> bool: ...
+
+    def read(self, name: str, extents: Extents | None = None, /) -> np.ndarray:
+        """The value kept under ``name``, or the part of it that ``extents`` say."""
+
+    def missing(self, keys: Sequence[str], /) -> NotAPolicyError:
+        """The error for variables that the policy needs, and that have no value here."""
+
+
 def is_effect(node: Node) -> bool:
     """Whether a node changes a variable, or writes or reads a checkpoint."""
     return node.op.startswith(_EFFECTS)
 
 
-def freeze(training: TrainingGraph, checkpoint: Checkpoint | None, roots: Sequence[str] | None = None) -> Graph:
+def freeze(training: TrainingGraph, checkpoint: Values | None, roots: Sequence[str] | None = None) -> Graph:
     """The graph with its variables' values.
 
     Raises NotAPolicyError or DamagedFileError when a variable that the policy needs has no value, or one that does not
-    fit. ``checkpoint`` is None where there is none: a graph may do without. ``roots`` are the policy's outputs; by
-    default they are found by their names.
+    fit. ``checkpoint`` has the values; it is None where there is none: a graph may do without. ``roots`` are the
+    policy's outputs; by default they are found by their names.
     """
     graph = training.graph
     variables = {n.name: n for n in graph.nodes if n.op in VARIABLES}
     values: dict[str, np.ndarray] = {}
     missing: dict[str, str] = {}
-    for name in _wanted(graph, variables):
+    for name in wanted_variables(graph):
         place = _place(variables[name], training, checkpoint)
         if checkpoint is None or place is None:
             missing[name] = _key(variables[name], training)
@@ -51,7 +68,8 @@ def freeze(training: TrainingGraph, checkpoint: Checkpoint | None, roots: Sequen
         needed = frozen.ancestors(_roots(frozen) if roots is None else roots)
         names = [name for name in missing if name in needed]
         if names:
-            raise _missing([missing[n] for n in names], checkpoint)
+            keys = [missing[n] for n in names]
+            raise _without_values(keys) if checkpoint is None else checkpoint.missing(keys)
     return frozen
 
 
@@ -66,8 +84,9 @@ def _roots(graph: Graph) -> list[str]:
 # ------------------------------------------------------------------ which variables, and where they are
 
 
-def _wanted(graph: Graph, variables: Collection[str]) -> list[str]:
+def wanted_variables(graph: Graph) -> list[str]:
     """Variables that something computes with an input from, and ML-Agents' constants."""
+    variables = [n.name for n in graph.nodes if n.op in VARIABLES]
     fed: set[str] = set()
     for node in graph.nodes:
         if node.op in _PLACEHOLDERS or (not is_effect(node) and any(node_of(r) in fed for r in node.inputs)):
@@ -81,7 +100,7 @@ def _key(node: Node, training: TrainingGraph) -> str:
     return saved.key if saved is not None else str(node.attrs.get("shared_name") or node.name)
 
 
-def _place(node: Node, training: TrainingGraph, checkpoint: Checkpoint | None) -> Saved | None:
+def _place(node: Node, training: TrainingGraph, checkpoint: Values | None) -> Saved | None:
     """Where the checkpoint keeps a variable: the saver's name for it, the name it is shared under, its own."""
     if checkpoint is None:
         return None
@@ -93,7 +112,7 @@ def _place(node: Node, training: TrainingGraph, checkpoint: Checkpoint | None) -
     return None
 
 
-def _checked(node: Node, value: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
+def _checked(node: Node, value: np.ndarray, checkpoint: Values) -> np.ndarray:
     """The value, if it has the variable's dtype and shape."""
     dtype, shape = node.attrs.get("dtype"), node.attrs.get("shape")
     dims = shape.dims if isinstance(shape, TensorShape) else None
@@ -104,40 +123,19 @@ def _checked(node: Node, value: np.ndarray, checkpoint: Checkpoint) -> np.ndarra
         raise DamagedFileError(
             f"the variable {node.name!r} is {dtype} {list(dims or ())} in the graph and {value.dtype.name} "
             f"{list(value.shape)} in the checkpoint",
-            where=checkpoint.prefix.name,
+            where=checkpoint.place,
             why="they are of different networks; a later run has overwritten one of them",
             fix="give a checkpoint whose own .meta is there, or another step: --step N",
         )
     return value
 
 
-def _missing(keys: Sequence[str], checkpoint: Checkpoint | None) -> NotAPolicyError:
-    """The error for variables without values."""
-    key, more = keys[0], f" (and {len(keys) - 1} more)" if len(keys) > 1 else ""
-    if checkpoint is None:
-        return NotAPolicyError(
-            f"the graph has variables and no values for them: {key!r}{more}",
-            why="it is the graph that training started from; the values are in a checkpoint, and none lies beside it",
-            fix="give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended",
-        )
-    if checkpoint.of_objects:
-        return of_objects(checkpoint)
-    alike = [n for n in checkpoint.names if n.rpartition("/")[2] == key.rpartition("/")[2]]
+def _without_values(keys: Sequence[str]) -> NotAPolicyError:
+    """The error for a graph that has variables, where nothing has their values."""
     return NotAPolicyError(
-        f"the checkpoint has no value for the variable {key!r}{more}",
-        where=checkpoint.prefix.name,
-        why=f"the policy needs it; what it does have: {', '.join((alike or checkpoint.names)[:4]) or 'nothing'}",
-        fix="give the checkpoint of this graph, or another step: --step N",
-    )
-
-
-def of_objects(checkpoint: Checkpoint) -> NotAPolicyError:
-    """The refusal of what ``tf.train.Checkpoint`` writes."""
-    return NotAPolicyError(
-        "is a checkpoint of Python objects",
-        where=checkpoint.prefix.name,
-        why="TensorFlow 2's tf.train.Checkpoint wrote it; what is computed with its values is in the Python code only",
-        fix="save the model as a SavedModel (tf.saved_model.save, model.export), and give that",
+        f"the graph has variables and no values for them: {several(keys)}",
+        why="it is the graph that training started from; the values are in a checkpoint, and none lies beside it",
+        fix="give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended",
     )
 
 

@@ -18,7 +18,7 @@ from converters.renaming import renamed
 from signatures.errors import ExportModelError
 from signatures.graph import Graph, Node, node_of, topological
 from signatures.infer import find_brains
-from signatures.roles import OUTPUT_NAMES
+from signatures.roles import OUTPUT_NAMES, Constant, numbers
 
 _SAMPLED = "action/Multinomial"
 _CLONED = frozenset(("action", "recurrent_out"))
@@ -56,11 +56,12 @@ def _with_action(graph: Graph) -> tuple[Graph, tuple[str, ...]]:
     return Graph(topological([*graph.nodes, *added])), (note,)
 
 
-def _is_inner(graph: Graph, scope: str, base: str, constants: Mapping[str, int | float]) -> bool:
+def _is_inner(graph: Graph, scope: str, base: str, constants: Mapping[str, Constant]) -> bool:
     """Whether the trainer that wrote the graph did not export the output ``base``."""
     if "version_number" not in constants and scope + "teacher_action" in graph:
         return base not in _CLONED
-    version = (constants.get("trainer_major_version", 0), constants.get("trainer_minor_version", 0))
+    known = numbers(constants)
+    version = (known.get("trainer_major_version", 0), known.get("trainer_minor_version", 0))
     return base == "action_probs" and version >= (0, 22)
 
 

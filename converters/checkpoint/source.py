@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from converters.checkpoint import listing
-from converters.checkpoint.bundle import Checkpoint, version_1
-from converters.checkpoint.freeze import freeze, of_objects
+from converters.checkpoint.bundle import Checkpoint, of_objects, version_1
+from converters.checkpoint.freeze import freeze
 from converters.checkpoint.policy_nodes import policy_nodes
 from converters.checkpoint.table import MAGIC
 from converters.checkpoint.training_graph import read_training_graph

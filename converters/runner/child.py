@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, NoReturn, Protocol
 
 from converters.runner.wire import Tensors, read_frame, write_frame
 
@@ -32,8 +32,8 @@ def claim_stdout() -> BinaryIO:
     return stream
 
 
-def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception], ...], out: BinaryIO) -> None:
-    """Answer requests until stdin ends. ``faults`` are what the runtime raises on bad models and inputs."""
+def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception], ...], out: BinaryIO) -> NoReturn:
+    """Answer requests until stdin ends, then end the process. ``faults`` are what bad models and inputs raise."""
     models: dict[str, Model] = {}
     caught: tuple[type[Exception], ...] = (*faults, KeyError, ValueError, TypeError, OSError)
     source = sys.stdin.buffer
@@ -41,7 +41,9 @@ def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception
         try:
             header, tensors = read_frame(source)
         except EOFError:
-            return
+            # Everything was answered and flushed, and nobody listens any more. Taking TensorFlow down in order would
+            # cost a second, which the parent would wait for.
+            os._exit(0)
         try:
             command = header["cmd"]
             if command == "hello":

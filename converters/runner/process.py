@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
@@ -35,13 +36,13 @@ class RuntimeProcess:
         self._errors: IO[bytes] | None = None
         self._loaded = 0
 
-    def start(self) -> str:
-        """Start the process if it is not running; returns the runtime's version.
+    def launch(self) -> None:
+        """Start the process if it is not running, and do not wait for it: it gets ready beside what is done next.
 
-        Raises RuntimeUnavailableError when it does not start.
+        Raises RuntimeUnavailableError where there is no such program.
         """
-        if self._process is not None and self.version is not None:
-            return self.version
+        if self._process is not None:
+            return
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
         try:
             self._process = subprocess.Popen(
@@ -51,9 +52,22 @@ class RuntimeProcess:
             raise RuntimeUnavailableError(
                 f"the runtime {self.name} did not start", why=str(error), fix="export-model runtimes shows what is here"
             ) from error
+        # Sent ahead: some runtimes start with the first request. One that ends at once is noticed by ``start``.
+        with contextlib.suppress(BrokenPipeError):
+            write_frame(self._streams[0], {"cmd": "hello"})
+
+    def start(self) -> str:
+        """Start the process if it is not running, and wait until it is ready; returns the runtime's version.
+
+        Raises RuntimeUnavailableError when it does not start.
+        """
+        if self.version is not None:
+            return self.version
+        self.launch()
         try:
-            answer, _ = self.request({"cmd": "hello"})
+            answer, _ = self._exchange(None)
         except RunFailedError as error:
+            self.close()  # its one "hello" is answered: asked again, it would be silent
             raise RuntimeUnavailableError(
                 f"the runtime {self.name} did not start",
                 why=error.why or error.what,
@@ -77,14 +91,27 @@ class RuntimeProcess:
 
         Raises RunFailedError where the answer is an error, the process died, or hangs.
         """
+        return self._exchange(lambda stream: write_frame(stream, header, tensors))
+
+    @property
+    def _streams(self) -> tuple[BinaryIO, BinaryIO]:
+        """The process's stdin and stdout."""
         process = self._process
         if process is None or process.stdin is None or process.stdout is None:
             raise RunFailedError(f"{self.name} is not running")
+        return cast(BinaryIO, process.stdin), cast(BinaryIO, process.stdout)
+
+    def _exchange(self, send: Callable[[BinaryIO], None] | None) -> tuple[dict[str, Any], Tensors]:
+        """Send a frame, unless it was sent ahead, and wait for an answer."""
+        to, back = self._streams
+        process = self._process
+        assert process is not None
         watchdog = threading.Timer(TIMEOUT, process.kill)
         watchdog.start()
         try:
-            write_frame(process.stdin, header, tensors)  # type: ignore[arg-type]
-            answer, results = read_frame(process.stdout)  # type: ignore[arg-type]
+            if send is not None:
+                send(to)
+            answer, results = read_frame(back)
         except (EOFError, BrokenPipeError, OSError) as error:
             status = process.poll() if process.poll() is not None else process.wait(5)
             said = self._last_errors()
@@ -109,16 +136,22 @@ class RuntimeProcess:
         lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
         return "\n".join(lines[-8:])
 
+    def hang_up(self) -> None:
+        """Tell the process to end, and do not wait: several end side by side before each is closed."""
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+
     def close(self) -> None:
-        """End the process."""
-        process, self._process, self.version = self._process, None, None
+        """End the process; one that is not ready yet is not waited for."""
+        self.hang_up()
+        process, ready = self._process, self.version is not None
+        self._process, self.version = None, None
         if process is not None:
-            for stream in (process.stdin, process.stdout):
-                if stream is not None:
-                    try:
-                        stream.close()
-                    except BrokenPipeError:
-                        continue
+            if not ready:
+                process.terminate()  # not kill: one that has started a browser ends that first
+            if process.stdout is not None:
+                process.stdout.close()
             try:
                 process.wait(10)
             except subprocess.TimeoutExpired:

@@ -1,9 +1,18 @@
-"""What only TensorFlow can freeze: SavedModels of TensorFlow 2 and Keras models. For children that have imported it."""
+"""What only TensorFlow can freeze: SavedModels of TensorFlow 2, Keras models, functions.
+
+For processes that have imported it: the children, and a training script that gives its model.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+_CALLS = frozenset(
+    (*("PartitionedCall", "StatefulPartitionedCall", "While", "StatelessWhile"),
+     *("If", "StatelessIf", "Case", "StatelessCase"))
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -26,18 +35,9 @@ def frozen_function(path: str, form: str, signature: str | None = None) -> Froze
 
     if form == "keras":
         model = tf.keras.models.load_model(path, compile=False)
-        names = [_argument(t.name, i) for i, t in enumerate(model.inputs)]
-        specs = [
-            tf.TensorSpec([None, *t.shape[1:]], t.dtype, name=name) for name, t in zip(names, model.inputs, strict=True)
-        ]
-        structure = model._inputs_struct if hasattr(model, "_inputs_struct") else list(model.inputs)
-
-        def call(*tensors: Any) -> Any:
-            return model(tf.nest.pack_sequence_as(structure, tensors), training=False)
-
+        call, specs, names = keras_call(model)
         function = tf.function(call).get_concrete_function(*specs)
-        results = tf.nest.flatten(function.structured_outputs)
-        keys = list(getattr(model, "output_names", [])) or [f"output_{i}" for i in range(len(results))]
+        keys = keras_outputs(model, len(tf.nest.flatten(function.structured_outputs)))
         used = "call"
     else:
         loaded = tf.saved_model.load(path)
@@ -54,11 +54,105 @@ def frozen_function(path: str, form: str, signature: str | None = None) -> Froze
             names = list(function._arg_keywords)
     frozen = convert_variables_to_constants_v2(function, lower_control_flow=True)
     return FrozenFunction(
-        frozen.graph.as_graph_def(),
+        _ordered(frozen.graph.as_graph_def(), [t.op.name for t in frozen.inputs]),
         dict(zip(names, (t.name for t in frozen.inputs), strict=True)),
         dict(zip(keys, (t.name for t in frozen.outputs), strict=True)),
         used,
     )
+
+
+def _ordered(graph_def: Any, first: Sequence[str]) -> Any:
+    """The nodes ``first``, then the others by name: the order that TensorFlow gives them differs from run to run."""
+    places = {name: i for i, name in enumerate(first)}
+    nodes = sorted(graph_def.node, key=lambda n: (places.get(n.name, len(places)), n.name))
+    ordered = type(graph_def)()
+    ordered.CopyFrom(graph_def)
+    del ordered.node[:]
+    ordered.node.extend(nodes)
+    return ordered
+
+
+def flattened(graph: Any) -> bytes:
+    """The GraphDef of a ``tf.Graph``, deterministic; function calls and functional control flow are inlined.
+
+    The graph is not changed. Control flow becomes Switch and Merge, as in TensorFlow 1.
+    """
+    graph_def = graph.as_graph_def()
+    calls = _CALLS | {f.signature.name for f in graph_def.library.function}
+    if any(node.op in calls for node in graph_def.node):
+        places = [node.name for node in graph_def.node if node.op == "Placeholder"]
+        graph_def = _ordered(_inlined(graph_def, calls), places)
+    data: bytes = graph_def.SerializeToString(deterministic=True)
+    return data
+
+
+def _inlined(graph_def: Any, calls: Collection[str]) -> Any:
+    """As ``convert_variables_to_constants_v2`` does it: Grappler, with nothing but its function optimizer."""
+    from tensorflow.core.protobuf import config_pb2, meta_graph_pb2  # noqa: TID251  the graph proves that it is loaded
+    from tensorflow.python.grappler import tf_optimizer  # noqa: TID251
+
+    meta = meta_graph_pb2.MetaGraphDef()
+    meta.graph_def.CopyFrom(graph_def)
+    for function in meta.graph_def.library.function:
+        function.attr.pop("api_implements", None)  # another implementation for GPUs, which is not inlined
+    read = {i.lstrip("^").split(":")[0] for node in graph_def.node for i in node.input}
+    kept = [n.name for n in graph_def.node if n.op not in calls and (n.op == "Placeholder" or n.name not in read)]
+    meta.collection_def["train_op"].node_list.value.extend(kept)
+    config = config_pb2.ConfigProto()
+    config.graph_options.rewrite_options.min_graph_nodes = -1
+    config.graph_options.rewrite_options.optimizers.append("function")
+    return tf_optimizer.OptimizeGraph(config, meta)
+
+
+def keras_call(model: Any) -> tuple[Callable[..., Any], list[Any], list[str]]:
+    """(what a Keras model computes at inference, its arguments' TensorSpecs with a free batch, their names)."""
+    import tensorflow as tf  # noqa: TID251  the model proves that it is loaded
+
+    names = [_argument(t.name, i) for i, t in enumerate(model.inputs)]
+    specs = [
+        tf.TensorSpec([None, *t.shape[1:]], t.dtype, name=name) for name, t in zip(names, model.inputs, strict=True)
+    ]
+    structure = model._inputs_struct if hasattr(model, "_inputs_struct") else list(model.inputs)
+
+    def call(*tensors: Any) -> Any:
+        return model(tf.nest.pack_sequence_as(structure, tensors), training=False)
+
+    return call, specs, names
+
+
+def keras_outputs(model: Any, count: int) -> list[str]:
+    """What a Keras model calls its outputs."""
+    return list(getattr(model, "output_names", [])) or [f"output_{i}" for i in range(count)]
+
+
+def saved_function(function: Any, folder: str) -> FrozenFunction:
+    """A ConcreteFunction written to ``folder`` as a SavedModel, and frozen from there as a child would.
+
+    Its graph then has the names that the child's has. Raises what ``tf.saved_model.save`` raises.
+    """
+    import tensorflow as tf  # noqa: TID251  the function proves that it is loaded
+
+    module = tf.Module()
+    module.variables_of_the_function = list(function.graph.variables)
+    log = tf.get_logger()
+    level = log.level
+    log.setLevel("ERROR")  # it says where it writes
+    try:
+        tf.saved_model.save(module, folder, signatures=function)
+    finally:
+        log.setLevel(level)
+    return frozen_function(folder, "saved_model", "serving_default")
+
+
+def named_function(call: Callable[..., Any], specs: Sequence[Any], keys: Callable[[int], Sequence[str]]) -> Any:
+    """The ConcreteFunction of ``call`` whose results are a dictionary; ``keys`` gives their names by their number."""
+    import tensorflow as tf  # noqa: TID251  the model proves that it is loaded
+
+    def named(*tensors: Any) -> dict[str, Any]:
+        results = tf.nest.flatten(call(*tensors))
+        return dict(zip(keys(len(results)), results, strict=True))
+
+    return tf.function(named).get_concrete_function(*specs)
 
 
 def _argument(name: str, number: int) -> str:

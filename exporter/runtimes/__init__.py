@@ -7,13 +7,18 @@ here imports a runtime: ``import tensorflow`` takes seconds, and the question is
 from __future__ import annotations
 
 from exporter.runtimes.base import Runtime, RuntimeInfo
-from exporter.runtimes.javascript import TFJS_CPU, TFJS_WASM
+from exporter.runtimes.browser import ONNXRUNTIME_WEB_CHROMIUM, TFJS_CPU_CHROMIUM, TFJS_WASM_CHROMIUM, TFJS_WEBGL
+from exporter.runtimes.javascript import ONNXRUNTIME_WEB, TFJS_CPU, TFJS_WASM
+from exporter.runtimes.legacy import TF1_4, TF1_7
 from exporter.runtimes.python import NUMPY, ONNXRUNTIME, TENSORFLOW
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 
 #: In the order in which they are reported.
-RUNTIMES: tuple[Runtime, ...] = (NUMPY, TENSORFLOW, ONNXRUNTIME, TFJS_CPU, TFJS_WASM)
+RUNTIMES: tuple[Runtime, ...] = (
+    *(NUMPY, TENSORFLOW, TF1_4, TF1_7, ONNXRUNTIME, ONNXRUNTIME_WEB, TFJS_CPU, TFJS_WASM),
+    *(TFJS_WEBGL, TFJS_CPU_CHROMIUM, TFJS_WASM_CHROMIUM, ONNXRUNTIME_WEB_CHROMIUM),
+)
 
 
 def available_runtimes() -> tuple[RuntimeInfo, ...]:

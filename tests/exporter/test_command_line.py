@@ -7,6 +7,8 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,10 @@ import exporter
 from converters.registry import TARGETS
 from exporter import cli
 from exporter.cli import app
+from exporter.console import Console
+from exporter.runtimes import RUNTIMES, Runtime
+from exporter.runtimes.base import Progress
+from exporter.runtimes.javascript import install_packages
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
@@ -283,7 +289,7 @@ def test_the_runtimes_are_listed_whether_they_are_here_or_not() -> None:
     assert (ran.status, ran.err) == (0, "")
     names = [line.split()[0] for line in ran.out.splitlines()[2:]]
     assert names == [r["name"] for r in export_model("runtimes", "--json").json["runtimes"]]
-    assert {"numpy", "tensorflow", "onnxruntime", "tfjs-cpu", "tfjs-wasm"} <= set(names)
+    assert names == [r.name for r in RUNTIMES]
 
 
 def test_the_runtimes_as_json_say_how_to_install_each() -> None:
@@ -292,15 +298,38 @@ def test_the_runtimes_as_json_say_how_to_install_each() -> None:
         assert runtime["install"]
 
 
-def test_only_tfjs_is_installed_by_the_command() -> None:
-    is_refused(export_model("runtimes", "install", "onnxruntime"), "only tfjs", "pip install")
-    is_refused(export_model("runtimes", "install", "nothing"), "only tfjs", "export-model runtimes")
+def test_what_pip_installs_is_not_installed_by_the_command() -> None:
+    is_refused(export_model("runtimes", "install", "onnxruntime"), "does not install it", "pip install")
+    is_refused(export_model("runtimes", "install", "numpy"), "does not install it", "pip install")
+    is_refused(export_model("runtimes", "install", "nothing"), "there is no such runtime", "export-model runtimes")
 
 
-def test_installing_tfjs_reports_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("exporter.runtimes.install_tfjs", lambda progress: progress("done"))
-    ran = export_model("runtimes", "install", "tfjs")
-    assert (ran.status, ran.out, ran.err) == (0, "done\n", "")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("tfjs", ["js"]),
+        ("tfjs-cpu", ["js"]),
+        ("onnxruntime-web", ["js"]),
+        ("tf1.4", ["tf1.4"]),
+        ("tf1.7", ["tf1.7"]),
+        ("tf1", ["tf1.4", "tf1.7"]),
+    ],
+)
+def test_installing_reports_its_steps(monkeypatch: pytest.MonkeyPatch, name: str, said: list[str]) -> None:
+    """Every runtime of a family once; what fetches is replaced, for these tests need no network."""
+
+    def stand_in(runtime: Runtime) -> Runtime:
+        if runtime.install is None:
+            return runtime
+        return replace(runtime, install=js if runtime.install is install_packages else steps[runtime.name])
+
+    def js(progress: Progress) -> None:
+        progress("js")
+
+    steps = {n: partial(lambda text, progress: progress(text), n) for n in ("tf1.4", "tf1.7")}
+    monkeypatch.setattr("exporter.runtimes.RUNTIMES", tuple(stand_in(r) for r in RUNTIMES))
+    ran = export_model("runtimes", "install", name)
+    assert (ran.status, ran.out.splitlines(), ran.err) == (0, said, "")
 
 
 # ------------------------------------------------------------------ terminals that cannot show everything
@@ -366,14 +395,15 @@ class Terminal(io.StringIO):
 
 
 def test_progress_is_shown_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
     shown = Terminal()
     monkeypatch.setattr(sys, "stderr", shown)
-    cli._progress(quiet=False)("working")
+    Console().progress()("working")
     assert "working" in shown.getvalue()
-    cli._progress(quiet=True)("hidden")
+    Console(as_json=True).progress()("hidden")
     assert "hidden" not in shown.getvalue()
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    cli._progress(quiet=False)("hidden")
+    Console().progress()("hidden")
     assert sys.stderr.getvalue() == ""
 
 
@@ -382,8 +412,10 @@ def test_a_terminal_is_cleared_of_progress_before_a_result(
 ) -> None:
     shown = Terminal()
     monkeypatch.setattr(sys, "stderr", shown)
+    monkeypatch.setenv("TERM", "xterm")
     cli.app.main([str(BALL), "-o", str(tmp_path), *UNVERIFIED], standalone_mode=False)
-    assert shown.getvalue() == "\r\x1b[2K"
+    assert shown.getvalue().startswith("\r\x1b[2K  reading ")
+    assert shown.getvalue().endswith("\r\x1b[2K")
     assert capsys.readouterr().out.startswith("continuous: ")
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from converters.runner.process import RunFailedError
 from exporter.parity import pool as pools
-from exporter.parity.pool import INDEPENDENT, RuntimePool, chosen_runtimes
-from exporter.runtimes import RuntimeInfo, javascript
+from exporter.parity.pool import RuntimePool, chosen_runtimes
+from exporter.runtimes import RUNTIMES, RuntimeInfo, javascript
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
+from tests.commands import ROOT
 
 NAMES = ("numpy", "tensorflow", "tf1.4", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
 
@@ -40,7 +43,8 @@ def test_what_is_installed_for_the_formats_is_chosen_by_itself(here: set[str]) -
 
 
 def test_full_is_everything_and_nothing_may_be_missing(here: set[str]) -> None:
-    assert set(names("full")) == {"numpy", *INDEPENDENT}
+    here |= {"tf1.4"}
+    assert set(names("full")) == set(NAMES)
     here -= {"onnxruntime"}
     with pytest.raises(RuntimeUnavailableError, match="onnxruntime is not installed") as caught:
         names("full")
@@ -107,6 +111,59 @@ def test_a_runtime_that_ends_at_once_is_unavailable() -> None:
         pool.process("numpy")
 
 
+#: A runtime that is ready once the file that it is given exists.
+WAITS = """
+import pathlib, sys, time
+sys.path.insert(0, sys.argv[2])
+from converters.runner.child import claim_stdout, serve
+out = claim_stdout()
+while not pathlib.Path(sys.argv[1]).exists():
+    time.sleep(0.01)
+serve("waits", "7", lambda header: 1 / 0, (), out)
+"""
+
+
+def waits(file: Path) -> Callable[[], list[str]]:
+    return lambda: [sys.executable, "-c", WAITS, str(file), str(ROOT)]
+
+
+def test_processes_start_side_by_side(tmp_path: Path) -> None:
+    """Neither would be ready if each were waited for: the file comes after both were started."""
+    with RuntimePool({"a": waits(tmp_path / "go"), "b": waits(tmp_path / "go")}) as pool:
+        pool.start(["a", "b"])
+        pool.start(["b"])
+        assert pool.versions() == {}
+        (tmp_path / "go").touch()
+        assert pool.process("b") is pool.process("b")
+        assert pool.versions() == {"b": "7"}
+        assert pool.process("a").version == "7"
+
+
+def test_what_is_not_ready_is_not_waited_for_at_the_end(tmp_path: Path) -> None:
+    with RuntimePool({"a": waits(tmp_path / "never")}) as pool:
+        pool.start(["a"])
+        child = pool._processes["a"]._process
+        assert child is not None
+    assert child.returncode != 0
+
+
+def test_one_that_cannot_be_started_leaves_the_others() -> None:
+    commands = {"numpy": RUNTIMES[0].command, "gone": lambda: ["/nonexistent/python"]}
+    with RuntimePool(commands) as pool:
+        with pytest.raises(RuntimeUnavailableError, match="gone did not start"):
+            pool.start(["numpy", "gone"])
+        assert pool.process("numpy").version == np.__version__
+
+
+def test_one_that_refused_to_start_is_tried_again(tmp_path: Path) -> None:
+    """It answers "hello" with an error and lives on; asked nothing again, it would be waited for in vain."""
+    empty = [*javascript.TFJS_CPU.command()[:-1], str(tmp_path)]
+    with RuntimePool({"tfjs-cpu": lambda: empty}) as pool:
+        for _ in range(2):
+            with pytest.raises(RuntimeUnavailableError, match="Cannot find module"):
+                pool.process("tfjs-cpu")
+
+
 def test_without_node_tensorflow_js_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(javascript, "node_executable", lambda: None)
     with RuntimePool() as pool, pytest.raises(RuntimeUnavailableError, match="Node is not installed"):
@@ -119,4 +176,4 @@ def test_tensorflow_js_runs_in_node_with_its_backend(monkeypatch: pytest.MonkeyP
     command = javascript.TFJS_WASM.command()
     assert command[0] == "node"
     assert command[1].endswith("runner.mjs")
-    assert command[2:] == ["--backend", "wasm", "--modules", "/packages"]
+    assert command[2:] == ["--runtime", "tfjs-wasm", "--modules", "/packages"]

@@ -102,7 +102,8 @@ def test_the_memory_is_fed_back(exporting: Exporting, tmp_path: Path) -> None:
     straight.write_bytes((tmp_path / "out" / "recurrent.failed" / "recurrent.bytes").read_bytes())
 
     def forgets(answer: Tensors) -> None:
-        answer["recurrent_out"] = answer["recurrent_out"] * np.float32(1.001)
+        if "recurrent_out" in answer:
+            answer["recurrent_out"] = answer["recurrent_out"] * np.float32(1.001)
 
     good = exporting(straight, name="good", parity=VerifyOptions(steps=3))
     rollouts = [c for c in report_of(good).comparisons if c.kind == "rollout" and c.format == "onnx"]

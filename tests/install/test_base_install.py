@@ -97,7 +97,9 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
         "signatures",
         f"export_model-{__version__}.dist-info",
     }
-    for name in ("runner.mjs", "package.json", "package-lock.json"):
+    scripts = {p.name for p in (ROOT / "converters" / "runner" / "js").glob("*.mjs")}
+    assert "runner.mjs" in scripts
+    for name in ("package.json", "package-lock.json", *scripts):
         assert f"converters/runner/js/{name}" in names
     strays = [n for n in names if "node_modules" in n or "__pycache__" in n or "/test" in n or n.endswith(".bytes")]
     assert not strays

@@ -1,7 +1,7 @@
 """Every ``.bytes`` that is written loads and runs in the runtimes of TensorFlow 1.4 and 1.7, and agrees.
 
-Agreement is judged by exporter.parity, in which the old runtime takes the place of today's TensorFlow: the same inputs,
-tolerances, steps with the memory fed back and draws. The reference is numpy.
+Agreement is judged by exporter.parity, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
+and draws. The reference is numpy.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import pytest
 
 from converters.frozen_graph.reader import read_graph
 from converters.graph.options import CompileOptions
-from converters.runner.process import RunFailedError, RuntimeProcess
+from converters.runner.process import RunFailedError
 from exporter.parity.pool import RuntimePool
 from exporter.parity.report import Comparison
 from exporter.parity.subject import Subject
 from exporter.parity.verify import verify
 from exporter.pipeline import ExportOptions, ExportResult, export
+from exporter.runtimes.legacy import RELEASES
 from fixtures import FIXTURES, path
 from fixtures.goldens import read_npz
-from signatures.errors import RuntimeUnavailableError
 from tests.corpus.conftest import frozen_corpus, genuine_cases
-from tests.legacy.runtime import WHEELS, legacy_process, unsupported_reason
+from tests.legacy.installed import VERSIONS, ensure
 
 pytestmark = [pytest.mark.legacy, pytest.mark.slow]
 
@@ -35,29 +35,15 @@ SHARED = [
 ] or [pytest.param(Path("absent"), id="shared-is-absent")]
 
 
-@pytest.fixture(
-    scope="module",
-    # A group per version: with several test processes, each version is started in one of them only.
-    params=[pytest.param(v, id=f"tf{v}", marks=pytest.mark.xdist_group(f"tf{v}")) for v in WHEELS],
-)
-def legacy(request: pytest.FixtureRequest) -> Iterator[RuntimeProcess]:
-    reason = unsupported_reason()
-    if reason is not None:
-        pytest.skip(reason)
-    try:
-        process = legacy_process(request.param)
-    except RuntimeUnavailableError as error:
-        pytest.skip(f"{error.what}: {error.why}")
-    with process:
-        assert process.start() == request.param
-        yield process
+@pytest.fixture(scope="module", params=VERSIONS)
+def legacy(request: pytest.FixtureRequest) -> str:
+    """The name of the old runtime, installed."""
+    return ensure(request.param)
 
 
 @pytest.fixture(scope="module")
-def pool(legacy: RuntimeProcess) -> Iterator[RuntimePool]:
-    """Processes in which "tensorflow" is the old one."""
+def pool() -> Iterator[RuntimePool]:
     with RuntimePool() as opened:
-        opened._processes["tensorflow"] = legacy
         yield opened
 
 
@@ -65,7 +51,7 @@ def exported(source: Path, out: Path, **options: Any) -> list[ExportResult]:
     return list(export([source], ExportOptions(out, targets=("bytes",), verify="none", **options)))
 
 
-def compared(result: ExportResult, pool: RuntimePool) -> list[Comparison]:
+def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Comparison]:
     file = result.folder / f"{result.policy.name}.bytes"
     subject = Subject(
         name=result.policy.name,
@@ -75,15 +61,15 @@ def compared(result: ExportResult, pool: RuntimePool) -> list[Comparison]:
         sizes=result.sizes,
         reference=file,
     )
-    report = verify(subject, ("numpy", "tensorflow"), (), pool)
-    return [c for c in report.comparisons if c.runtime == "tensorflow"]
+    report = verify(subject, ("numpy", legacy), (), pool)
+    return [c for c in report.comparisons if c.runtime == legacy]
 
 
-def assert_agrees(source: Path, out: Path, pool: RuntimePool) -> None:
+def assert_agrees(source: Path, out: Path, legacy: str, pool: RuntimePool) -> None:
     results = exported(source, out)
     assert results
     for result in results:
-        found = compared(result, pool)
+        found = compared(result, legacy, pool)
         failed = [f"{c.output}, {c.kind}, {c.worst_input}: {c.max_abs_diff} {c.reason}" for c in found if not c.passed]
         assert not failed, "\n".join(failed)
         assert {c.output for c in found} == {s.name for s in result.policy.signature.outputs}
@@ -93,20 +79,22 @@ def assert_agrees(source: Path, out: Path, pool: RuntimePool) -> None:
 
 
 @pytest.mark.parametrize("name", FIXTURES)
-def test_fixtures_agree(name: str, tmp_path: Path, pool: RuntimePool) -> None:
-    assert_agrees(path(name), tmp_path, pool)
+def test_fixtures_agree(name: str, tmp_path: Path, legacy: str, pool: RuntimePool) -> None:
+    assert_agrees(path(name), tmp_path, legacy, pool)
 
 
 @pytest.mark.corpus
 @pytest.mark.parametrize("source", SHARED)
-def test_public_and_genuine_policies_agree(source: Path, tmp_path: Path, pool: RuntimePool) -> None:
+def test_public_and_genuine_policies_agree(source: Path, tmp_path: Path, legacy: str, pool: RuntimePool) -> None:
     if not source.is_file():
         pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
-    assert_agrees(source, tmp_path, pool)
+    assert_agrees(source, tmp_path, legacy, pool)
 
 
 @pytest.mark.parametrize("name", FIXTURES)
-def test_goldens_come_out_under_the_names_of_the_source(name: str, tmp_path: Path, legacy: RuntimeProcess) -> None:
+def test_goldens_come_out_under_the_names_of_the_source(
+    name: str, tmp_path: Path, legacy: str, pool: RuntimePool
+) -> None:
     """Nodes are found by the trainer's names, as in Unity's plug-in. The goldens are today's TensorFlow's.
 
     What a sampler drew then is fed in its place.
@@ -116,7 +104,7 @@ def test_goldens_come_out_under_the_names_of_the_source(name: str, tmp_path: Pat
     for result in exported(path(name), tmp_path, compile=CompileOptions(names="source", noise="keep")):
         file = result.folder / f"{result.policy.name}.bytes"
         nodes = {n.name for n in read_graph(file.read_bytes()).nodes}
-        model = legacy.load(str(file))
+        model = pool.process(legacy).load(str(file))
         for run in runs:
             feeds, expected = {}, {}
             for key, value in goldens.items():
@@ -129,17 +117,23 @@ def test_goldens_come_out_under_the_names_of_the_source(name: str, tmp_path: Pat
         model.unload()
 
 
-def test_a_newer_graph_is_refused_in_the_words_of_tensorflow(legacy: RuntimeProcess) -> None:
+def test_the_version_is_what_the_library_says(legacy: str, pool: RuntimePool) -> None:
+    pool.process(legacy)
+    assert pool.versions()[legacy] == next(r.version for r in RELEASES if r.runtime == legacy)
+
+
+def test_a_newer_graph_is_refused_in_the_words_of_tensorflow(legacy: str, pool: RuntimePool) -> None:
     """The fixture itself, not what is exported from it: it has AddV2, which came between 1.4 and 1.7."""
-    if legacy.version == "1.4.0":
+    process = pool.process(legacy)
+    if legacy == "tf1.4":
         with pytest.raises(RunFailedError, match="Op type not registered 'AddV2'"):
-            legacy.load(str(path("discrete")))
+            process.load(str(path("discrete")))
     else:
-        legacy.load(str(path("discrete"))).unload()
+        process.load(str(path("discrete"))).unload()
 
 
-def test_a_run_that_fails_leaves_the_process_at_work(legacy: RuntimeProcess) -> None:
-    model = legacy.load(str(path("continuous")))
+def test_a_run_that_fails_leaves_the_process_at_work(legacy: str, pool: RuntimePool) -> None:
+    model = pool.process(legacy).load(str(path("continuous")))
     feeds = {"state": np.zeros((2, 8), np.float32), "epsilon": np.zeros((2, 2), np.float32)}
     with pytest.raises(RunFailedError, match="You must feed a value for placeholder tensor 'epsilon'"):
         model.run({"state": feeds["state"]}, ["action"])
@@ -149,3 +143,22 @@ def test_a_run_that_fails_leaves_the_process_at_work(legacy: RuntimeProcess) -> 
         model.run(feeds, ["nothing:1"])
     assert model.run(feeds, ["action:0"])["action:0"].shape == (2, 2)
     model.unload()
+
+
+def test_what_aborts_there_ends_the_child_and_is_an_answer(legacy: str, tmp_path: Path) -> None:
+    """Bytes that are no graph are refused; the process that refused them serves the next model."""
+    bad = tmp_path / "bad.bytes"
+    bad.write_bytes(b"not a graph" * 9)
+    with RuntimePool() as own:
+        with pytest.raises(RunFailedError, match="Invalid GraphDef"):
+            own.process(legacy).load(str(bad))
+        own.process(legacy).load(str(path("continuous"))).unload()
+
+
+def test_verification_by_name_takes_part_in_an_export(legacy: str, tmp_path: Path) -> None:
+    options = ExportOptions(tmp_path, targets=("bytes", "onnx"), verify=legacy)
+    (result,) = export([path("continuous")], options)
+    assert result.report is not None
+    assert result.report.passed
+    assert {(c.format, c.runtime) for c in result.report.comparisons} == {("reference", "numpy"), ("bytes", legacy)}
+    assert result.report.runtimes[legacy]["status"] == "ran"

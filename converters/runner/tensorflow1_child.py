@@ -1,0 +1,42 @@
+"""An old TensorFlow in its own process: ``python -m converters.runner.tensorflow1_child NAME LIBRARY``.
+
+NAME is the runtime's, LIBRARY the path of the shared object that has the C API. An assertion within TensorFlow ends
+this process, not its parent.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from converters.runner.child import claim_stdout, serve
+from converters.runner.tensorflow1 import LegacyError, LegacySession, library_version, load_library
+from converters.runner.wire import Tensors
+
+
+class _Model:
+    """A session as converters.runner.child wants it."""
+
+    def __init__(self, session: LegacySession) -> None:
+        self.session = session
+
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        return self.session.run(feeds, fetch)
+
+
+def main() -> None:
+    """Entry of the child process."""
+    out = claim_stdout()
+    name, path = sys.argv[1:]
+    library = load_library(path)
+
+    def load(header: Mapping[str, Any]) -> _Model:
+        return _Model(LegacySession(Path(header["path"]).read_bytes(), library))
+
+    serve(name, library_version(library), load, (LegacyError,), out)
+
+
+if __name__ == "__main__":
+    main()

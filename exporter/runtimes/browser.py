@@ -1,0 +1,104 @@
+"""TensorFlow.js and onnxruntime-web in Chromium: where a user's page runs them.
+
+They need Node (which drives Chromium), the npm packages of ``converters/runner/js/package-lock.json`` and a Chromium
+that is installed already: nothing here downloads a browser. WebGL draws with Chromium's own software renderer
+(SwiftShader) on every machine, so that what is verified does not depend on a graphics card.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+from exporter.runtimes.base import Runtime, RuntimeInfo
+from exporter.runtimes.javascript import (
+    INSTALL_NODE,
+    INSTALL_TFJS,
+    JS_SOURCE,
+    install_packages,
+    js_home,
+    node_executable,
+    package_version,
+)
+from signatures.errors import RuntimeUnavailableError
+
+CHROMIUM_VARIABLE = "EXPORT_MODEL_CHROMIUM"
+"""The environment variable that names Chromium's program; it goes before every other place."""
+
+INSTALL_CHROMIUM = "apt-get install chromium"
+"""Of Debian and Ubuntu; elsewhere Google Chrome will do."""
+
+_ON_PATH = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_USUAL_PLACES = {
+    "darwin": (
+        "/Applications/Chromium.app/Contents/MacOS/Chromium",
+        "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    ),
+    "win32": tuple(
+        f"{root}/{program}"
+        for root in (os.environ.get(v) for v in ("ProgramFiles", "ProgramFiles(x86)", "LocalAppData"))
+        if root
+        for program in ("Chromium/Application/chrome.exe", "Google/Chrome/Application/chrome.exe")
+    ),
+}
+
+_TFJS = "@tensorflow/tfjs"
+_TFJS_WASM = "@tensorflow/tfjs-backend-wasm"
+_ORT = "onnxruntime-web"
+_DRIVER = "playwright-core"
+
+
+def chromium_executable() -> str | None:
+    """Chromium's program: ``EXPORT_MODEL_CHROMIUM``, else on PATH, else where the system usually has it, else None.
+
+    A file that the variable names and that is not there gives None: another browser would not be what was asked for.
+    """
+    named = os.environ.get(CHROMIUM_VARIABLE)
+    if named:
+        return shutil.which(str(Path(named).expanduser()))
+    for name in _ON_PATH:
+        found = shutil.which(name)
+        if found is not None:
+            return found
+    return next((place for place in _USUAL_PLACES.get(sys.platform, ()) if Path(place).is_file()), None)
+
+
+def _find(name: str, packages: tuple[str, ...]) -> RuntimeInfo:
+    """The version is that of the npm package; Chromium's own would take a third of a second to ask for."""
+    home = js_home()
+    versions = [package_version(home, package) for package in (*packages, _DRIVER)]
+    steps = {
+        INSTALL_CHROMIUM: chromium_executable() is None,
+        INSTALL_NODE: node_executable() is None,
+        INSTALL_TFJS: None in versions,
+    }
+    missing = [step for step, needed in steps.items() if needed]
+    # With everything here, ``how`` is what a user of another machine has to do.
+    how = " && ".join(missing or [INSTALL_CHROMIUM, INSTALL_TFJS])
+    return RuntimeInfo(name, not missing, None if missing else versions[0], how)
+
+
+def _command(name: str) -> list[str]:
+    node, chromium = node_executable(), chromium_executable()
+    if node is None or chromium is None:
+        what = "Node" if node is None else "Chromium"
+        raise RuntimeUnavailableError(
+            f"{what} is not installed",
+            fix=INSTALL_NODE if node is None else f"{INSTALL_CHROMIUM}, or let {CHROMIUM_VARIABLE} name it",
+        )
+    script = str(JS_SOURCE / "browser.mjs")
+    return [node, script, "--runtime", name, "--modules", str(js_home()), "--chromium", chromium]
+
+
+def _runtime(name: str, kind: str, *packages: str) -> Runtime:
+    find, command = partial(_find, name, packages), partial(_command, name)
+    return Runtime(name, (kind,), find, command, install_packages, automatic=False)
+
+
+TFJS_WEBGL = _runtime("tfjs-webgl", "tfjs", _TFJS)
+TFJS_CPU_CHROMIUM = _runtime("tfjs-cpu@chromium", "tfjs", _TFJS)
+TFJS_WASM_CHROMIUM = _runtime("tfjs-wasm@chromium", "tfjs", _TFJS, _TFJS_WASM)
+ONNXRUNTIME_WEB_CHROMIUM = _runtime("onnxruntime-web@chromium", "onnx", _ORT)

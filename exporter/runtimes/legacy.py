@@ -1,0 +1,100 @@
+"""TensorFlow 1.4 and 1.7, the C libraries of 2017 and 2018 that Unity's TensorFlowSharp drove.
+
+Their wheels, which pip still serves, hold two shared objects with all of the C API; nothing else of the wheels is kept,
+and no Python of that age is needed. They lie in the user's cache folder, fetched by ``export-model runtimes install``.
+Linux on x86-64 with glibc only.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from exporter.runtimes.base import Progress, Runtime, RuntimeInfo
+from exporter.runtimes.cache import cache_folder
+from exporter.runtimes.python import child_command
+from signatures.errors import RuntimeUnavailableError
+
+API_LIBRARY = "_pywrap_tensorflow_internal.so"
+#: The API library finds the other one beside itself (RUNPATH $ORIGIN).
+LIBRARIES = ("libtensorflow_framework.so", API_LIBRARY)
+
+
+@dataclass(frozen=True)
+class Release:
+    """A version, and the sha256 of its wheel for CPython 3.6, manylinux1, x86-64."""
+
+    runtime: str
+    version: str
+    sha256: str
+    megabytes: int  # to download
+
+
+RELEASES = (
+    Release("tf1.4", "1.4.0", "972724621a25d136799959cd03ef77b0cca6e1799cd3448f05514bc519b735ad", 41),
+    Release("tf1.7", "1.7.1", "6f18752f79f0e037e0e4298d375dabb233394d5dcbf513b35cfb544e5d78b479", 48),
+)
+
+
+def unsupported_reason() -> str | None:
+    """Why these runtimes cannot run on this machine, or None."""
+    if (sys.platform, platform.machine()) == ("linux", "x86_64") and _has_glibc():
+        return None
+    return "TensorFlow 1.4 and 1.7 are there for Linux on x86-64 with glibc only"
+
+
+def _has_glibc() -> bool:
+    try:
+        return (os.confstr("CS_GNU_LIBC_VERSION") or "").startswith("glibc")
+    except (ValueError, OSError):  # musl knows no such name
+        return False
+
+
+def library_folder(release: Release) -> Path:
+    """Where the libraries of a version lie; it need not exist."""
+    return cache_folder() / f"tf-{release.version}"
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether the libraries are there."""
+    return all((folder / name).is_file() for name in LIBRARIES)
+
+
+def how(release: Release) -> str:
+    """The command that installs a version."""
+    return f"export-model runtimes install {release.runtime}"
+
+
+def _find(release: Release) -> RuntimeInfo:
+    reason = unsupported_reason()
+    if reason is not None:
+        return RuntimeInfo(release.runtime, False, None, reason)
+    here = is_whole(library_folder(release))
+    return RuntimeInfo(release.runtime, here, release.version if here else None, how(release))
+
+
+def _command(release: Release) -> list[str]:
+    folder = library_folder(release)
+    if not is_whole(folder):
+        raise RuntimeUnavailableError(f"the runtime {release.runtime} is not installed", fix=how(release))
+    return child_command("converters.runner.tensorflow1_child", release.runtime, str(folder / API_LIBRARY))
+
+
+def _install(release: Release, progress: Progress) -> Path:
+    from exporter.runtimes.legacy_install import install  # what fetches and unpacks is imported where that is done
+
+    return install(release, progress)
+
+
+def _runtime(release: Release) -> Runtime:
+    # A library of an old TensorFlow reads frozen graphs; SavedModels would need the wheel's Python code.
+    return Runtime(
+        release.runtime, ("bytes",), partial(_find, release), partial(_command, release), partial(_install, release)
+    )
+
+
+TF1_4, TF1_7 = (_runtime(release) for release in RELEASES)
