@@ -1,0 +1,83 @@
+"""What each format has of the graph's tensors is found under the graph's names, with the graph's axes and values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from converters.graph.run import run_graph
+from exporter.parity.bisect import plain
+from exporter.parity.compare import compare
+from exporter.parity.entrants import entrants
+from exporter.parity.inside import inside, outputs_read, saved_graph
+from exporter.parity.pool import RuntimePool
+from exporter.parity.subject import Subject
+from exporter.parity.tolerances import Tolerance
+from exporter.pipeline import verify_folder
+from exporter.runtimes import available_runtimes
+from signatures.sampling import draw_cases
+from tests.faults.conftest import Bundle
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("runtimes"), pytest.mark.usefixtures("runtimes")]
+
+#: What the formats may hide: products that were fused with their bias, numbers that became attributes.
+HIDDEN = {"MatMul", "BiasAdd", "Conv2D", "Const"}
+
+
+def subject_of(folder: object, monkeypatch: pytest.MonkeyPatch) -> Subject:
+    """What a verification of the bundle is about."""
+    caught: list[Subject] = []
+
+    class CaughtError(Exception):
+        pass
+
+    def catch(subject: Subject, *rest: object, **more: object) -> None:
+        caught.append(subject)
+        raise CaughtError
+
+    monkeypatch.setattr("exporter.pipeline.verify", catch)
+    with pytest.raises(CaughtError):
+        verify_folder(folder)  # type: ignore[arg-type]
+    return caught[0]
+
+
+@pytest.mark.parametrize("name", ["continuous", "discrete", "recurrent", "visual", "two"])
+def test_every_tensor_that_a_format_has_is_the_graphs(
+    name: str, bundle: Bundle, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = subject_of(bundle(name).folder, monkeypatch)
+    graph = plain(subject.graph)
+    case = draw_cases(subject.signature, seed=3, samples=1)[1]
+    read = outputs_read([n.name for n in graph.nodes], [r for n in graph.nodes for r in n.inputs])
+    tensors = [t for n in graph.nodes for t in read[n.name]]
+    expected = run_graph(graph, case.feeds, tensors)
+    installed = [
+        r.name for r in available_runtimes() if r.installed and "chromium" not in r.name and "webgl" not in r.name
+    ]
+    reference = pool.process("numpy").load(str(subject.reference))
+    tried = set()
+    for entrant in entrants(subject, installed, pool, reference, lambda *failure: pytest.fail(str(failure))):
+        assert entrant.path is not None
+        with inside(entrant, entrant.path, pool) as within:
+            upstream = graph.ancestors(list(entrant.outputs))
+            wanted = [t for t in tensors if graph.producer(t).name in upstream]
+            got = within.fetch(case.feeds, wanted)
+        missing = {graph.producer(t).op for t in wanted if t not in got}
+        assert missing <= (HIDDEN if entrant.format in ("tfjs", "onnx") else set()), (entrant.name, missing)
+        assert len(got) >= 0.6 * len(wanted)
+        for tensor, value in got.items():
+            exact = graph.producer(tensor).op == "Const"
+            wide = value.astype(expected[tensor].dtype)
+            found = compare(expected[tensor], wide, Tolerance(0, 0) if exact else Tolerance())
+            assert found.passed, (entrant.name, entrant.runtime, tensor, found)
+        tried.add(entrant.format)
+    assert tried >= {"reference", "bytes", "saved_model", "tfjs", "onnx"}
+
+
+def test_a_saved_model_has_the_same_graph_as_the_bytes(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    subject = subject_of(bundle("recurrent").folder, monkeypatch)
+    ours, other = plain(subject.graph), plain(saved_graph(subject.artefacts["saved_model"]))
+    assert [(n.name, n.op, n.inputs) for n in ours.nodes] == [(n.name, n.op, n.inputs) for n in other.nodes]
+    assert all(
+        np.array_equal(a.value, b.value) for a, b in zip(ours.nodes, other.nodes, strict=True) if a.op == "Const"
+    )
