@@ -6,12 +6,14 @@ STAMP := $(VENV)/.installed
 JS := converters/runner/js
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: install browser demo test lint types bench train clean help
+.PHONY: install browser demo test lint types docs figures bench train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
-	@echo "make demo      export a fixture to four formats and compare them in every runtime"
+	@echo "make demo      two trained policies in four formats, compared in every runtime, with a report to look at"
 	@echo "make test      lint, types and all tests (installs Chromium where apt-get can, for those in a browser)"
+	@echo "make docs      the documentation as a site in build/docs"
+	@echo "make figures   docs/figures.md anew, from ../shared (minutes)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
 	@echo "make train     the policies of fixtures/trained anew, in an environment of its own (minutes)"
 
@@ -19,7 +21,7 @@ install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev,docs]'
 	cd $(JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	@touch $(STAMP)
 
@@ -35,10 +37,14 @@ browser:
 	elif command -v sudo >/dev/null; then sudo sh -c '$(APT_CHROMIUM)'; \
 	else echo "no Chromium, and no right to install it: the tests in a browser will be skipped"; fi
 
+# The first is a folder that training left, the second has an LSTM memory, which every runtime is fed back.
+OUT := exported
 demo: install
-	$(BIN)/export-model fixtures/recurrent.bytes fixtures/continuous.bytes -o exported --verify auto
+	$(BIN)/export-model fixtures/trained/3DBall fixtures/recurrent.bytes -o $(OUT) --html $(OUT)/parity.html
 	@echo
-	@ls -l exported/continuous exported/continuous/saved_model exported/continuous/tfjs
+	@echo "To look at:"
+	@echo "  $(OUT)/parity.html                           the comparison, in any browser"
+	@echo "  $(BIN)/export-model serve $(OUT)/3DBall    a page on which the policy balances the ball"
 
 lint: install
 	$(BIN)/ruff check .
@@ -49,6 +55,13 @@ types: install
 
 test: install browser lint types
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90
+
+docs: install
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs
+	@echo "build/docs/index.html"
+
+figures: install
+	$(BIN)/python -m tests.figures
 
 bench: install
 	$(BIN)/python -m tests.bench
@@ -65,4 +78,4 @@ train: install .venv-train/.installed
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-train exported .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-train exported build .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -206,9 +206,10 @@ def verify_folder(
             fix="export the policy again with bytes among --to",
         )
     original = None if source is None else _original_of(source, content, step)
+    embedding = _checked_graph(folder, graph_file, content)
     signature, source_map = bundle.signature_of(content)
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
-    graph = _whole_graph(_checked_graph(folder, graph_file, content), names, artefacts)
+    graph = _whole_graph(embedding, names, artefacts)
     policy = Policy(
         name,
         graph,

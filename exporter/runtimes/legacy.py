@@ -60,8 +60,11 @@ def library_folder(release: Release) -> Path:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether the libraries are there."""
-    return all((folder / name).is_file() for name in LIBRARIES)
+    """Whether the libraries are there; in a cache that may not be read they are not."""
+    try:
+        return all((folder / name).is_file() for name in LIBRARIES)
+    except PermissionError:
+        return False
 
 
 def how(release: Release) -> str:

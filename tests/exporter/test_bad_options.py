@@ -163,7 +163,8 @@ def test_a_runtime_that_was_asked_for_and_is_missing_is_status_3(
     assert as_json.json["error"] == "RuntimeUnavailableError"
 
 
-def test_a_runtime_of_a_later_version_is_status_3(out: Path) -> None:
+def test_a_runtime_that_was_not_installed_is_status_3(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(out.parent / "empty"))
     is_refused(export_model(BALL, "-o", out, "--verify", "tf1.4"), "tf1.4", status=3)
 
 

@@ -54,7 +54,7 @@ def test_every_policy_has_a_folder_of_its_own(bundles: Path) -> None:
 def test_a_bundle_has_exactly_its_files(name: str, bundles: Path) -> None:
     assert files_in(bundles / name) == {
         *(f"{name}.bytes", f"{name}.onnx", "policy.json", "saved_model", "saved_model/saved_model.pb"),
-        *("tfjs", "tfjs/model.json", "tfjs/group1-shard1of1.bin"),
+        *("tfjs", "tfjs/model.json", "tfjs/group1-shard1of1.bin", "tfjs/policy.mjs", "tfjs/policy.d.mts"),
     }
 
 

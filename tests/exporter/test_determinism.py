@@ -38,7 +38,7 @@ def in_this_process(folder: Path, *flags: str) -> dict[str, str]:
 def test_the_bytes_do_not_depend_on_the_run(how: str, tmp_path: Path) -> None:
     first = in_this_process(tmp_path / "first", *FLAGS[how])
     assert in_this_process(tmp_path / "second", *FLAGS[how]) == first
-    assert len(first) == 7 * 6
+    assert len(first) == 7 * 8
 
 
 @pytest.mark.parametrize("seed", ["0", "4242"])

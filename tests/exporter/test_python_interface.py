@@ -31,8 +31,9 @@ from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
 BALL = fixture("continuous")
 
 
-def test_the_package_offers_three_functions_and_its_version() -> None:
-    assert set(exporter.__all__) == {"__version__", "export_model", "inspect_model", "verify_bundle"}
+def test_the_package_offers_its_functions_and_its_version() -> None:
+    functions = {"compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"}
+    assert set(exporter.__all__) == {"__version__", *functions}
     assert all(hasattr(exporter, name) for name in exporter.__all__)
 
 
