@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from exporter.command_group import SourceGroup, completion_command, show_version
 from exporter.console import Console, reporting
 from exporter.serve.command import serve_command
 from exporter.snippets.command import snippets_command
-from exporter.version import __version__
 from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
@@ -28,30 +28,25 @@ if TYPE_CHECKING:
 _TARGETS = "bytes,saved_model,tfjs,onnx"
 
 
-class _DefaultGroup(click.Group):
-    """``export-model FILE`` is ``export-model export FILE``: anything that is not a command is a source."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        first = next((a for a in args if not a.startswith("-")), None)
-        own = {"--help", "-h", "--version"}
-        if args and (first is None or args[0] not in self.commands) and args[0] not in own:
-            args = ["export", *args]
-        return super().parse_args(ctx, args)
-
-    def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        formatter.write_usage(ctx.command_path, "SOURCE... [-o DIR] [OPTIONS]")
-        formatter.write_usage(ctx.command_path, "COMMAND ...", prefix="       ")
-
-
 @click.group(
-    cls=_DefaultGroup,
+    cls=SourceGroup,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Export trained Unity ML-Agents policies to .bytes, SavedModel, TensorFlow.js and ONNX, and prove by running "
     "them that all agree. 'export-model SOURCE' exports; see the commands for the rest.",
 )
-@click.version_option(__version__, prog_name="export-model")
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=show_version,
+    help="Show the version, and the runtimes that are here.",
+)
 def app() -> None:
     """The group; its commands do the work."""
+
+
+app.add_command(completion_command)
 
 
 def _pairs(values: Sequence[str], flag: str) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 
@@ -35,7 +36,9 @@ def chosen_runtimes(wanted: str | Sequence[str], formats: Sequence[str]) -> tupl
     names = [n for n in known if n in INDEPENDENT or n == "numpy"] if wanted == "full" else _names(wanted)
     for name in names:
         if name not in known:
-            raise UsageError(f"there is no runtime {name!r}", fix=f"the runtimes are {', '.join(known)}")
+            close = difflib.get_close_matches(name, known, n=1)
+            meant = f"did you mean {close[0]}? " if close else ""
+            raise UsageError(f"there is no runtime {name!r}", fix=f"{meant}the runtimes are {', '.join(known)}")
         if not known[name].installed:
             raise RuntimeUnavailableError(f"the runtime {name} is not installed", fix=known[name].how)
     return tuple(dict.fromkeys(["numpy", *names])), list(known.values())

@@ -89,7 +89,7 @@ def test_no_argument_shows_the_usage_and_is_status_2() -> None:
 
 def test_the_version_is_the_packages() -> None:
     ran = export_model("--version")
-    assert (ran.status, ran.out.split()[-1], ran.err) == (0, exporter.__version__, "")
+    assert (ran.status, ran.out.splitlines()[0].split()[-1], ran.err) == (0, exporter.__version__, "")
 
 
 def test_the_module_is_the_command() -> None:
