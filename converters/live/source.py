@@ -1,0 +1,69 @@
+"""A live object to a model: its graph, frozen, and a copy in a folder from which TensorFlow runs the original."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from converters.live.functions import read_function, read_keras
+from converters.live.session import read_session
+from converters.recognise import FileKind
+from converters.source import SourceModel
+from signatures.digest import sha256_hex
+from signatures.errors import UsageError
+from signatures.graph import Graph
+
+_KINDS = {
+    "session": (FileKind("session", "a live session"), read_session),
+    "tf_function": (FileKind("tf_function", "a live tf.function"), read_function),
+    "keras_model": (FileKind("keras_model", "a live Keras model"), read_keras),
+}
+#: What a caller may give: the parameters' names.
+LIVE = tuple(_KINDS)
+
+
+@dataclass(frozen=True)
+class Live:
+    """What was read of a live object. ``sha256`` and ``size`` (bytes) are those of its frozen graph."""
+
+    kind: FileKind
+    model: SourceModel
+    sha256: str
+    size: int
+
+
+def label(kind: str) -> str:
+    """What stands where other sources have a path, for a kind in ``LIVE``."""
+    return _KINDS[kind][0].label.removeprefix("a ")
+
+
+def read_live(kind: str, given: object, folder: Path) -> Live:
+    """Read ``given``, which is of a kind in ``LIVE``; neither it nor its graph is changed.
+
+    ``folder`` is empty and stays until the export is verified: what TensorFlow needs to run the original is written
+    there. Raises UsageError for an object of another kind, SourceError and what a frozen graph raises.
+    """
+    found, read = _KINDS[kind]
+    tensorflow = sys.modules.get("tensorflow")
+    if tensorflow is None:
+        raise UsageError(
+            f"{kind} is {type(given).__name__}, and TensorFlow is not loaded",
+            why="a live object of TensorFlow comes from a process that has imported it",
+            fix="give a file or a folder as the source instead",
+        )
+    model = read(tensorflow, given, folder)
+    data = b"".join(_content(model.graph))
+    return Live(found, model, sha256_hex(data), len(data))
+
+
+def _content(graph: Graph) -> Iterator[bytes]:
+    """A graph as bytes, the same in every process: TensorFlow's own form numbers its functions by the process."""
+    for node in graph.nodes:
+        attrs: list[tuple[str, Any]] = [(key, str(node.attrs[key])) for key in sorted(node.attrs)]
+        yield repr((node.name, node.op, node.inputs, attrs)).encode()
+        if node.value is not None:
+            yield repr((node.value.dtype.str, node.value.shape)).encode()
+            yield node.value.tobytes()
