@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from exporter.reports.charts import diagram_parts
 from exporter.reports.layers import Block, blocks_of
@@ -45,7 +46,9 @@ def picture(policy: Policy) -> str:
             f"--svg: the policy {policy.name!r} is too large for a picture ({nodes} nodes)",
             fix="look at it in TensorBoard: --logdir DIR",
         )
-    parts, inner, height, described = diagram_parts([_sized(b, specs) if b.kind != "layer" else b for b in blocks])
+    parts, inner, height, described = diagram_parts(
+        [_sized(b, specs, signature.labels) if b.kind != "layer" else b for b in blocks]
+    )
     line = f"{signature.family}, {signature.action_space} actions"
     width = max(inner, _TITLE * len(policy.name), _LINE * len(line)) + 2 * _MARGIN
     height += _HEAD + _MARGIN
@@ -67,9 +70,11 @@ def picture(policy: Policy) -> str:
     return f"{drawing}\n"
 
 
-def _sized(block: Block, specs: Mapping[str, TensorSpec]) -> Block:
+def _sized(block: Block, specs: Mapping[str, TensorSpec], labels: Mapping[str, Any]) -> Block:
     """An input or output with its size beside its name, and its role and labels where the pointer rests on it."""
     spec = specs[block.title]
     size = "×".join("any" if n is None else str(n) for n in spec.shape[1:]) or "1"
     detail = f"{spec.name}: {spec.role.value.replace('_', ' ')}, {spec.dtype}, {size} per agent"
+    names = labels.get("observations", {}).get(spec.name, [])
+    detail += ": " + ", ".join(names) if names else ""
     return replace(block, title=f"{spec.name} · {size}", detail=detail)

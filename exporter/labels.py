@@ -1,0 +1,60 @@
+"""``--labels``: names for observations and actions, from a file into the contract."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from signatures.errors import UsageError
+from signatures.labels import checked
+from signatures.spec import Policy
+
+Labels = Path | str | Mapping[str, Any]
+_MOST_BYTES = 1 << 20
+
+
+def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
+    """What a file of labels holds (TOML where its name ends so, else JSON). Raises UsageError."""
+    if given is None or isinstance(given, Mapping):
+        return given
+    import tomllib
+
+    path = Path(given)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise UsageError(f"--labels {path}: the file is larger than 1 MiB", fix="give a file of names")
+        text = path.read_text(encoding="utf-8-sig")
+        content = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+    except OSError as error:
+        raise UsageError(f"--labels {path}: cannot be read", why=error.strerror, fix="check the path") from error
+    except (ValueError, RecursionError) as error:  # a JSON, TOML or UTF-8 error is a ValueError
+        raise UsageError(f"--labels {path}: is no JSON or TOML", why=str(error)[:200], fix="mend the file") from error
+    if not isinstance(content, dict):
+        raise UsageError(f"--labels {path}: is no table", fix="see docs/acting.md for its form")
+    return content
+
+
+def labelled(policies: Sequence[Policy], labels: Mapping[str, Any] | None) -> list[Policy]:
+    """The policies with ``labels`` in their contracts; without any, as they are.
+
+    Labels of several policies stand under ``policies``, by name; else they must fit every one. Raises UsageError.
+    """
+    if labels is None:
+        return list(policies)
+    if "policies" not in labels:
+        return [_with(policy, labels) for policy in policies]
+    named = labels["policies"]
+    if not isinstance(named, Mapping) or len(labels) > 1:
+        raise UsageError("labels: 'policies' stands alone and holds the labels by policy", fix="see docs/acting.md")
+    known = [p.name for p in policies]
+    for name in named:
+        if name not in known:
+            raise UsageError(f"labels: there is no policy {name!r}", fix=f"there are {', '.join(known)}")
+    return [_with(p, named[p.name]) if p.name in named else p for p in policies]
+
+
+def _with(policy: Policy, labels: Any) -> Policy:
+    return replace(policy, signature=replace(policy.signature, labels=checked(labels, policy.signature)))

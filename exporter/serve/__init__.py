@@ -1,0 +1,1 @@
+"""``export-model serve``: a page on which a bundle's policy acts in the visitor's browser."""

@@ -1,0 +1,107 @@
+"""The inputs that the page tries in the visitor's browser, and what is right: the numpy kernels' answers.
+
+``golden.json`` says what lies where in ``golden.bin`` (little-endian, C order, each tensor on a multiple of 4):
+
+- ``cases``: name, ``rows``, ``inputs`` and ``outputs`` (name, dtype, shape, offset in bytes). A case that ``continues``
+  takes its memory from the answer to the one before, not from the file.
+- ``tolerance``: per output, |a − b| ≤ atol + rtol·|b|. Integers must be equal, but for the indices in ``ties``.
+
+Left out are outputs that a sampler inside the graph decides, and inputs so large that float32's own rounding shows
+(those are verified with an account of that rounding, which a page has not).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from exporter.parity.compare import floored, ties
+from exporter.parity.tolerances import Tolerance, tolerance_for
+from exporter.parity.verify import random_outputs
+from signatures.graph import Graph
+from signatures.roles import Role
+from signatures.sampling import Case, draw_cases, draw_rollout
+from signatures.spec import PolicySignature
+
+SEED = 0
+_STEPS = 4
+_TOO_LARGE = ("beyond the clip", "1e3")
+#: Inputs with images are large; those that do not fit are left out, but never the first three (batches of 1, 2 and 7).
+_MOST_BYTES = 4_000_000
+_STORED = {"int64": "int32", "bool": "uint8"}
+
+
+def golden(signature: PolicySignature, file: Path) -> tuple[dict[str, Any], bytes]:
+    """golden.json and golden.bin for the policy whose ``.bytes`` is ``file``."""
+    from converters.frozen_graph.reader import read_graph
+    from converters.graph.compile import CONTRACT_NODE
+    from converters.graph.passes.normalise import normalise
+    from converters.graph.run import run_graph
+
+    graph = read_graph(file.read_bytes())
+    graph = normalise(Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)))
+    drawn = random_outputs(graph, [s.name for s in signature.outputs])
+    names = [s.name for s in signature.outputs if s.name not in drawn]
+    book = _Book(signature)
+    kept = [c for c in draw_cases(signature, seed=SEED, samples=1) if c.name not in _TOO_LARGE]
+    for number, case in enumerate(kept):
+        if number >= 3 and book.size + sum(a.nbytes for a in case.feeds.values()) > _MOST_BYTES:
+            continue
+        book.add(case, run_graph(graph, case.feeds, names))
+    memory = signature.memory
+    if memory is not None and memory.input is not None and memory.output is not None:
+        last: Mapping[str, np.ndarray] | None = None
+        for step, feeds in enumerate(draw_rollout(signature, seed=SEED, steps=_STEPS), 1):
+            given = feeds if last is None else {**feeds, memory.input: last[memory.output]}
+            answers = run_graph(graph, given, names)
+            book.add(Case(f"memory fed back, step {step}", given, 2), answers, continues=last is not None)
+            last = answers
+    tolerance = {n: tolerance_for(signature, n, Tolerance()) for n in names}
+    said = {n: {"atol": t.atol, "rtol": t.rtol, "reason": t.reason} for n, t in tolerance.items()}
+    left_out = [s.name for s in signature.outputs if s.name in drawn]
+    return {"seed": SEED, "cases": book.cases, "tolerance": said, "left_out": left_out}, bytes(book.data)
+
+
+class _Book:
+    def __init__(self, signature: PolicySignature) -> None:
+        self.signature = signature
+        self.cases: list[dict[str, Any]] = []
+        self.data = bytearray()
+
+    @property
+    def size(self) -> int:
+        return len(self.data)
+
+    def add(self, case: Case, answers: Mapping[str, np.ndarray], *, continues: bool = False) -> None:
+        scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
+        outputs = []
+        for spec in self.signature.outputs:
+            if spec.name not in answers:
+                continue
+            value = answers[spec.name]
+            branches = self.signature.branches
+            if spec.role is Role.LOG_PROBS and value.ndim and value.dtype.kind == "f":
+                value = floored(value, branches)
+            entry = self._tensor(spec.name, value)
+            if spec.role is Role.LOG_PROBS:
+                entry["floored"] = list(branches) if sum(branches) == value.shape[-1] else [value.shape[-1]]
+            if spec.role is Role.DETERMINISTIC and value.dtype.kind != "f" and branches and scores in answers:
+                open_ = ties(answers[scores], branches, Tolerance())
+                if open_.shape == value.shape and open_.any():
+                    entry["ties"] = [int(i) for i in np.flatnonzero(open_)]
+            outputs.append(entry)
+        inputs = [self._tensor(s.name, case.feeds[s.name]) for s in self.signature.inputs]
+        self.cases.append(
+            {"name": case.name, "rows": case.batch, "continues": continues, "inputs": inputs, "outputs": outputs}
+        )
+
+    def _tensor(self, name: str, value: np.ndarray) -> dict[str, Any]:
+        dtype = value.dtype.name
+        stored = value.astype(_STORED.get(dtype, dtype)).astype("<" + np.dtype(_STORED.get(dtype, dtype)).str[1:])
+        offset = len(self.data)
+        self.data += stored.tobytes()
+        self.data += bytes(-len(self.data) % 4)
+        return {"name": name, "dtype": dtype, "shape": list(value.shape), "offset": offset}

@@ -1,0 +1,76 @@
+/** Numbers as bars and as a strip of colours. The bars are tables, so that a screen reader reads names and values. */
+
+import { h, text } from "./dom.mjs";
+
+/** Rows of a name, a bar and a value. `from` is where bars start: "zero" in the middle, or "left" for 0 to 1. */
+export class Bars {
+  #rows = [];
+  #from;
+  #most;
+  #body = h("tbody");
+
+  constructor(caption, names, { from = "zero", most = 1, hideCaption = false } = {}) {
+    this.#from = from;
+    this.#most = most;
+    this.element = h(
+      "table",
+      { class: `bars ${from}` },
+      h("caption", { class: hideCaption ? "hidden" : "" }, caption),
+      this.#body,
+    );
+    this.rename(names);
+  }
+
+  rename(names) {
+    this.#rows = names.map((name) => {
+      const [fill, value] = [h("span", { class: "fill" }), h("td", { class: "value" })];
+      const track = h("td", { class: "track", "aria-hidden": "true" }, h("span", {}, fill));
+      const row = h("tr", {}, h("th", { scope: "row" }, name), track, value);
+      return { row, fill, value };
+    });
+    this.#body.replaceChildren(...this.#rows.map(({ row }) => row));
+  }
+
+  /** @param {number} chosen the row to mark, if any */
+  show(values, { chosen = -1, write = text } = {}) {
+    for (const v of values) if (Number.isFinite(v)) this.#most = Math.max(this.#most, Math.abs(v));
+    this.#rows.forEach(({ row, fill, value }, i) => {
+      const share = Number.isFinite(values[i]) ? Math.min(Math.abs(values[i]) / this.#most, 1) : 0;
+      const width = this.#from === "zero" ? share / 2 : share;
+      const left = this.#from === "zero" ? (values[i] < 0 ? 0.5 - width : 0.5) : 0;
+      fill.style.insetInlineStart = `${100 * left}%`;
+      fill.style.inlineSize = `${100 * width}%`;
+      const said = `${write(values[i])}${i === chosen ? " ✓" : ""}`;
+      if (value.textContent !== said) value.textContent = said;
+      row.classList.toggle("chosen", i === chosen);
+    });
+  }
+}
+
+export const percent = (share) => `${(100 * share).toFixed(share > 0.0995 || share === 0 ? 0 : 1)} %`;
+
+/** Numbers as cells from blue over paper to orange; ±`most` are the full colours. */
+export class Strip {
+  constructor(label) {
+    this.element = h("canvas", { class: "strip", role: "img", "aria-label": label, height: 1, width: 1 });
+    this.label = label;
+  }
+
+  show(values) {
+    const count = values.length;
+    const columns = count > 64 ? Math.ceil(count / Math.ceil(count / 64)) : count;
+    const canvas = this.element;
+    [canvas.width, canvas.height] = [Math.max(columns, 1), Math.max(Math.ceil(count / columns), 1)];
+    canvas.style.aspectRatio = `${canvas.width} / ${canvas.height * (count > 64 ? 1 : 2)}`;
+    const context = canvas.getContext("2d");
+    const most = values.reduce((a, v) => Math.max(a, Math.abs(v)), 1e-9);
+    const [low, high] = ["--cold", "--warm"].map((name) => getComputedStyle(canvas).getPropertyValue(name).trim());
+    values.forEach((value, i) => {
+      context.globalAlpha = Math.min(Math.abs(value) / most, 1);
+      context.fillStyle = value < 0 ? low : high;
+      context.fillRect(i % columns, Math.floor(i / columns), 1, 1);
+    });
+    const zero = values.every((v) => v === 0);
+    canvas.setAttribute("aria-label", `${this.label}: ${count} numbers, ${zero ? "all 0" : `the largest ±${text(most)}`}`);
+  }
+}

@@ -1,0 +1,139 @@
+/** The section that says whether the policy acts the same in this browser, and how fast. */
+
+import { $, h, milliseconds, text } from "./dom.mjs";
+import { check, fetchGolden, visitor } from "./golden.mjs";
+
+const RULE = "|a − b| ≤ 1e-5 + 1e-5·|b|";
+
+export class Verdict {
+  #golden;
+  #rows = h("tbody");
+  #outputs = h("tbody");
+  #results = [];
+  #button = h("button", { type: "button", disabled: true, onclick: () => this.run() }, "Check again");
+
+  constructor(host, backends, absent) {
+    this.host = host;
+    this.backends = backends.map(({ name }) => name);
+    const head = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name))));
+    const table = (caption, columns, body, extra = "") => {
+      return h(
+        "div",
+        { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
+        h("table", { class: `facts ${extra}` }, h("caption", {}, caption), head(...columns), body),
+      );
+    };
+    $("check-body").append(
+      h("p", { class: "soft" }, `Measured in ${visitor()}.`),
+      table(
+        "By backend",
+        ["Backend", "Verdict", "Worst |Δ|", "Median", "95 % below", "Computes on"],
+        this.#rows,
+      ),
+      h("div", { class: "actions" }, this.#button),
+      h(
+        "details",
+        {},
+        h("summary", {}, "Output by output"),
+        table("Worst difference of each output", ["Output", "Backend", "Worst |Δ|", "Allowed", "At the input"], this.#outputs),
+      ),
+      h("p", { class: "soft", id: "check-how" }),
+      ...absent.map(({ name, why }) => h("p", { class: "soft" }, `${name} is left out: ${why}.`)),
+    );
+  }
+
+  /** Checks the backends in this order; `after` is called when the first is done. */
+  async run(after = () => {}) {
+    this.#button.disabled = true;
+    this.#results = [];
+    this.#rows.replaceChildren();
+    this.#outputs.replaceChildren();
+    const first = this.host.backend ?? this.backends[0];
+    const order = [first, ...this.backends.filter((name) => name !== first)];
+    try {
+      this.#golden ??= await fetchGolden();
+      this.#golden.memory = this.host.policy()?.contract.memory ?? null;
+      this.#explain();
+      for (const backend of order) {
+        this.#say(`Checking ${backend} …`);
+        this.#add(await check(this.host, backend, this.#golden));
+        if (backend === first) after();
+        await new Promise((resolve) => setTimeout(resolve, 50)); // let the page breathe
+      }
+      this.#conclude();
+    } catch (error) {
+      this.#say(`Not checked: ${error.message}.`, "fail");
+    } finally {
+      this.#button.disabled = false;
+    }
+  }
+
+  #say(words, kind = "") {
+    $("verdict").className = `lead ${kind}`;
+    $("verdict").textContent = words;
+  }
+
+  #explain() {
+    const { cases, left_out: left } = this.#golden;
+    const rows = cases.reduce((sum, { rows }) => sum + rows, 0);
+    const drawn = left.length ? ` Drawn by chance inside the model, and so not compared: ${left.join(", ")}.` : "";
+    $("check-how").textContent =
+      `${cases.length} sets of inputs, ${rows} decisions, drawn from what the policy knows of its inputs. Every number must ` +
+      `agree with export-model's own reference by ${RULE}, every choice exactly. Times are of one decision for one agent: ` +
+      `inputs given, model run, answer read back.${drawn}`;
+  }
+
+  #add(result) {
+    this.#results.push(result);
+    const { backend, passed, error, median, slow, device } = result;
+    const state = error === undefined ? (passed ? "agrees" : "differs") : "did not run";
+    const mark = { agrees: "ok", differs: "fail", "did not run": "warn" }[state];
+    const cells =
+      error === undefined
+        ? [text(Math.max(...result.outputs.map((output) => output.worst))), milliseconds(median), milliseconds(slow), device]
+        : null;
+    this.#rows.append(
+      h(
+        "tr",
+        { "data-backend": backend, "data-state": state },
+        h("th", { scope: "row" }, backend),
+        h("td", { class: mark }, `${{ ok: "✓", fail: "✗", warn: "–" }[mark]} ${state}`),
+        cells === null ? h("td", { colspan: 4, class: "wide" }, error) : cells.map((cell, i) => h("td", { class: i < 3 ? "number" : "wide" }, cell)),
+      ),
+    );
+    for (const output of result.outputs ?? []) {
+      const { atol, rtol, reason } = this.#golden.tolerance[output.name];
+      const allowed = output.name in this.#golden.tolerance ? `${atol} + ${rtol}·|b|${reason && ` (${reason})`}` : "";
+      this.#outputs.append(
+        h(
+          "tr",
+          {},
+          h("th", { scope: "row" }, output.name),
+          h("td", {}, backend),
+          h("td", { class: output.passed ? "number" : "number fail" }, text(output.worst)),
+          h("td", { class: "wide" }, allowed),
+          h("td", { class: "wide" }, output.case ?? ""),
+        ),
+      );
+    }
+  }
+
+  #conclude() {
+    const ran = this.#results.filter(({ error }) => error === undefined);
+    const wrong = ran.filter(({ passed }) => !passed);
+    const idle = this.#results.length - ran.length;
+    const note = idle === 0 ? "" : ` ${idle} of ${this.#results.length} did not run, the table says why.`;
+    if (ran.length === 0) return this.#say(`Not checked: no backend ran here.${note}`, "fail");
+    if (wrong.length > 0) {
+      const said = wrong.map(({ backend, worst }) => `${backend} is off by ${text(worst.worst)} at ${worst.name}`);
+      return this.#say(`No: ${said.join(", ")}.${note}`, "fail");
+    }
+    const worst = Math.max(...ran.flatMap(({ outputs }) => outputs.map((output) => output.worst)));
+    const names = ran.map(({ backend }) => backend).join(", ");
+    const numbers = ran[0].numbers.toLocaleString("en");
+    return this.#say(
+      `Yes. In your browser ${names} give the reference's ${numbers} numbers; the worst difference is ${text(worst)}.${note}`,
+      "ok",
+    );
+  }
+}

@@ -1,0 +1,192 @@
+"""The page's files, put together in memory: its own, TensorFlow.js, the model, and the inputs to check it with."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from exporter import bundle
+from exporter.runtimes.javascript import INSTALL_TFJS, js_home, package_version
+from exporter.serve.golden import golden
+from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
+from exporter.serve.server import TYPES
+from exporter.version import __version__
+from signatures.errors import BundleError, RuntimeUnavailableError
+from signatures.spec import PolicySignature
+
+PAGE = Path(__file__).resolve().parent / "page"
+POLICY_MODULE = Path(__file__).resolve().parents[2] / "converters" / "tfjs" / "js" / "policy.mjs"
+#: The file by which a folder is known as ours.
+SITE = "site.json"
+MADE_BY = "export-model serve"
+
+_TFJS = "@tensorflow/tfjs"
+
+
+@dataclass(frozen=True)
+class _Backend:
+    """A backend of TensorFlow.js; ``files`` of a ``package`` besides tf.es2017.min.js, the first one a script."""
+
+    name: str
+    package: str
+    files: tuple[str, ...] = ()
+
+
+_BACKENDS = (
+    _Backend("cpu", _TFJS),
+    _Backend(
+        "wasm",
+        "@tensorflow/tfjs-backend-wasm",
+        (
+            "tf-backend-wasm.es2017.min.js",
+            "tfjs-backend-wasm.wasm",
+            "tfjs-backend-wasm-simd.wasm",
+            "tfjs-backend-wasm-threaded-simd.wasm",
+        ),
+    ),
+    _Backend("webgl", _TFJS),
+    _Backend("webgpu", "@tensorflow/tfjs-backend-webgpu", ("tf-backend-webgpu.es2017.min.js",)),
+)
+_REQUIRED = (_TFJS, "@tensorflow/tfjs-backend-wasm")
+
+
+def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
+    """The site of a bundle, by path; the same bytes for the same bundle.
+
+    Raises BundleError (its files are not those of policy.json, it holds no TensorFlow.js or no .bytes), UsageError (the
+    scene does not fit), RuntimeUnavailableError (the npm packages are not installed).
+    """
+    content, signature = _checked(folder)
+    found = scene_of(content["name"], signature, scene)
+    opponent = None if found is None or found.side is None else _opponent(folder, content["name"], found)
+    site = {path.relative_to(PAGE).as_posix(): path.read_bytes() for path in sorted(PAGE.rglob("*")) if _ours(path)}
+    site["policy.mjs"] = POLICY_MODULE.read_bytes()
+    vendor, backends, absent = _vendor()
+    site.update(vendor)
+    site.update(_model(folder, content, "model"))
+    if opponent is not None:
+        site.update(_model(*opponent, "opponent"))
+    said, data = golden(signature, folder / f"{content['name']}.bytes")
+    site["golden.json"], site["golden.bin"] = f"{bundle.compact(said)}\n".encode(), data
+    site["policy.json"] = bundle.dumps(content)
+    site[SITE] = bundle.dumps(
+        {
+            "made_by": MADE_BY,
+            "version": __version__,
+            "name": content["name"],
+            "scene": None if found is None else found.id,
+            "side": None if found is None else found.side,
+            "opponent": None if opponent is None else opponent[1]["name"],
+            "tfjs": package_version(js_home(), _TFJS),
+            "backends": backends,
+            "absent": absent,
+            "model_bytes": sum(len(v) for k, v in site.items() if k.startswith("model/")),
+        }
+    )
+    return site
+
+
+def write_site(site: Mapping[str, bytes], place: Path) -> None:
+    """Write a site, in place of an older one of ours. Raises BundleError where something else is in the way."""
+    with bundle.writing(place, "cannot be written"):
+        if place.is_symlink() or (place.exists() and not _replaceable(place)):
+            raise BundleError(
+                "is in the way and is not a page of ours",
+                where=str(place),
+                why=f"it has no {SITE} that says so",
+                fix="move it, or choose another folder with --out",
+            )
+        place.parent.mkdir(parents=True, exist_ok=True)
+        stage = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+        try:
+            for name, data in site.items():
+                target = stage / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(data)
+            stage.chmod(0o755)
+            bundle.put_in_place(stage, place)
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+
+
+def _replaceable(place: Path) -> bool:
+    if not place.is_dir():
+        return False
+    if not any(place.iterdir()):
+        return True
+    try:
+        content = json.loads((place / SITE).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.get("made_by") == MADE_BY
+
+
+def _ours(path: Path) -> bool:
+    return path.is_file() and path.suffix in TYPES
+
+
+def _checked(folder: Path) -> tuple[dict[str, Any], PolicySignature]:
+    content = bundle.read_policy_json(folder)
+    bundle.check_hashes(folder, content)
+    for file, why in (
+        ("tfjs/model.json", "the page runs TensorFlow.js"),
+        (f"{content['name']}.bytes", "what the page's answers are held against is computed from it"),
+    ):
+        if file not in content["files"]:
+            raise BundleError(f"has no {file}", where=str(folder), why=why, fix="export it again with --to bytes,tfjs")
+    signature, _ = bundle.signature_of(content)
+    return content, signature
+
+
+def _model(folder: Path, content: Mapping[str, Any], place: str) -> dict[str, bytes]:
+    names = sorted(name for name in content["files"] if name.startswith("tfjs/"))
+    return {f"{place}/{name.removeprefix('tfjs/')}": (folder / name).read_bytes() for name in names}
+
+
+def _opponent(folder: Path, name: str, scene: Scene) -> tuple[Path, dict[str, Any]] | None:
+    """The other player's bundle, where it lies beside this one; the page says so where it does not."""
+    for other in other_side(name):
+        beside = folder.resolve().parent / other
+        if (beside / bundle.POLICY).is_file():
+            content, signature = _checked(beside)
+            found = scene_of(other, signature)
+            if found is not None and found.id == scene.id and found.side != scene.side:
+                return beside, content
+    return None
+
+
+def _vendor() -> tuple[dict[str, bytes], list[dict[str, Any]], list[dict[str, str]]]:
+    """TensorFlow.js' files, its backends, and those that are not in the packages."""
+    home = js_home()
+    missing = [name for name in _REQUIRED if package_version(home, name) is None]
+    if missing:
+        raise RuntimeUnavailableError(f"the npm package {missing[0]} is not installed", fix=INSTALL_TFJS)
+    files, backends, absent = {"vendor/tf.es2017.min.js": _dist(home, _TFJS, "tf.es2017.min.js")}, [], []
+    for backend in _BACKENDS:
+        if package_version(home, backend.package) is None:
+            absent.append({"name": backend.name, "why": f"{backend.package} is not among the npm packages"})
+            continue
+        files.update({f"vendor/{file}": _dist(home, backend.package, file) for file in backend.files})
+        script = f"vendor/{backend.files[0]}" if backend.files else None
+        backends.append({"name": backend.name, "script": script})
+    return files, backends, absent
+
+
+def _dist(home: Path, package: str, file: str) -> bytes:
+    try:
+        return _without_map((home / "node_modules" / package / "dist" / file).read_bytes())
+    except OSError as error:
+        raise RuntimeUnavailableError(
+            f"{file} of {package} cannot be read", where=str(home), why=error.strerror, fix=INSTALL_TFJS
+        ) from error
+
+
+def _without_map(script: bytes) -> bytes:
+    """Without the line that names a source map, which is not there: a browser's tools would ask for it."""
+    head, _, last = script.rstrip().rpartition(b"\n")
+    return head + b"\n" if last.startswith(b"//# sourceMappingURL=") else script

@@ -1,0 +1,1 @@
+"""Code to copy: how a bundle's policy is called in each runtime, made from the bundle's own contract."""

@@ -1,0 +1,35 @@
+"""The command ``snippets``. Imports click only; the rest when it runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command("snippets")
+@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE")
+@click.option(
+    "--for", "target", metavar="NAME", help="Only this one (or all that begin so: serving), ready to be piped."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
+    """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""
+    from exporter.snippets.contract import read_bundle
+    from exporter.snippets.registry import snippets
+
+    found = read_bundle(bundle)
+    made, lacking = snippets(found, target)
+    if as_json:
+        content = {"policy": found.name, "snippets": [s.to_dict() for s in made], "left_out": lacking}
+        click.echo(json.dumps(content, indent=1))
+        return
+    if len(made) == 1 and target is not None:
+        click.echo(made[0].code, nl=False)
+        return
+    for snippet in made:
+        click.echo(f"==== {snippet.target.title} (--for {snippet.target.name}) ====\n")
+        click.echo(snippet.code)
+    for name, needed in lacking.items():
+        click.echo(f"left out: {name} needs {needed}, which this bundle has not")

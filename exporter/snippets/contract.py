@@ -1,0 +1,167 @@
+"""What the snippets say of a policy: its inputs with what to feed and their labels, its actions, its files."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from exporter.bundle import read_policy_json, signature_of
+from signatures.roles import Role
+from signatures.spec import PolicySignature, TensorSpec
+
+_FEED = {
+    Role.VECTOR: "vector observation",
+    Role.ENTITIES: "variable-length observation",
+    Role.NOISE: "N(0, 1) draws; zeros: the action without chance",
+    Role.MASKS: "1 allows an action, 0 forbids it; branches side by side",
+    Role.PREV_ACTION: "the actions of the step before",
+    Role.MEMORY_IN: "the memory of the step before; zeros at the start of an episode",
+    Role.PARAMETER: "the source's own placeholder: give it its value",
+}
+#: How many steps a snippet plays where the policy remembers.
+STEPS = 3
+#: Comments are folded at about this many characters.
+WIDTH = 100
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle as the snippets need it; ``folder`` is written into the code as it was given."""
+
+    folder: Path
+    name: str
+    signature: PolicySignature
+    files: frozenset[str]
+    source: Mapping[str, Any]
+
+    def path(self, relative: str) -> str:
+        """A file of the bundle, with slashes."""
+        return (self.folder / relative).as_posix()
+
+    def mount(self, relative: str) -> str:
+        """A file of the bundle for a shell that wants it absolute."""
+        path = self.path(relative)
+        if self.folder.is_absolute():
+            return shlex.quote(path)
+        return f'"$(pwd)"/{shlex.quote(path)}'
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a step needs something of the step before."""
+        return any(s.role in (Role.MEMORY_IN, Role.PREV_ACTION) for s in self.signature.inputs)
+
+    @property
+    def memory(self) -> tuple[TensorSpec, str] | None:
+        """(the input, the output that is fed back into it), None where there is no such pair."""
+        memory = self.signature.memory
+        if memory is None or memory.input is None or memory.output is None:
+            return None
+        return self.signature.input(memory.input), memory.output
+
+    @property
+    def previous(self) -> TensorSpec | None:
+        """The input that takes the actions of the step before."""
+        return next((s for s in self.signature.inputs if s.role is Role.PREV_ACTION), None)
+
+    @property
+    def heads(self) -> tuple[TensorSpec, ...]:
+        """The outputs that are the actions: one, or two of a hybrid."""
+        return self.signature.outputs[: 2 if self.signature.action_space == "hybrid" else 1]
+
+    def plain(self, head: TensorSpec) -> TensorSpec:
+        """The output with ``head``'s action without chance; the head itself where there is none."""
+        others = self.signature.outputs[len(self.heads) :]
+        found = [s for s in others if s.role is Role.DETERMINISTIC]
+        pairs = dict(zip((h.name for h in self.heads), found, strict=False))
+        return pairs.get(head.name, head)
+
+
+def read_bundle(folder: Path) -> Bundle:
+    """A bundle by its policy.json. Raises BundleError."""
+    content = read_policy_json(folder)
+    signature, _ = signature_of(content)
+    return Bundle(folder, content["name"], signature, frozenset(content["files"]), content["source"])
+
+
+def is_continuous(head: TensorSpec) -> bool:
+    """Whether an action is of numbers, not of choices."""
+    return head.role is Role.CONTINUOUS or (head.role is Role.DETERMINISTIC and head.dtype == "float32")
+
+
+def example_shape(spec: TensorSpec) -> tuple[int, ...]:
+    """The shape for one agent; 1 for every other free axis, too."""
+    return tuple(1 if n is None else n for n in spec.shape)
+
+
+def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
+    """Comment lines on an input: what it takes, and what its numbers are called."""
+    signature = bundle.signature
+    text = _FEED.get(spec.role, spec.role.value)
+    if spec.role is Role.VISUAL:
+        how = signature.preprocess.get(spec.name, {})
+        colours = f"{' to '.join(map(str, how.get('range', [0, 1])))}"
+        text = f"camera image, {how.get('layout', 'NHWC')}, colours {colours}, first row at the top"
+    known = spec.distribution or {}
+    if spec.role is Role.VECTOR and known.get("kind") == "integer":
+        text = f"discrete state, an integer from {known['low']} to {known['high']}"
+    names = signature.labels.get("observations", {}).get(spec.name, [])
+    return folded(f"{spec.name}: {text}", numbered(names))
+
+
+def action_meaning(bundle: Bundle, head: TensorSpec) -> list[str]:
+    """Comment lines on an action."""
+    if is_continuous(head):
+        return folded(f"{head.shape[-1]} continuous actions", numbered(bundle.signature.labels.get("actions", [])))
+    return branch_lines(bundle)
+
+
+def branch_lines(bundle: Bundle) -> list[str]:
+    """A comment line per branch of discrete actions."""
+    labels = bundle.signature.labels.get("branches", [])
+    lines: list[str] = []
+    for i, size in enumerate(bundle.signature.branches):
+        names = numbered(labels[i]) if i < len(labels) else []
+        lines += folded(f"branch {i}: {size} actions", names)
+    return lines
+
+
+def numbered(names: list[str]) -> list[str]:
+    """``["0 left", "1 right"]``."""
+    return [f"{i} {name}" for i, name in enumerate(names)]
+
+
+def folded(head: str, items: list[str]) -> list[str]:
+    """``head: item, item`` on lines of at most ``WIDTH`` characters (longer where one item is)."""
+    if not items:
+        return [head]
+    lines, line = [], f"{head}:"
+    for i, item in enumerate(items):
+        text = item + ("," if i < len(items) - 1 else "")
+        if len(line) + len(text) > WIDTH:
+            lines.append(line)
+            line = "  " + text
+        else:
+            line += f" {text}"
+    return [*lines, line]
+
+
+def quoted(text: str) -> str:
+    """A string literal of Python, JavaScript, C# and JSON alike, also inside of a page."""
+    return json.dumps(text).replace("</", "<\\/")
+
+
+def identifier(name: str) -> str:
+    """A name for a variable."""
+    word = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return word if word[:1].isalpha() else f"input_{word}"
+
+
+def class_name(name: str) -> str:
+    """A name for a class."""
+    words = "".join(w[:1].upper() + w[1:] for w in re.findall("[A-Za-z0-9]+", name)) or "Exported"
+    return f"{words}Policy" if words[0].isalpha() else f"Policy{words}"

@@ -1,0 +1,205 @@
+"""Snippets in C#: TensorFlowSharp with the ``.bytes``, Unity Inference Engine (Sentis) with the ``.onnx``."""
+
+from __future__ import annotations
+
+from string import Template
+
+from exporter.snippets.contract import (
+    STEPS,
+    Bundle,
+    action_meaning,
+    class_name,
+    example_shape,
+    identifier,
+    is_continuous,
+    meaning,
+    quoted,
+)
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+_TENSORFLOWSHARP = Template("""\
+// NuGet package TensorFlowSharp; in Unity the plugin of ML-Agents 0.1 to 0.6, with ENABLE_TENSORFLOW defined
+using System;
+using System.IO;
+using TensorFlow;
+
+public static class $type
+{
+    public static void Main()
+    {
+        var graph = new TFGraph();
+        graph.Import(File.ReadAllBytes($path));  // in Unity: the bytes of a TextAsset
+        using (var session = new TFSession(graph))
+        {
+$play
+        }
+    }
+}
+""")
+
+_INFERENCE_ENGINE = Template("""\
+// Unity Inference Engine 2.2 and newer (com.unity.ai.inference); Sentis 2.1: using Unity.Sentis;
+using Unity.InferenceEngine;
+using UnityEngine;
+
+public class $type : MonoBehaviour
+{
+    public ModelAsset modelAsset;  // $file, dragged into Assets
+
+    Worker worker;
+$fields
+    void Start()
+    {
+        worker = new Worker(ModelLoader.Load(modelAsset), BackendType.CPU);
+    }
+
+$methods
+    void OnDestroy()
+    {
+        worker?.Dispose();
+    }
+}
+""")
+
+_TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool"}
+
+
+# ------------------------------------------------------------------ TensorFlowSharp
+
+
+def tensorflowsharp(bundle: Bundle) -> str:
+    """TFGraph and TFSession."""
+    before, lines = [], ["var runner = session.GetRunner();"]
+    memory, previous = bundle.memory, bundle.previous
+    if memory is not None:
+        before.append(f"var memory = {_array(memory[0])};  // the start of an episode; a row per agent")
+    if previous is not None:
+        before.append(f"var previous = {_array(previous)};  // no action yet")
+    for spec in bundle.signature.inputs:
+        value = (
+            "memory" if memory is not None and spec == memory[0] else "previous" if spec == previous else _array(spec)
+        )
+        lines += [f"// {line}" for line in meaning(bundle, spec)]
+        lines.append(f"runner.AddInput(graph[{quoted(spec.name)}][0], {value});")
+    fetched = _fetched(bundle)
+    outputs = [*fetched.values()] if memory is None else [*fetched.values(), bundle.signature.output(memory[1])]
+    lines += [f"runner.Fetch(graph[{quoted(spec.name)}][0]);" for spec in outputs]
+    lines.append("TFTensor[] output = runner.Run();")
+    for i, (name, spec) in enumerate(fetched.items()):
+        lines += [f"// {line}" for line in action_meaning(bundle, bundle.heads[i])]
+        chance = bundle.heads[i].name
+        hint = "" if chance == spec.name else f"  // without chance; with it: {chance}"
+        lines.append(f"var {name} = ({_kind(spec)})output[{i}].GetValue();{hint}")
+    if memory is not None:
+        lines.append(f"memory = ({_kind(bundle.signature.output(memory[1]))})output[{len(fetched)}].GetValue();")
+    if previous is not None:
+        taken = "discrete" if "discrete" in fetched else "action"
+        place = "[branch]" if len(previous.shape) == 1 else "[0, branch]"
+        lines += [
+            f"for (var branch = 0; branch < {taken}.GetLength(1); branch++)",
+            f"    previous{place} = ({_TYPES[previous.dtype]}){taken}[0, branch];",
+        ]
+    lines += [
+        f"for (var i = 0; i < {name}.GetLength(1); i++)\n    Console.WriteLine({name}[0, i]);" for name in fetched
+    ]
+    lines = [part for line in lines for part in line.split("\n")]
+    if bundle.remembers:
+        lines = [f"for (var step = 0; step < {STEPS}; step++)", "{", *(f"    {line}" for line in lines), "}"]
+    play = "\n".join(f"            {line}" for line in [*before, *lines])
+    return _TENSORFLOWSHARP.substitute(
+        type=class_name(bundle.name), path=quoted(bundle.path(f"{bundle.name}.bytes")), play=play
+    )
+
+
+def _fetched(bundle: Bundle) -> dict[str, TensorSpec]:
+    """Variable → the output without chance (a draw from log-probabilities is the caller's)."""
+    single = len(bundle.heads) == 1
+    names = ("action" if single else "continuous" if is_continuous(h) else "discrete" for h in bundle.heads)
+    return {name: bundle.plain(head) for name, head in zip(names, bundle.heads, strict=True)}
+
+
+def _kind(spec: TensorSpec) -> str:
+    """The C# type of an array: ``float[,]``."""
+    return f"{_TYPES[spec.dtype]}[{',' * (len(spec.shape) - 1)}]"
+
+
+def _array(spec: TensorSpec) -> str:
+    """An example of one agent's input."""
+    shape, kind = example_shape(spec), _TYPES[spec.dtype]
+    if not shape:
+        return f"new TFTensor(({kind})0)"
+    if spec.role is not Role.MASKS:
+        return f"new {kind}[{', '.join(map(str, shape))}]"
+    one = {"float": "1f", "bool": "true"}.get(kind, "1")
+    return f"new {kind}[,] {{ {{ {', '.join([one] * shape[-1])} }} }}"
+
+
+# ------------------------------------------------------------------ Inference Engine
+
+
+def inference_engine(bundle: Bundle) -> str:
+    """ModelLoader and Worker. The engine has float and int tensors; int64 becomes int."""
+    memory, previous = bundle.memory, bundle.previous
+    kept = {}
+    fields = []
+    if memory is not None:
+        kept[memory[0].name] = "memory"
+        fields.append(f"    float[] memory = new float[{_size(memory[0])}];  // the start of an episode")
+    if previous is not None:
+        kept[previous.name] = "previous"
+        fields.append(f"    int[] previous = new int[{_size(previous)}];  // no action yet")
+    parameters, body = [], []
+    for spec in bundle.signature.inputs:
+        variable = kept.get(spec.name) or identifier(spec.name)
+        kind = "float" if spec.dtype == "float32" else "int"
+        body += [f"// {line}" for line in meaning(bundle, spec)]
+        shape = f"new TensorShape({', '.join(map(str, example_shape(spec)))})"
+        tensor = f"{identifier(spec.name)}Tensor"
+        if spec.role is Role.NOISE:
+            body.append(f"using var {tensor} = new Tensor<{kind}>({shape}, new {kind}[{_size(spec)}]);")
+        else:
+            body.append(f"using var {tensor} = new Tensor<{kind}>({shape}, {variable});")
+            if spec.name not in kept:
+                parameters.append(f"{kind}[] {variable}")
+        body.append(f"worker.SetInput({quoted(spec.name)}, {tensor});")
+    body.append("worker.Schedule();")
+    fetched = _fetched(bundle)
+    for (name, spec), head in zip(fetched.items(), bundle.heads, strict=True):
+        body += [f"// {line}" for line in action_meaning(bundle, head)]
+        body.append(_read(spec, f"{name}Tensor"))
+        body.append(f"var {name} = {name}Tensor.DownloadToArray();")
+    if memory is not None:
+        body.append(_read(bundle.signature.output(memory[1]), "memoryTensor"))
+        body.append("memory = memoryTensor.DownloadToArray();")
+    if previous is not None:
+        body.append(f"previous = {'discrete' if 'discrete' in fetched else 'action'};")
+    kinds = [f"{'float' if s.dtype == 'float32' else 'int'}[]" for s in fetched.values()]
+    if len(fetched) == 1:
+        result, answer = kinds[0], next(iter(fetched))
+    else:
+        result = f"({', '.join(f'{kind} {name}' for kind, name in zip(kinds, fetched, strict=True))})"
+        answer = f"({', '.join(fetched)})"
+    body.append(f"return {answer};")
+    methods = [f"public {result} Decide({', '.join(parameters)})", "{", *(f"    {line}" for line in body), "}", ""]
+    if kept:
+        reset = [f"    {line.split('  //')[0].strip().split(' ', 1)[1]}" for line in fields]
+        methods += ["public void BeginEpisode()", "{", *reset, "}", ""]
+    return _INFERENCE_ENGINE.substitute(
+        type=class_name(bundle.name),
+        file=f"{bundle.name}.onnx",
+        fields="".join(f"{line}\n" for line in fields),
+        methods="\n".join(f"    {line}" if line else "" for line in methods),
+    )
+
+
+def _read(spec: TensorSpec, variable: str) -> str:
+    kind = "float" if spec.dtype == "float32" else "int"
+    return f"using var {variable} = (worker.PeekOutput({quoted(spec.name)}) as Tensor<{kind}>).ReadbackAndClone();"
+
+
+def _size(spec: TensorSpec) -> int:
+    size = 1
+    for n in example_shape(spec):
+        size *= n
+    return size

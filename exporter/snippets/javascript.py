@@ -1,0 +1,229 @@
+"""Snippets in JavaScript: policy.mjs, plain TensorFlow.js and onnxruntime-web, each a page of its own.
+
+A page lies beside the bundle's folder and takes its runtime from ``node_modules`` there: no network is needed.
+"""
+
+from __future__ import annotations
+
+import re
+from string import Template
+
+from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, is_continuous, meaning, quoted
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+_PAGE = Template("""\
+<!doctype html>
+<!-- Save as index.html beside the folder $name, then: npm install $package; python3 -m http.server -->
+<html lang="en">
+<meta charset="utf-8">
+<title>$name</title>
+<script type="importmap">
+{"imports": {"$package": "./node_modules/$module"}}
+</script>
+<script type="module">
+$code
+</script>
+</html>
+""")
+_TFJS = ("@tensorflow/tfjs", "@tensorflow/tfjs/dist/tf.fesm.min.js")
+_ORT = ("onnxruntime-web", "onnxruntime-web/dist/ort.wasm.bundle.min.mjs")
+
+_ACTING_TFJS = Template("""\
+import * as tf from "@tensorflow/tfjs";
+import { loadPolicy } from $module;
+
+const policy = await loadPolicy($model, { tf, seed: 0 });
+$play""")
+
+_ACTING_ORT = Template("""\
+import * as ort from "onnxruntime-web";
+import { loadPolicy } from $module;
+
+const policy = await loadPolicy($model, { ort, seed: 0 });
+$play""")
+
+_PLAIN_TFJS = Template("""\
+import * as tf from "@tensorflow/tfjs";
+
+await tf.ready();
+const model = await tf.loadGraphModel($model);
+$play""")
+
+_PLAIN_ORT = Template("""\
+import * as ort from "onnxruntime-web";
+
+const session = await ort.InferenceSession.create($model);
+$play""")
+
+_ARRAYS = {"float32": "Float32Array", "int32": "Int32Array", "int64": "BigInt64Array", "bool": "Uint8Array"}
+
+
+def acting_tfjs(bundle: Bundle) -> str:
+    """policy.mjs with TensorFlow.js."""
+    code = _ACTING_TFJS.substitute(module=_module(bundle), model=_url(bundle, "tfjs/model.json"), play=_agents(bundle))
+    return _page(bundle, _TFJS, code)
+
+
+def acting_ort(bundle: Bundle) -> str:
+    """policy.mjs with onnxruntime-web."""
+    model = _url(bundle, f"{bundle.name}.onnx")
+    return _page(bundle, _ORT, _ACTING_ORT.substitute(module=_module(bundle), model=model, play=_agents(bundle)))
+
+
+def plain_tfjs(bundle: Bundle) -> str:
+    """``tf.loadGraphModel`` alone."""
+    lines = _feeds(bundle, _tf_value)
+    fetched = _fetched(bundle)
+    lines.append("const outputs = model.predict(feeds);  // tensors by name; dispose of them in a long run: tf.dispose")
+    for name, output in fetched.items():
+        lines.append(f"const {name} = await outputs[{quoted(output)}].array();")
+    return _page(
+        bundle,
+        _TFJS,
+        _PLAIN_TFJS.substitute(model=_url(bundle, "tfjs/model.json"), play=_steps(bundle, lines, _tf_value)),
+    )
+
+
+def plain_ort(bundle: Bundle) -> str:
+    """onnxruntime-web alone."""
+    lines = _feeds(bundle, _ort_value)
+    fetched = _fetched(bundle)
+    lines.append("const outputs = await session.run(feeds);")
+    for name, output in fetched.items():
+        lines.append(f"const {name} = Array.from(outputs[{quoted(output)}].data, Number);")
+    return _page(
+        bundle,
+        _ORT,
+        _PLAIN_ORT.substitute(model=_url(bundle, f"{bundle.name}.onnx"), play=_steps(bundle, lines, _ort_value)),
+    )
+
+
+def _page(bundle: Bundle, runtime: tuple[str, str], code: str) -> str:
+    return _PAGE.substitute(name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
+
+
+def _url(bundle: Bundle, relative: str) -> str:
+    return quoted(f"./{bundle.name}/{relative}")
+
+
+def _module(bundle: Bundle) -> str:
+    return _url(bundle, "tfjs/policy.mjs")
+
+
+def _agents(bundle: Bundle) -> str:
+    """Acting with policy.mjs, which draws and remembers."""
+    lines = ["const decision = await agents.decide({"]
+    for spec in bundle.signature.observations:
+        lines += _entry(bundle, spec, _flat(spec))
+    extra: list[str] = []
+    for spec in bundle.signature.inputs:
+        if spec.role is Role.MASKS:
+            extra += [*_comment(bundle, spec), f"  masks: {_flat(spec)},"]
+    parameters = [s for s in bundle.signature.inputs if s.role is Role.PARAMETER]
+    if parameters:
+        extra.append("  parameters: {")
+        extra += [f"  {line}" for spec in parameters for line in _entry(bundle, spec, _flat(spec))]
+        extra.append("  },")
+    lines += ["}, {", *extra, "});"] if extra else ["});"]
+    lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
+    shown = ", ".join("decision.continuous" if is_continuous(h) else "decision.discrete" for h in bundle.heads)
+    lines.append(f"console.log({shown});  // a row per agent")
+    start = [
+        "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): without chance",
+        "const agents = policy.agent();",
+    ]
+    return "\n".join([*start, *_looped(bundle, lines)])
+
+
+def _fetched(bundle: Bundle) -> dict[str, str]:
+    """Variable → output: the actions without chance (what draws from log-probabilities is in policy.mjs)."""
+    names = (
+        ["action"]
+        if len(bundle.heads) == 1
+        else ["continuous" if is_continuous(h) else "discrete" for h in bundle.heads]
+    )
+    return {name: bundle.plain(head).name for name, head in zip(names, bundle.heads, strict=True)}
+
+
+def _feeds(bundle: Bundle, value: object) -> list[str]:
+    assert callable(value)
+    lines = ["const feeds = {"]
+    for spec in bundle.signature.inputs:
+        fed = value(spec)
+        if bundle.memory is not None and spec == bundle.memory[0]:
+            fed = "memory"
+        elif spec == bundle.previous:
+            fed = "previous"
+        lines += _entry(bundle, spec, fed)
+    return [*lines, "};"]
+
+
+def _steps(bundle: Bundle, lines: list[str], value: object) -> str:
+    """The lines with what goes from step to step."""
+    assert callable(value)
+    before: list[str] = []
+    fetched = _fetched(bundle)
+    memory, previous = bundle.memory, bundle.previous
+    if memory is not None:
+        before.append(f"let memory = {value(memory[0])};  // the start of an episode; a row per agent")
+        lines.append(f"memory = outputs[{quoted(memory[1])}];")
+    if previous is not None:
+        before.append(f"let previous = {value(previous)};  // no action yet")
+        taken = "discrete" if "discrete" in fetched else "action"
+        lines.append(_again(previous, taken, tensorflow=value is _tf_value))
+    lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
+    chance = [f"outputs[{quoted(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]
+    hint = f"  // without chance; with it: {', '.join(chance)}" if chance else ""
+    lines.append(f"console.log({', '.join(fetched)});{hint}")
+    return "\n".join([*before, *_looped(bundle, lines)])
+
+
+def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:
+    """The previous actions as the next step's input."""
+    shape = list(example_shape(spec))
+    if tensorflow:
+        return f'previous = tf.tensor({taken}.flat(), {shape}, "int32");'
+    values = f"{taken}.map(BigInt)" if spec.dtype == "int64" else taken
+    return f"previous = new ort.Tensor({quoted(spec.dtype)}, {_ARRAYS[spec.dtype]}.from({values}), {shape});"
+
+
+def _looped(bundle: Bundle, lines: list[str]) -> list[str]:
+    if not bundle.remembers:
+        return lines
+    return [f"for (let step = 0; step < {STEPS}; step++) {{", *(f"  {line}" for line in lines), "}"]
+
+
+def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
+    key = spec.name if re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", spec.name) else quoted(spec.name)
+    return [*_comment(bundle, spec), f"  {key}: {value},"]
+
+
+def _comment(bundle: Bundle, spec: TensorSpec) -> list[str]:
+    return [f"  // {_safe(line)}" for line in meaning(bundle, spec)]
+
+
+def _safe(comment: str) -> str:
+    """A comment that cannot end the script it stands in."""
+    return comment.replace("<", "‹")
+
+
+def _tf_value(spec: TensorSpec) -> str:
+    maker = "ones" if spec.role is Role.MASKS else "zeros"
+    dtype = "int32" if spec.dtype == "int64" else spec.dtype
+    return f"tf.{maker}({list(example_shape(spec))}{'' if dtype == 'float32' else f', {quoted(dtype)}'})"
+
+
+def _ort_value(spec: TensorSpec) -> str:
+    shape = example_shape(spec)
+    return f"new ort.Tensor({quoted(spec.dtype)}, {_flat(spec, _ARRAYS[spec.dtype])}, {list(shape)})"
+
+
+def _flat(spec: TensorSpec, kind: str | None = None) -> str:
+    """A typed array of one agent's numbers; policy.mjs takes int64 as 32 bits."""
+    size = 1
+    for n in example_shape(spec):
+        size *= n
+    one = "1n" if kind == "BigInt64Array" else "1"
+    kind = kind or ("Int32Array" if spec.dtype == "int64" else _ARRAYS[spec.dtype])
+    return f"new {kind}({size})" + (f".fill({one})" if spec.role is Role.MASKS else "")

@@ -1,0 +1,175 @@
+"""Snippets in Python: onnxruntime, TensorFlow, ``exporter.load_policy``; and the pieces that TF Serving's use."""
+
+from __future__ import annotations
+
+from string import Template
+
+from exporter.snippets.contract import (
+    STEPS,
+    Bundle,
+    action_meaning,
+    example_shape,
+    is_continuous,
+    meaning,
+    quoted,
+)
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+_ONNXRUNTIME = Template("""\
+# pip install onnxruntime
+import numpy as np
+import onnxruntime
+
+session = onnxruntime.InferenceSession($path, providers=["CPUExecutionProvider"])
+names = [output.name for output in session.get_outputs()]
+$play""")
+
+_SAVED_MODEL = Template("""\
+# pip install tensorflow
+import numpy as np
+import tensorflow as tf
+
+model = tf.saved_model.load($path)  # keep it: the signature alone does not hold its graph
+policy = model.signatures["serving_default"]
+$play""")
+
+_LOAD_POLICY = Template("""\
+# pip install 'export-model[onnxruntime]'; it draws the discrete actions, and remembers
+import numpy as np
+
+from exporter import load_policy
+
+policy = load_policy($path, seed=0)
+# agents.reset() where an episode begins; policy.agent(deterministic=True): without chance
+agents = policy.agent()
+$play""")
+
+
+def onnxruntime(bundle: Bundle) -> str:
+    """The ONNX in onnxruntime."""
+    run = "dict(zip(names, session.run(names, feeds)))"
+    return _ONNXRUNTIME.substitute(
+        path=quoted(bundle.path(f"{bundle.name}.onnx")), play=play(bundle, [f"outputs = {run}"])
+    )
+
+
+def saved_model(bundle: Bundle) -> str:
+    """The SavedModel in TensorFlow."""
+    run = [
+        "answer = policy(**{name: tf.constant(value) for name, value in feeds.items()})",
+        "outputs = {name: tensor.numpy() for name, tensor in answer.items()}",
+    ]
+    return _SAVED_MODEL.substitute(path=quoted(bundle.path("saved_model")), play=play(bundle, run))
+
+
+def load_policy(bundle: Bundle) -> str:
+    """The bundle by this tool's own package."""
+    masks = next((s for s in bundle.signature.inputs if s.role is Role.MASKS), None)
+    parameters = [s for s in bundle.signature.inputs if s.role is Role.PARAMETER]
+    lines = ["decision = agents.decide(", "    {"]
+    for spec in bundle.signature.observations:
+        lines += [f"    {line}" for line in _entry(bundle, spec, array(spec))]
+    lines.append("    },")
+    if masks is not None:
+        lines += [f"    # {text}" for text in meaning(bundle, masks)]
+        lines.append(f"    masks={array(masks)},")
+    if parameters:
+        lines.append("    parameters={")
+        for spec in parameters:
+            lines += [f"    {line}" for line in _entry(bundle, spec, array(spec))]
+        lines.append("    },")
+    lines.append(")")
+    for head in bundle.heads:
+        lines += [f"# {text}" for text in action_meaning(bundle, head)]
+    lines.append(
+        f"print({', '.join('decision.continuous' if is_continuous(h) else 'decision.discrete' for h in bundle.heads)})"
+    )
+    return _LOAD_POLICY.substitute(path=quoted(bundle.folder.as_posix()), play=looped(bundle, lines))
+
+
+def play(bundle: Bundle, run: list[str]) -> str:
+    """From feeds to actions by ``run``, which makes ``outputs`` (name → array) of ``feeds``."""
+    before: list[str] = []
+    if _draws(bundle):
+        before.append("rng = np.random.default_rng()")
+    memory, previous = bundle.memory, bundle.previous
+    if memory is not None:
+        before.append(f"memory = {array(memory[0])}  # the start of an episode; a row per agent")
+    if previous is not None:
+        before.append(f"previous = {array(previous)}  # no action yet")
+    lines = ["feeds = {"]
+    for spec in bundle.signature.inputs:
+        lines += _entry(bundle, spec, _fed(bundle, spec))
+    lines += ["}", *run]
+    for head in bundle.heads:
+        lines += _action(bundle, head)
+    if memory is not None:
+        lines.append(f"memory = outputs[{quoted(memory[1])}]")
+    if previous is not None:
+        name = "discrete" if len(bundle.heads) > 1 else "action"
+        shape = ".reshape(-1)" if len(previous.shape) == 1 else ""
+        lines.append(f"previous = {name}{shape}.astype({_dtype(previous)})")
+    lines.append(f"print({', '.join(_variable(bundle, head) for head in bundle.heads)})")
+    return "\n".join([*before, looped(bundle, lines)])
+
+
+def looped(bundle: Bundle, lines: list[str]) -> str:
+    """``lines`` as they are, or in a loop of a few steps where the policy remembers."""
+    if not bundle.remembers:
+        return "\n".join([*lines, ""])
+    return "\n".join([f"for step in range({STEPS}):", *(f"    {line}" for line in lines), ""])
+
+
+def array(spec: TensorSpec) -> str:
+    """An example of one agent's input: all actions allowed, all else zero."""
+    maker = "ones" if spec.role is Role.MASKS else "zeros"
+    return f"np.{maker}({_shape(example_shape(spec))}, {_dtype(spec)})"
+
+
+def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
+    return [*(f"    # {text}" for text in meaning(bundle, spec)), f"    {quoted(spec.name)}: {value},"]
+
+
+def _fed(bundle: Bundle, spec: TensorSpec) -> str:
+    if spec.role is Role.NOISE:
+        return f"rng.standard_normal({_shape(example_shape(spec))}, {_dtype(spec)})"
+    if bundle.memory is not None and spec == bundle.memory[0]:
+        return "memory"
+    return "previous" if spec == bundle.previous else array(spec)
+
+
+def _draws(bundle: Bundle) -> bool:
+    return bool(bundle.signature.noise) or any(h.role in (Role.LOG_PROBS, Role.PROBS) for h in bundle.heads)
+
+
+def _variable(bundle: Bundle, head: TensorSpec) -> str:
+    if len(bundle.heads) == 1:
+        return "action"
+    return "continuous" if is_continuous(head) else "discrete"
+
+
+def _action(bundle: Bundle, head: TensorSpec) -> list[str]:
+    variable, plain = _variable(bundle, head), bundle.plain(head)
+    lines = [f"# {text}" for text in action_meaning(bundle, head)]
+    if plain != head:
+        lines.append(f"# without chance: outputs[{quoted(plain.name)}]")
+    output = f"outputs[{quoted(head.name)}]"
+    if head.role not in (Role.LOG_PROBS, Role.PROBS):
+        return [*lines, f"{variable} = {output}"]
+    scores = output if head.role is Role.LOG_PROBS else f"np.log({output})"
+    ends = [sum(bundle.signature.branches[: i + 1]) for i in range(len(bundle.signature.branches) - 1)]
+    return [
+        *lines,
+        f"branches = np.split({scores}, {ends}, axis=1)  # log-probabilities",
+        "# a draw from each branch: the largest of log-probability + Gumbel noise",
+        f"{variable} = np.stack([(b + rng.gumbel(size=b.shape)).argmax(axis=1) for b in branches], axis=1)",
+    ]
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+
+
+def _dtype(spec: TensorSpec) -> str:
+    return "np.bool_" if spec.dtype == "bool" else f"np.{spec.dtype}"

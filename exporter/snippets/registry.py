@@ -1,0 +1,85 @@
+"""All snippets by name, in the order they are printed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from exporter.snippets import csharp, javascript, python, serving, unity
+from exporter.snippets.contract import Bundle
+from signatures.errors import BundleError, UsageError
+
+
+@dataclass(frozen=True)
+class Target:
+    """One way to call a policy: its name for ``--for``, title, language, and the formats it needs (any of them)."""
+
+    name: str
+    title: str
+    language: str
+    needs: tuple[str, ...]
+    render: Callable[[Bundle], str]
+
+
+TARGETS = (
+    Target("load-policy", "Python, exporter.load_policy", "python", ("onnx", "bytes"), python.load_policy),
+    Target("onnxruntime", "Python, onnxruntime", "python", ("onnx",), python.onnxruntime),
+    Target("saved-model", "Python, tf.saved_model.load", "python", ("saved_model",), python.saved_model),
+    Target("serving-docker", "TensorFlow Serving, the container", "sh", ("saved_model",), serving.docker),
+    Target("serving-rest", "TensorFlow Serving, REST with curl", "sh", ("saved_model",), serving.rest),
+    Target("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", ("saved_model",), serving.grpc),
+    Target("policy-tfjs", "A page, policy.mjs with TensorFlow.js", "html", ("tfjs",), javascript.acting_tfjs),
+    Target("policy-ort", "A page, policy.mjs with onnxruntime-web", "html", ("tfjs+onnx",), javascript.acting_ort),
+    Target("tfjs", "A page, tf.loadGraphModel", "html", ("tfjs",), javascript.plain_tfjs),
+    Target("onnxruntime-web", "A page, onnxruntime-web", "html", ("onnx",), javascript.plain_ort),
+    Target("tensorflowsharp", "C#, TensorFlowSharp", "csharp", ("bytes",), csharp.tensorflowsharp),
+    Target("internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", ("bytes",), unity.internal_brain),
+    Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", ("onnx",), csharp.inference_engine),
+)
+
+
+@dataclass(frozen=True)
+class Snippet:
+    """The code of a target for one bundle."""
+
+    target: Target
+    code: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "name": self.target.name,
+            "title": self.target.title,
+            "language": self.target.language,
+            "code": self.code,
+        }
+
+
+def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], dict[str, str]]:
+    """(snippets, target → the format it lacks). ``name`` chooses one, or all that begin so (``serving``).
+
+    Raises UsageError where there is no such target, BundleError where the bundle lacks the format of all chosen.
+    """
+    chosen = [t for t in TARGETS if name in (None, t.name)] or [t for t in TARGETS if t.name.startswith(f"{name}-")]
+    if not chosen:
+        raise UsageError(f"--for {name}: there is no such target", fix=f"one of: {', '.join(t.name for t in TARGETS)}")
+    lacking = {t.name: " or ".join(t.needs).replace("+", " and ") for t in chosen if not _has(bundle, t)}
+    if len(lacking) == len(chosen):
+        needed = next(iter(lacking.values()))
+        raise BundleError(
+            f"has no {needed}, which {chosen[0].title} needs",
+            where=str(bundle.folder),
+            fix="export the policy again with all formats (the default of --to)",
+        )
+    return [Snippet(t, t.render(bundle)) for t in chosen if t.name not in lacking], lacking
+
+
+def _has(bundle: Bundle, target: Target) -> bool:
+    mains = {
+        "bytes": f"{bundle.name}.bytes",
+        "saved_model": "saved_model/saved_model.pb",
+        "tfjs": "tfjs/model.json",
+        "onnx": f"{bundle.name}.onnx",
+    }
+    return any(all(mains[part] in bundle.files for part in need.split("+")) for need in target.needs)

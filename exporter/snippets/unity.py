@@ -1,0 +1,175 @@
+"""What to set in Unity for the ``.bytes``: the Internal Brain of ML-Agents 0.1 to 0.5, the Learning Brain of 0.6.
+
+Sources: the ML-Agents documentation of 0.1 to 0.3 ("Using TensorFlowSharp in Unity") and CoreBrainInternal.cs of those
+versions (names are typed by the user, so that any will do; shapes and dtypes are fixed), and for 0.6
+BarracudaModelParamLoader's forerunner, TensorFlowSharp's InferenceBrain/ModelParamLoader.cs (names are fixed).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from exporter.snippets.contract import Bundle, branch_lines, is_continuous, numbered
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+
+@dataclass(frozen=True)
+class Generation:
+    """A span of ML-Agents versions and what its brain can do with a graph."""
+
+    name: str
+    memory: bool
+    previous_rank: int | None
+    masks: bool
+    branches: bool
+    vector_field: str
+    observation_field: str
+
+
+_INTERNAL = (
+    Generation("0.1", False, None, False, False, "State Node Name", "Observation Placeholder Name"),
+    Generation("0.2", True, None, False, False, "State Node Name", "Observation Placeholder Name"),
+    Generation("0.3-0.4", True, 1, False, False, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
+    Generation("0.5", True, 2, True, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
+)
+_FIXED = ("vector_observation", "prev_action", "epsilon", "action_masks", "recurrent_in")
+_NEEDED = ("version_number", "is_continuous_control", "memory_size", "action_output_shape")
+
+
+def internal_brain(bundle: Bundle) -> str:
+    """The settings, and for which versions they hold."""
+    able = [g for g in _INTERNAL if not _faults(bundle, g)]
+    lines = [
+        f"The policy {bundle.name} in Unity, as the TensorFlowSharp plugin runs it",
+        f"(Player Settings: .NET 4.x and the symbol ENABLE_TENSORFLOW; copy {bundle.name}.bytes into Assets)",
+        "",
+    ]
+    if able:
+        lines += [f"ML-Agents {', '.join(g.name for g in able)}: Brain Type Internal", *_settings(bundle, able), ""]
+    for generation in _INTERNAL:
+        if faults := _faults(bundle, generation):
+            lines.append(f"ML-Agents {generation.name}: not this policy: {'; '.join(faults)}")
+    lines.append(_learning_brain(bundle))
+    lines.append("ML-Agents 0.7 to release 20: their Barracuda reads .nn and .onnx of fixed names, not this graph")
+    lines.append("newer: Unity Inference Engine, see export-model snippets --for inference-engine")
+    return "\n".join([*lines, ""])
+
+
+def _settings(bundle: Bundle, able: Sequence[Generation]) -> list[str]:
+    signature = bundle.signature
+    scope = _scope(bundle)
+    vectors = [s for s in signature.inputs if s.role is Role.VECTOR]
+    images = [s for s in signature.inputs if s.role is Role.VISUAL]
+    newest = able[-1]
+    rows: list[tuple[str, str]] = [
+        ("Graph Model", bundle.name),
+        ("Graph Scope", scope.rstrip("/") + ("/ (0.3 and newer add the slash themselves)" if scope else "(empty)")),
+        *_placeholders(bundle, scope),
+        *((newest.vector_field, s.name.removeprefix(scope)) for s in vectors),
+        *((f"{newest.observation_field} {i}", s.name.removeprefix(scope)) for i, s in enumerate(images)),
+    ]
+    if bundle.memory is not None:
+        rows.append(("Recurrent Input Node Name", bundle.memory[0].name.removeprefix(scope)))
+        rows.append(("Recurrent Output Node Name", bundle.memory[1].removeprefix(scope)))
+    rows.append(("Action Node Name", _action(bundle).name.removeprefix(scope)))
+    rows += _brain(bundle, vectors, images)
+    width = max(len(name) for name, _ in rows)
+    lines = [f"  {name.ljust(width)}  {value}" for name, value in rows]
+    names = signature.labels.get("observations", {})
+    lines += [f"  {s.name}: {', '.join(numbered(names[s.name]))}" for s in vectors if s.name in names]
+    if "actions" in signature.labels:
+        lines.append(f"  actions: {', '.join(numbered(signature.labels['actions']))}")
+    return [*lines, *(f"  {line}" for line in branch_lines(bundle))]
+
+
+def _placeholders(bundle: Bundle, scope: str) -> list[tuple[str, str]]:
+    """Inputs that the brain does not know are drawn from a range, one number for all."""
+    rows = []
+    for spec in bundle.signature.inputs:
+        name, kind = spec.name.removeprefix(scope), "Floating Point" if spec.dtype == "float32" else "Integer"
+        if spec.role is Role.NOISE:
+            text = f"{name}: {kind}, Min Value 0, Max Value 0 (without chance; -1 and 1: with noise)"
+            rows.append(("Graph Placeholder", text))
+        elif spec.role is Role.PARAMETER:
+            rows.append(("Graph Placeholder", f"{name}: {kind}, Min Value and Max Value: its value"))
+    return rows
+
+
+def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) -> list[tuple[str, str]]:
+    rows = []
+    for spec in vectors:
+        known = spec.distribution or {}
+        if known.get("kind") == "integer":
+            rows.append(("Vector Observation", f"Space Type Discrete, Space Size {int(known['high']) + 1}"))
+            continue
+        size = spec.shape[-1] or 0
+        splits = [f"{size // n} x {n}" for n in range(2, 10) if size % n == 0]
+        stacked = f"; or, as it was trained, Space Size x Stacked Vectors: {', '.join(splits)}" if splits else ""
+        rows.append(("Vector Observation", f"Space Type Continuous, Space Size {size}, Stacked Vectors 1{stacked}"))
+    if not vectors:
+        rows.append(("Vector Observation", "Space Size 0"))
+    for spec in images:
+        height, width, channels = spec.shape[1:]
+        colour = "Black And White" if channels == 1 else "colour"
+        rows.append(("Camera Observation", f"Width {width}, Height {height}, {colour}"))
+    head = bundle.heads[0]
+    if is_continuous(head):
+        rows.append(("Vector Action", f"Space Type Continuous, Space Size {head.shape[-1]}"))
+    else:
+        sizes = bundle.signature.branches
+        text = (
+            f"Space Size {sizes[0]}" if len(sizes) == 1 else f"Branches Size {len(sizes)}: {', '.join(map(str, sizes))}"
+        )
+        rows.append(("Vector Action", f"Space Type Discrete, {text}"))
+    return rows
+
+
+def _action(bundle: Bundle) -> TensorSpec:
+    """The node that CoreBrainInternal reads: float for continuous actions, int64 for discrete ones."""
+    head = bundle.heads[0]
+    return head if is_continuous(head) or head.dtype == "int64" else bundle.plain(head)
+
+
+def _scope(bundle: Bundle) -> str:
+    names = [s.name for s in (*bundle.signature.inputs, *bundle.heads)]
+    scope = names[0].rpartition("/")[0]
+    return f"{scope}/" if scope and all(n.startswith(f"{scope}/") for n in names) else ""
+
+
+def _faults(bundle: Bundle, generation: Generation) -> list[str]:
+    """Why the Internal Brain of a generation cannot run the policy."""
+    signature = bundle.signature
+    roles = {s.role for s in signature.inputs}
+    vectors = [s for s in signature.inputs if s.role is Role.VECTOR]
+    faults = []
+    if len(bundle.heads) > 1:
+        faults.append("it has no hybrid actions")
+    elif not is_continuous(bundle.heads[0]) and _action(bundle).dtype != "int64":
+        faults.append("it reads discrete actions as int64")
+    if len(signature.branches) > 1 and not generation.branches:
+        faults.append("it has one branch of discrete actions")
+    if Role.MASKS in roles and not generation.masks:
+        faults.append("it does not feed action masks")
+    if Role.ENTITIES in roles or len(vectors) > 1:
+        faults.append("it feeds one vector observation")
+    if signature.memory is not None and not generation.memory:
+        faults.append("its memory does not work")
+    previous = bundle.previous
+    if previous is not None and generation.previous_rank != len(previous.shape):
+        faults.append(f"it does not feed {previous.name} {list(previous.shape)}".replace("None", "agents"))
+    layouts = {p.get("layout") for p in signature.preprocess.values()}
+    if "NCHW" in layouts:
+        faults.append("its images have the channels last")
+    return faults
+
+
+def _learning_brain(bundle: Bundle) -> str:
+    signature = bundle.signature
+    odd = [s.name for s in signature.inputs if s.name not in _FIXED and not s.name.startswith("visual_observation_")]
+    missing = [name for name in _NEEDED if name not in signature.constants]
+    if not odd and not missing and signature.constants["version_number"] == 1:
+        return f"ML-Agents 0.6: drop {bundle.name}.bytes on the Model of the Learning Brain; it finds the rest itself"
+    why = f"it does not know {', '.join(odd)}" if odd else f"it wants {', '.join(missing)}" if missing else "it wants 1"
+    return f"ML-Agents 0.6: not this bundle: {why} (a policy trained with 0.6: export it with --names source)"
