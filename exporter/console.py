@@ -177,7 +177,10 @@ class Console:
             return
         if "bytes" in targets and names == "canonical":
             click.echo("note: Unity looks nodes up by the trainer's names: export with --names source for Unity")
-        click.echo(f"next: export-model verify {results[-1].folder}    (policy.json there says what to feed)")
+        folder = results[-1].folder
+        if "tfjs" in targets:
+            click.echo(f"next: export-model serve {folder}    (see it act, in a browser)")
+        click.echo(f"next: export-model snippets {folder}    (code for Python, TF Serving, JavaScript, C#, Unity)")
 
     def json(self, content: Mapping[str, Any]) -> None:
         """The answer for a program, where it was asked for."""

@@ -6,11 +6,12 @@ import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 
+from converters.registry import TARGETS
 from converters.runner.process import RuntimeProcess
 from exporter.runtimes import RUNTIMES, RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError, UsageError
 
-FORMATS = ("source", "bytes", "saved_model", "tfjs", "onnx")
+FORMATS = ("source", *TARGETS)
 #: Format → the runtimes that run it. "source" is the original file, read by a runtime of its own.
 RUNTIMES_OF = MappingProxyType({f: tuple(r.name for r in RUNTIMES if f in r.formats) for f in FORMATS})
 #: Runtimes that compute by themselves; numpy is this project's own.

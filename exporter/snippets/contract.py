@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from exporter.bundle import read_policy_json, signature_of
+from converters.frozen_graph.reader import read_graph
+from exporter.bundle import check_hashes, read_policy_json, signature_of
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -37,7 +38,8 @@ class Bundle:
     name: str
     signature: PolicySignature
     files: frozenset[str]
-    source: Mapping[str, Any]
+    #: nodes of its .bytes: an old Unity asks for some that are neither inputs nor outputs
+    nodes: frozenset[str] = frozenset()
 
     def path(self, relative: str) -> str:
         """A file of the bundle, with slashes."""
@@ -82,10 +84,18 @@ class Bundle:
 
 
 def read_bundle(folder: Path) -> Bundle:
-    """A bundle by its policy.json. Raises BundleError."""
+    """A bundle by its policy.json. Raises BundleError, also where its .bytes is not the one that was written."""
     content = read_policy_json(folder)
     signature, _ = signature_of(content)
-    return Bundle(folder, content["name"], signature, frozenset(content["files"]), content["source"])
+    name, files = content["name"], frozenset(content["files"])
+    graph = f"{name}.bytes"
+    nodes = _nodes(folder, graph, content["files"][graph]) if graph in files else frozenset()
+    return Bundle(folder, name, signature, files, nodes)
+
+
+def _nodes(folder: Path, file: str, entry: Mapping[str, Any]) -> frozenset[str]:
+    check_hashes(folder, {"files": {file: entry}})
+    return frozenset(node.name for node in read_graph((folder / file).read_bytes()).nodes)
 
 
 def is_continuous(head: TensorSpec) -> bool:

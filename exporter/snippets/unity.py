@@ -24,15 +24,19 @@ class Generation:
     previous_rank: int | None
     masks: bool
     branches: bool
+    #: whether it feeds sequence_length and reads memory_size wherever there is a memory
+    asks: bool
     vector_field: str
     observation_field: str
 
 
 _INTERNAL = (
-    Generation("0.1", False, None, False, False, "State Node Name", "Observation Placeholder Name"),
-    Generation("0.2", True, None, False, False, "State Node Name", "Observation Placeholder Name"),
-    Generation("0.3-0.4", True, 1, False, False, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
-    Generation("0.5", True, 2, True, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
+    Generation("0.1", False, None, False, False, False, "State Node Name", "Observation Placeholder Name"),
+    Generation("0.2", True, None, False, False, False, "State Node Name", "Observation Placeholder Name"),
+    Generation(
+        "0.3-0.4", True, 1, False, False, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"
+    ),
+    Generation("0.5", True, 2, True, True, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
 )
 _FIXED = ("vector_observation", "prev_action", "epsilon", "action_masks", "recurrent_in")
 _NEEDED = ("version_number", "is_continuous_control", "memory_size", "action_output_shape")
@@ -105,7 +109,7 @@ def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) 
             rows.append(("Vector Observation", f"Space Type Discrete, Space Size {int(known['high']) + 1}"))
             continue
         size = spec.shape[-1] or 0
-        splits = [f"{size // n} x {n}" for n in range(2, 10) if size % n == 0]
+        splits = [f"{size // n} x {n}" for n in range(2, 10) if size % n == 0 and size > n]
         stacked = f"; or, as it was trained, Space Size x Stacked Vectors: {', '.join(splits)}" if splits else ""
         rows.append(("Vector Observation", f"Space Type Continuous, Space Size {size}, Stacked Vectors 1{stacked}"))
     if not vectors:
@@ -156,6 +160,9 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
         faults.append("it feeds one vector observation")
     if signature.memory is not None and not generation.memory:
         faults.append("its memory does not work")
+    asked = [n for n in ("memory_size", "sequence_length") if f"{_scope(bundle)}{n}" not in bundle.nodes]
+    if signature.memory is not None and generation.asks and asked:
+        faults.append(f"it asks a policy with memory for {' and '.join(asked)}: export with --names source")
     previous = bundle.previous
     if previous is not None and generation.previous_rank != len(previous.shape):
         faults.append(f"it does not feed {previous.name} {list(previous.shape)}".replace("None", "agents"))
@@ -168,8 +175,9 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
 def _learning_brain(bundle: Bundle) -> str:
     signature = bundle.signature
     odd = [s.name for s in signature.inputs if s.name not in _FIXED and not s.name.startswith("visual_observation_")]
-    missing = [name for name in _NEEDED if name not in signature.constants]
-    if not odd and not missing and signature.constants["version_number"] == 1:
+    missing = [name for name in _NEEDED if name not in bundle.nodes]
+    if not odd and not missing and signature.constants.get("version_number") == 1:
         return f"ML-Agents 0.6: drop {bundle.name}.bytes on the Model of the Learning Brain; it finds the rest itself"
-    why = f"it does not know {', '.join(odd)}" if odd else f"it wants {', '.join(missing)}" if missing else "it wants 1"
+    wrong = f"it wants {', '.join(missing)}" if missing else "it wants version_number 1"
+    why = f"it does not know {', '.join(odd)}" if odd else wrong
     return f"ML-Agents 0.6: not this bundle: {why} (a policy trained with 0.6: export it with --names source)"

@@ -23,6 +23,12 @@ export interface Contract {
   readonly inputs: readonly TensorSpec[];
   readonly outputs: readonly TensorSpec[];
   readonly branches: readonly number[];
+  /** Names for people, where the export was given some (`--labels`). */
+  readonly labels?: {
+    readonly observations?: Readonly<Record<string, readonly string[]>>;
+    readonly actions?: readonly string[];
+    readonly branches?: readonly (readonly string[])[];
+  };
   readonly memory: { size: number; input: string | null; output: string | null; layout: readonly string[] } | null;
 }
 

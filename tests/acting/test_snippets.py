@@ -1,0 +1,442 @@
+"""``export-model snippets``: what is printed runs as printed, and gives what numpy gives."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import importlib.util
+import json
+import os
+import queue
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from exporter import export_model, load_policy
+from exporter.acting.policy import LoadedPolicy
+from exporter.pipeline import ExportOptions, export
+from exporter.runtimes.javascript import js_home, node_executable
+from exporter.snippets.contract import Bundle, class_name, folded, identifier, read_bundle
+from exporter.snippets.registry import TARGETS, snippets
+from fixtures import path as fixture
+from signatures.errors import ExportModelError
+from signatures.roles import Role
+from tests.commands import ROOT, is_refused
+from tests.commands import export_model as run
+
+KINDS = ("continuous", "discrete", "sampled", "recurrent", "visual", "twobrains")
+NAMES = (*KINDS[:-1], "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2", "own-names-Goalie-Brain-2")
+SHARED = ROOT.parent / "shared"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All fixtures as bundles, one with labels, one with the trainer's own names."""
+    folder = tmp_path_factory.mktemp("snippets")
+    for kind in KINDS:
+        labels = {"actions": ["roll </script>", "pitch"]} if kind == "continuous" else None
+        list(export([fixture(kind)], ExportOptions(folder, verify="none", labels=labels)))
+    renamed = folder / "own-names.bytes"
+    shutil.copy(fixture("twobrains"), renamed)
+    export_model(renamed, folder, names="source", verify="none")
+    return folder
+
+
+def bundle_of(out: Path, name: str) -> Bundle:
+    """The bundle as it is seen from ``out``."""
+    return replace(read_bundle(out / name), folder=Path(name))
+
+
+def code_of(out: Path, name: str, target: str) -> str:
+    made, _ = snippets(bundle_of(out, name), target)
+    return made[0].code
+
+
+def same(found: dict[str, Any], expected: dict[str, np.ndarray], policy: LoadedPolicy) -> None:
+    drawn = {s.name for s in policy.signature.outputs if s.role is Role.SAMPLED}
+    assert set(found) == set(expected)
+    for name in set(expected) - drawn:
+        np.testing.assert_allclose(np.array(found[name]), expected[name], atol=1e-5, rtol=1e-5, err_msg=name)
+    for name in drawn:
+        sizes = policy.signature.branches
+        assert np.all((np.array(found[name]) >= 0) & (np.array(found[name]) < sizes))
+
+
+def in_numpy(policy: LoadedPolicy, feeds: dict[str, Any]) -> dict[str, np.ndarray]:
+    arrays = {s.name: np.array(feeds[s.name], s.dtype) for s in policy.signature.inputs}
+    assert set(arrays) == set(feeds)
+    return policy._run(arrays, [s.name for s in policy.signature.outputs])
+
+
+# ------------------------------------------------------------------ Python
+
+
+@pytest.fixture(scope="module")
+def answers(out: Path) -> Callable[[str, str], dict[str, Any]]:
+    """(target, policy) → what running its snippet left behind; all are run in one process, when one is asked for."""
+
+    @functools.cache
+    def ran() -> dict[tuple[str, str], Any]:
+        jobs: dict[tuple[str, str], Any] = {}
+        for name in NAMES:
+            for target in ("onnxruntime", "saved-model", "serving-grpc", "load-policy"):
+                jobs[target, name] = {"kind": "python", "code": code_of(out, name, target)}
+            jobs["serving-rest", name] = {"kind": "rest", "name": name, "body": rest_body(out, name)}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "TF_CPP_MIN_LOG_LEVEL": "3", "CUDA_VISIBLE_DEVICES": ""}
+        command = [sys.executable, str(Path(__file__).with_name("run_snippets.py"))]
+        done = subprocess.run(
+            command, input=json.dumps(list(jobs.values())), capture_output=True, text=True, cwd=out, env=environment
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        return dict(zip(jobs, json.loads(done.stdout), strict=True))
+
+    def answer(target: str, name: str) -> dict[str, Any]:
+        for needed in ("tensorflow", "onnxruntime"):
+            if importlib.util.find_spec(needed) is None:
+                pytest.skip(f"{needed} is not installed: pip install export-model[all]")
+        found: dict[str, Any] = ran()[target, name]
+        return found
+
+    return answer
+
+
+def rest_body(out: Path, name: str) -> Any:
+    """What the printed command posts: it is run with a curl that prints the body."""
+    tools = out / ".tools"
+    tools.mkdir(exist_ok=True)
+    curl = tools / "curl"
+    curl.write_text('#!/bin/sh\nfor last; do :; done\n[ "$last" = @- ] && exec cat\nexec cat "${last#@}"\n')
+    curl.chmod(0o755)
+    path = f"{tools}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["sh", "-e"],
+        input=code_of(out, name, "serving-rest"),
+        capture_output=True,
+        text=True,
+        cwd=out,
+        env={**os.environ, "PATH": path},
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["onnxruntime", "saved-model", "serving-grpc", "serving-rest"])
+@pytest.mark.parametrize("name", NAMES)
+def test_what_python_is_told_gives_what_numpy_gives(
+    name: str, target: str, out: Path, answers: Callable[[str, str], dict[str, Any]]
+) -> None:
+    policy = load_policy(out / name, runtime="numpy")
+    answer = answers(target, name)
+    same(answer["outputs"], in_numpy(policy, answer["feeds"]), policy)
+    if target != "serving-rest":
+        steps = 3 if name == "recurrent" else 1
+        assert len(re.findall(r"\[\[", answer["printed"])) == steps
+        if policy.signature.branches:
+            assert np.all(np.array(answer["action"]) < policy.signature.branches)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_load_policy_decides_as_in_numpy(name: str, out: Path, answers: Callable[[str, str], dict[str, Any]]) -> None:
+    policy = load_policy(out / name, runtime="numpy", seed=0)
+    agents = policy.agent()
+    zeros = {s.name: np.zeros([n or 1 for n in s.shape], s.dtype) for s in policy.signature.observations}
+    for _ in range(3 if name == "recurrent" else 1):
+        decision = agents.decide(zeros)
+    found = answers("load-policy", name)["outputs"]
+    for key in ("continuous", "discrete", "memory"):
+        expected = getattr(decision, key)
+        assert (expected is None) == (key not in found)
+        if expected is not None:
+            np.testing.assert_allclose(found[key], expected, atol=1e-5, rtol=1e-5)
+
+
+# ------------------------------------------------------------------ JavaScript
+
+PAGES = ("policy-tfjs", "policy-ort", "tfjs", "onnxruntime-web")
+
+
+def module_of(page: str, modules: Path, folder: Path) -> str:
+    """The page's module, its imports resolved as its import map says."""
+    (mapped,) = re.findall(r'<script type="importmap">\n(.*?)\n</script>', page, re.S)
+    (code,) = re.findall(r'<script type="module">\n(.*?)\n</script>', page, re.S)
+    return resolved(code, json.loads(mapped)["imports"], modules, folder)
+
+
+def resolved(code: str, imports: dict[str, str], modules: Path, folder: Path) -> str:
+    """A module's imports as files: packages by an import map, other modules from ``folder``."""
+    for package, target in imports.items():
+        file = modules / target
+        assert file.is_file(), target
+        if file.suffix == ".js":  # a module all the same; Node goes by the name
+            named = folder / f"{file.stem}.mjs"
+            shutil.copy(file, named)
+            file = named
+        code = code.replace(f'"{package}"', json.dumps(file.as_uri()))
+    return re.sub(r'from "\./', f'from "{folder.as_uri()}/', code)
+
+
+@pytest.fixture(scope="module")
+def logs(out: Path) -> Callable[[str, str], list[Any]]:
+    """(target, policy) → what the page logged, call by call."""
+
+    @functools.cache
+    def ran() -> dict[tuple[str, str], Any]:
+        node, home = node_executable(), js_home()
+        if node is None or not (home / "node_modules/@tensorflow/tfjs").is_dir():
+            pytest.skip("Node.js with @tensorflow/tfjs and onnxruntime-web is not here: make setup")
+        files = {}
+        for target in PAGES:
+            for name in NAMES:
+                file = out / f"{target}-{name}.mjs"
+                file.write_text(module_of(code_of(out, name, target), home, out), encoding="utf-8")
+                files[target, name] = str(file)
+        done = subprocess.run(
+            [node, str(Path(__file__).with_name("run_pages.mjs"))],
+            input=json.dumps(list(files.values())),
+            capture_output=True,
+            text=True,
+            cwd=out,
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        return dict(zip(files, json.loads(done.stdout), strict=True))
+
+    return lambda target, name: ran()[target, name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", PAGES)
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_page_is_told_gives_what_numpy_gives(
+    name: str, target: str, out: Path, logs: Callable[[str, str], list[Any]]
+) -> None:
+    policy = load_policy(out / name, runtime="numpy", seed=0)
+    agents = policy.agent(deterministic=target in ("tfjs", "onnxruntime-web"))
+    zeros = {s.name: np.zeros([n or 1 for n in s.shape], s.dtype) for s in policy.signature.observations}
+    lines = logs(target, name)
+    assert len(lines) == (3 if name == "recurrent" else 1)
+    for (values,) in lines:
+        expected = agents.decide(zeros).action
+        np.testing.assert_allclose(np.array(values).reshape(expected.shape), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize("target", PAGES)
+def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> None:
+    home = js_home()
+    if not (home / "node_modules/@tensorflow/tfjs").is_dir():
+        pytest.skip("@tensorflow/tfjs is not here: make setup")
+    (tmp_path / "node_modules").symlink_to((home / "node_modules").resolve())
+    (tmp_path / "recurrent").symlink_to(out / "recurrent")
+    page = code_of(out, "recurrent", target)
+    tell = "(what) => navigator.sendBeacon('/told', JSON.stringify(what))"
+    told = f"<script>const tell = {tell}; console.log = (...v) => tell(v); onerror = (m) => tell('error: ' + m);"
+    told += "onunhandledrejection = (e) => tell('error: ' + e.reason);</script>"
+    (tmp_path / "index.html").write_text(page.replace('<meta charset="utf-8">', f'<meta charset="utf-8">{told}'))
+    answers: queue.Queue[Any] = queue.Queue()
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+        def do_POST(self) -> None:
+            answers.put(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+    handler = functools.partial(Handler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        assert CHROMIUM is not None
+        command = [CHROMIUM, "--headless", "--no-sandbox", f"--user-data-dir={tmp_path / 'profile'}"]
+        browser = subprocess.Popen(
+            [*command, f"http://127.0.0.1:{server.server_port}/"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            logged = [answers.get() for _ in range(3)]
+        finally:
+            browser.kill()
+            browser.wait()
+            server.shutdown()
+    for (values,) in logged:
+        assert np.size(values) == 2, logged
+
+
+# ------------------------------------------------------------------ C#, Unity, shell
+
+
+def balanced(code: str) -> bool:
+    plain = re.sub(r"//[^\n]*", "", re.sub(r'"(\\.|[^"\\])*"', '""', code))
+    stack: list[str] = []
+    for letter in plain:
+        if letter in "([{":
+            stack.append(")]}"["([{".index(letter)])
+        elif letter in ")]}" and (not stack or stack.pop() != letter):
+            return False
+    return not stack
+
+
+@pytest.mark.parametrize("target", ["tensorflowsharp", "inference-engine"])
+@pytest.mark.parametrize("name", NAMES)
+def test_csharp_feeds_every_input_and_reads_the_action(name: str, target: str, out: Path) -> None:
+    code, bundle = code_of(out, name, target), bundle_of(out, name)
+    assert balanced(code)
+    for line in (line.split("//")[0].strip() for line in code.splitlines()):
+        assert re.search(r"^$|[;{})]$|^public (static )?class \w+( : MonoBehaviour)?$", line), line
+    fed = 'runner.AddInput(graph["{}"][0]' if target == "tensorflowsharp" else 'worker.SetInput("{}"'
+    read = 'runner.Fetch(graph["{}"][0]' if target == "tensorflowsharp" else 'worker.PeekOutput("{}"'
+    for spec in bundle.signature.inputs:
+        assert code.count(fed.format(spec.name)) == 1
+    assert read.format(bundle.plain(bundle.heads[0]).name) in code
+    assert not re.search(r"\$\w", code)
+    if bundle.memory is not None:
+        assert read.format(bundle.memory[1]) in code
+        assert "memory = " in code
+    if target == "tensorflowsharp" and bundle.previous is not None:
+        assert "previous[0, branch] = (int)action[0, branch];" in code
+
+
+def test_csharp_arrays_have_the_ranks_and_types_of_the_contract(out: Path) -> None:
+    code = code_of(out, "visual", "tensorflowsharp")
+    assert "new float[1, 20, 20, 3]" in code
+    assert "(float[,])output[0].GetValue()" in code
+    code = code_of(out, "recurrent", "tensorflowsharp")
+    assert "var previous = new int[1, 2];" in code
+    assert "new float[,] { { 1f, 1f, 1f, 1f, 1f } }" in code
+    assert "(long[,])output[0].GetValue()" in code
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_container_mounts_the_model_as_its_first_version(name: str, out: Path) -> None:
+    code = code_of(out, name, "serving-docker")
+    assert f'source="$(pwd)"/{name}/saved_model,target=/models/{name}/1,readonly' in code
+    assert f"MODEL_NAME={name} tensorflow/serving" in code
+    assert subprocess.run(["sh", "-n"], input=code, text=True).returncode == 0
+    absolute, _ = snippets(read_bundle(out / name), "serving-docker")
+    assert f"source={(out / name).as_posix()}/saved_model," in absolute[0].code
+
+
+def test_the_internal_brain_is_told_what_its_inspector_asks(out: Path) -> None:
+    text = code_of(out, "continuous", "internal-brain")
+    assert "ML-Agents 0.1, 0.2, 0.3-0.4, 0.5: Brain Type Internal" in text
+    assert re.search(r"Vector Observation Node Name +state\n", text)
+    assert re.search(r"Action Node Name +action\n", text)
+    assert "epsilon: Floating Point, Min Value 0, Max Value 0" in text
+    assert "Space Size 8, Stacked Vectors 1; or, as it was trained, Space Size x Stacked Vectors: 4 x 2" in text
+    assert re.search(r"Graph Scope +\(empty\)", text)
+    assert "Width 20, Height 20, colour" in code_of(out, "visual", "internal-brain")
+
+
+def test_the_internal_brain_knows_its_generations(out: Path) -> None:
+    text = code_of(out, "discrete", "internal-brain")
+    assert "ML-Agents 0.5: Brain Type Internal" in text
+    assert re.search(r"Action Node Name +deterministic_action\n", text)
+    assert "ML-Agents 0.3-0.4: not this policy: it has one branch of discrete actions" in text
+    assert "Branches Size 3: 3, 2, 4" in text
+    assert "ML-Agents 0.6: not this bundle: it does not know state" in text
+    assert "asks a policy with memory for memory_size and sequence_length" in code_of(
+        out, "recurrent", "internal-brain"
+    )
+    scoped = code_of(out, "own-names-Goalie-Brain-2", "internal-brain")
+    assert re.search("Graph Scope +Goalie-Brain-2/", scoped)
+    assert re.search(r"Node Name +state\n", scoped)
+
+
+# ------------------------------------------------------------------ the command
+
+
+def test_the_command_prints_all_or_one(out: Path) -> None:
+    ran = run("snippets", out / "continuous")
+    assert ran.status == 0
+    for target in TARGETS:
+        assert f"(--for {target.name})" in ran.out
+    one = run("snippets", out / "continuous", "--for", "onnxruntime")
+    made, _ = snippets(read_bundle(out / "continuous"), "onnxruntime")
+    assert one.out == made[0].code
+    group = run("snippets", out / "continuous", "--for", "serving").out
+    assert group.count("====\n") == 3
+
+
+def test_json_has_every_snippet(out: Path) -> None:
+    content = run("snippets", out / "recurrent", "--json").json
+    assert [s["name"] for s in content["snippets"]] == [t.name for t in TARGETS]
+    assert content["left_out"] == {}
+
+
+def test_labels_are_comments(out: Path) -> None:
+    assert "# 2 continuous actions: 0 roll </script>, 1 pitch" in code_of(out, "continuous", "onnxruntime")
+    page = code_of(out, "continuous", "tfjs")
+    assert "1 pitch" in page
+    assert page.count("</script>") == 2
+
+
+def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:
+    (result,) = export_model(fixture("continuous"), tmp_path, to="bytes", verify="none")
+    ran = run("snippets", result.folder)
+    assert "left out: onnxruntime needs onnx, which this bundle has not" in ran.out
+    assert "left out: policy-ort needs tfjs and onnx" in ran.out
+    assert "(--for tensorflowsharp)" in ran.out
+    is_refused(run("snippets", result.folder, "--for", "onnxruntime"), "has no onnx", "fix")
+    is_refused(run("snippets", result.folder, "--for", "swift"), "there is no such target", "onnxruntime")
+    is_refused(run("snippets", tmp_path / "none"), "is no bundle")
+
+
+def test_a_recurrent_policy_with_the_nodes_of_its_trainer_runs_in_unity(tmp_path: Path) -> None:
+    (result,) = export_model(fixture("recurrent"), tmp_path, names="source", to="bytes", verify="none")
+    made, _ = snippets(read_bundle(result.folder), "internal-brain")
+    assert "ML-Agents 0.5: Brain Type Internal" in made[0].code
+    assert re.search(r"Recurrent Input Node Name +recurrent_in\n", made[0].code)
+
+
+@pytest.mark.corpus
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared: public models")
+@pytest.mark.parametrize("kind", ["onnx", "nn", "bytes"])
+def test_every_kind_of_public_policy_has_snippets(kind: str, tmp_path: Path) -> None:
+    files = sorted((SHARED / "corpus" / kind).rglob(f"*.{kind}"))
+    rendered = 0
+    for number, file in enumerate(files[:: max(1, len(files) // 12)]):
+        try:
+            results = list(export([file], ExportOptions(tmp_path / str(number), verify="none")))
+        except ExportModelError:
+            continue
+        for result in results:
+            made, lacking = snippets(read_bundle(result.folder))
+            assert len(made) == len(TARGETS) and not lacking
+            for snippet in made:
+                if snippet.target.language == "python":
+                    compile(snippet.code, snippet.target.name, "exec")
+                if snippet.target.language == "csharp":
+                    assert balanced(snippet.code), snippet.code
+            rendered += 1
+    assert rendered
+
+
+def test_a_changed_bundle_is_refused(tmp_path: Path) -> None:
+    (result,) = export_model(fixture("continuous"), tmp_path, to="bytes", verify="none")
+    with (result.folder / "continuous.bytes").open("ab") as file:
+        file.write(b"x")
+    is_refused(run("snippets", result.folder), "has been changed since it was exported")
+
+
+def test_names_for_code() -> None:
+    assert class_name("3DBall") == "Policy3DBall"
+    assert class_name("own-names.v2") == "OwnNamesV2Policy"
+    assert identifier("Brain/state") == "Brain_state"
+    assert identifier("0") == "input_0"
+    lines = folded("state: numbers", [f"{i} {'x' * 20}" for i in range(12)])
+    assert len(lines) > 1
+    assert max(map(len, lines)) <= 102
