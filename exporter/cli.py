@@ -264,10 +264,12 @@ def _result_dict(result: ExportResult) -> dict[str, Any]:
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
 @click.option("--svg", type=click.Path(path_type=Path), metavar="FILE", help="Write a picture of the policy.")
+@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
 @_understanding
 def inspect_command(
     source: Path,
     step: int | None,
+    sensors: str,
     as_json: bool,
     logdir: Path | None,
     svg: Path | None,
@@ -280,7 +282,9 @@ def inspect_command(
     from converters.source import ReadOptions
     from exporter.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, _compile_options(brain, inputs, outputs, values), ReadOptions(step))
+    found = inspect_source(
+        source, _compile_options(brain, inputs, outputs, values), ReadOptions(step, _shapes(sensors))
+    )
     written: list[Path] = []
     if logdir is not None or svg is not None:
         from exporter.pictures import write_pictures

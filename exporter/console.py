@@ -178,6 +178,9 @@ class Console:
         if "bytes" in targets and names == "canonical":
             click.echo("note: Unity looks nodes up by the trainer's names: export with --names source for Unity")
         folder = results[-1].folder
+        if results[-1].report is None:
+            click.echo(f"next: export-model verify {folder}    (nothing was compared yet)")
+            return
         if "tfjs" in targets:
             click.echo(f"next: export-model serve {folder}    (see it act, in a browser)")
         click.echo(f"next: export-model snippets {folder}    (code for Python, TF Serving, JavaScript, C#, Unity)")

@@ -137,6 +137,8 @@ def _write(job: _Job, writers: Mapping[str, Any], options: ExportOptions) -> tup
         origin["model"] = job.model.name
     if options.read.step is not None:
         origin["step"] = options.read.step
+    if options.read.sensors:
+        origin["sensors"] = [list(shape) for shape in options.read.sensors]
     content = bundle.contract(job.policy, origin)
     with naming(job.source.path):
         how = WriteOptions(bundle.compact(content), options.opset)
@@ -293,7 +295,9 @@ def _original_of(source: Path, content: Mapping[str, Any], step: int | None) -> 
     A run's folder is read at ``step``, by default at the one that the export asked for.
     """
     asked = content["source"].get("step")
-    found = read_source(source, ReadOptions(step if step is not None or not isinstance(asked, int) else asked))
+    sensors = tuple(tuple(shape) for shape in content["source"].get("sensors", ()))
+    read = ReadOptions(step if step is not None or not isinstance(asked, int) else asked, sensors)
+    found = read_source(source, read)
     if found.sha256 != content["source"]["sha256"]:
         raise BundleError(
             "is not the source of this bundle",

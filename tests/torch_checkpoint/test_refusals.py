@@ -176,6 +176,19 @@ def test_images_are_refused_with_what_is_missing_and_the_flag_that_says_it(name:
     assert "--sensors" in str(caught.value)
 
 
+def test_the_shapes_are_kept_for_another_look_at_the_source(tmp_path: Path) -> None:
+    """inspect takes them too, and verify --source finds them in policy.json."""
+    source = image(tmp_path, "resnet_1_1")
+    shapes = ",".join("x".join(map(str, s)) for s in IMAGES["resnet_1_1"].sensors)
+    inspected = export_model("inspect", source, "--sensors", shapes, "--json")
+    assert inspected.status == 0, inspected.err
+    exported = export_model(source, "-o", tmp_path / "out", "--sensors", shapes, "--verify", "none")
+    assert exported.status == 0, exported.err
+    (folder,) = (tmp_path / "out").iterdir()
+    again = export_model("verify", folder, "--source", source, "--runtimes", "numpy", "--allow-unverified")
+    assert again.status == 0, again.err
+
+
 def test_the_sizes_that_would_fit_are_listed(tmp_path: Path) -> None:
     with pytest.raises(SourceError) as caught:
         read_source(image(tmp_path, "resnet_1_1"))

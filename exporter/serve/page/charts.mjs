@@ -47,7 +47,7 @@ export class Bars {
   }
 }
 
-export const percent = (share) => `${(100 * share).toFixed(share > 0.0995 || share === 0 ? 0 : 1)} %`;
+export const percent = (share) => `${(100 * share).toFixed(share > 0.0995 || share < 0.0005 ? 0 : 1)} %`;
 
 /** Numbers as cells from blue over paper to orange; ±`most` are the full colours. */
 export class Strip {
