@@ -76,7 +76,8 @@ class _Book:
         return len(self.data)
 
     def add(self, case: Case, answers: Mapping[str, np.ndarray], *, continues: bool = False) -> None:
-        scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
+        scored = (s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS))
+        scores = next((answers[name] for name in scored if name in answers), None)
         outputs = []
         for spec in self.signature.outputs:
             if spec.name not in answers:
@@ -88,8 +89,8 @@ class _Book:
             entry = self._tensor(spec.name, value)
             if spec.role is Role.LOG_PROBS:
                 entry["floored"] = list(branches) if sum(branches) == value.shape[-1] else [value.shape[-1]]
-            if spec.role is Role.DETERMINISTIC and value.dtype.kind != "f" and branches and scores in answers:
-                open_ = ties(answers[scores], branches, Tolerance())
+            if spec.role is Role.DETERMINISTIC and value.dtype.kind != "f" and branches and scores is not None:
+                open_ = ties(scores, branches, Tolerance())
                 if open_.shape == value.shape and open_.any():
                     entry["ties"] = [int(i) for i in np.flatnonzero(open_)]
             outputs.append(entry)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socketserver
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -32,6 +33,10 @@ class SiteServer(ThreadingHTTPServer):
     def __init__(self, site: Mapping[str, bytes], host: str, port: int) -> None:
         self.site = site
         super().__init__((host, port), _Handler)
+
+    def server_bind(self) -> None:
+        """Without HTTPServer's look-up of the machine's name, which takes seconds where no network answers."""
+        socketserver.TCPServer.server_bind(self)
 
     @property
     def url(self) -> str:

@@ -25,7 +25,7 @@ export function text(value, digits = 3) {
   const size = Math.abs(value);
   if (!Number.isFinite(value)) return Number.isNaN(value) ? "not a number" : value < 0 ? "−∞" : "∞";
   const written = size >= 1e5 || size < 1e-3 ? value.toExponential(1) : value.toFixed(size >= 100 ? 1 : digits);
-  return written.replace("-", "−");
+  return written.replaceAll("-", "−");
 }
 
 export const milliseconds = (value) => `${value < 10 ? value.toFixed(2) : value.toFixed(1)} ms`;

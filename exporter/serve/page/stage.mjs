@@ -31,6 +31,8 @@ export class Stage {
   #shown = { numbers: 0, text: 0 };
   #colours;
   #busy = Promise.resolve();
+  /** The loop that runs; one that was paused and has not noticed yet is another. */
+  #loop = 0;
 
   constructor(view, host, names) {
     this.#view = view;
@@ -201,9 +203,10 @@ export class Stage {
   }
 
   async #run() {
+    const own = ++this.#loop;
     let [last, behind] = [performance.now(), 0];
     try {
-      while (!this.#paused) {
+      while (!this.#paused && own === this.#loop) {
         await frame();
         const now = performance.now();
         const speed = Number(this.#parts.speed.value);

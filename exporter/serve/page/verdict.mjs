@@ -20,7 +20,7 @@ export class Verdict {
       return h(
         "div",
         { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
-        h("table", { class: `facts ${extra}` }, h("caption", {}, caption), head(...columns), body),
+        h("table", { class: `facts ${extra}` }, h("caption", { class: "hidden" }, caption), head(...columns), body),
       );
     };
     $("check-body").append(

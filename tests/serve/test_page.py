@@ -1,0 +1,205 @@
+"""The page in Chromium: the policy acts, answers what is asked, says whether it is right, and asks nobody else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from exporter.acting.policy import load_policy
+from exporter.serve.site import assemble
+from tests.serve.browsing import CHECKED, Visit, served, visit
+from tests.serve.conftest import Bundle
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
+
+VERDICT = "document.querySelector('#verdict').textContent"
+STATES = "[...document.querySelectorAll('[data-backend]')].map((row) => [row.dataset.backend, row.dataset.state])"
+STATUS = "({...document.querySelector('#status').dataset})"
+ACTIONS = "[...document.querySelectorAll('.answering .bars .value')].map((cell) => cell.textContent)"
+DECIDED = "document.querySelector('#timing').textContent.startsWith('Decided')"
+#: Controls without a name for a screen reader, images without an alternative, elements with the same id.
+UNNAMED = """[...document.querySelectorAll("button, input, select, canvas, [role=img], [role=region]")]
+  .filter((e) => !(e.labels?.length || e.getAttribute("aria-label")))
+  .filter((e) => !(e.tagName === "BUTTON" && e.textContent.trim()))
+  .map((e) => e.outerHTML.slice(0, 120))"""
+TWINS = """[...document.querySelectorAll("[id]")].map((e) => e.id).filter((id, i, all) => all.indexOf(id) !== i)"""
+#: Text that is not 4.5 times as light or dark as what is behind it (WCAG AA).
+FAINT = """(() => {
+  const numbers = (colour) => colour.match(/[\\d.]+/g).map(Number);
+  const light = (rgb) => {
+    const [r, g, b] = rgb.map((v) => (v / 255 <= 0.04045 ? v / 255 / 12.92 : ((v / 255 + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const behind = (e) => {
+    for (; e; e = e.parentElement) {
+      const colour = numbers(getComputedStyle(e).backgroundColor);
+      if (colour.length === 3 || colour[3] > 0) return colour;
+    }
+    return [255, 255, 255];
+  };
+  return [...document.querySelectorAll("body *")].filter((e) => {
+    if (!e.checkVisibility() || e.disabled) return false;
+    if (![...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) return false;
+    const [a, b] = [light(numbers(getComputedStyle(e).color)), light(behind(e))].sort((x, y) => y - x);
+    return (a + 0.05) / (b + 0.05) < 4.5;
+  }).map((e) => e.outerHTML.slice(0, 120));
+})()"""
+
+
+def see(bundle: Path, *steps: list[object], scene: str = "auto", **context: object) -> Visit:
+    """A visit once the check is done; nothing may be written to the console, and no other origin be asked."""
+    with served(assemble(bundle, scene)) as server:
+        seen = visit(server.url, [["wait", CHECKED], *steps], **context)
+        assert seen.console == []
+        assert [address for address in seen.requests if not address.startswith(server.url)] == []
+        return seen
+
+
+def test_the_policy_keeps_the_balls_up_for_20_seconds_on_each_backend(bundle: Bundle) -> None:
+    for backend in ("cpu", "wasm"):
+        seen = see(
+            bundle("3DBall"),
+            ["select", "#backend", backend],
+            ["wait", "!document.querySelector('#backend').disabled"],
+            ["click", "#reset"],
+            ["select", "#speed", "8"],
+            ["wait", f"{STATUS}.seconds > 20.5"],
+            ["eval", STATUS],
+            ["eval", "document.querySelector('#canvas').getAttribute('aria-label')"],
+            ["eval", VERDICT],
+            ["eval", STATES],
+        )
+        status, described, verdict, states = seen.results[-4:]
+        assert (status["good"], status["bad"]) == ("12", "0")
+        assert described.startswith("12 tilting platforms")
+        assert verdict.startswith("Yes. In your browser cpu, wasm, webgl give the reference's")
+        assert sorted(states) == [["cpu", "agrees"], ["wasm", "agrees"], ["webgl", "agrees"]]
+
+
+def test_without_its_memory_the_hallway_is_a_guess(bundle: Bundle) -> None:
+    """The page must feed each agent's own memory back, and begin anew with its episodes."""
+    seen = see(bundle("Hallway"), ["select", "#speed", "8"], ["wait", f"Number({STATUS}.good) >= 12"], ["eval", STATUS])
+    assert seen.results[-1]["bad"] == "0"
+
+
+@pytest.mark.parametrize(("name", "least"), [("GridWorld", 10), ("Tennis-LeftBrain", 0), ("Tennis-RightBrain", 0)])
+def test_the_other_environments_are_played(bundle: Bundle, name: str, least: int) -> None:
+    seen = see(
+        bundle(name),
+        ["select", "#speed", "8"],
+        ["wait", f"{STATUS}.seconds > 10 && Number({STATUS}.good) >= {least}"],
+        ["click", "#poke"],
+        ["click", "#step"],
+        ["eval", "document.querySelector('#pause').textContent"],
+        ["click", "#reset"],
+        ["wait", f"{STATUS}.seconds === '0'"],
+        ["eval", "document.querySelector('#problem').hidden"],
+    )
+    assert seen.results[-4] == "Play", "a single step pauses"
+    assert seen.results[-1]
+
+
+def test_a_slider_changes_the_action_to_what_python_answers(bundle: Bundle) -> None:
+    folder = bundle("continuous")
+    seen = see(
+        folder,
+        ["wait", DECIDED],
+        ["eval", ACTIONS],
+        ["focus", ".slider input[type=range]"],
+        *[["press", "ArrowRight"]] * 9,
+        ["eval", "new Promise((resolve) => setTimeout(resolve, 300))"],
+        ["eval", "[...document.querySelectorAll('.slider input[type=number]')].map((box) => box.valueAsNumber)"],
+        ["eval", ACTIONS],
+    )
+    before, values, after = seen.results[2], seen.results[-2], seen.results[-1]
+    assert before != after
+    policy = load_policy(folder, runtime="numpy")
+    expected = policy.decide(np.array([values], np.float32), deterministic=True).action[0]
+    shown = [float(text.replace("−", "-")) for text in after]
+    np.testing.assert_allclose(shown, expected, atol=6e-3)  # three digits are shown, of inputs with four
+
+
+def test_masks_memory_and_chance_have_their_controls(bundle: Bundle) -> None:
+    seen = see(
+        bundle("recurrent"),
+        ["wait", DECIDED],
+        ["eval", ACTIONS],
+        ["click", ".asking .boxes input[type=checkbox]"],  # the first action of the first branch
+        ["wait", f"{ACTIONS}[0] === '0 %'"],
+        ["click", "#next-step"],
+        ["wait", "!document.querySelector('.asking canvas').getAttribute('aria-label').includes('all 0')"],
+        ["click", ".asking fieldset button"],
+        ["wait", "document.querySelector('.asking canvas').getAttribute('aria-label').includes('all 0')"],
+    )
+    assert seen.results[2][0] != "0 %"
+
+
+def test_images_can_be_painted_and_filled(bundle: Bundle) -> None:
+    seen = see(
+        bundle("visual"),
+        ["wait", DECIDED],
+        ["eval", ACTIONS],
+        ["click", ".picture"],
+        ["eval", "new Promise((resolve) => setTimeout(resolve, 500))"],
+        ["eval", ACTIONS],
+        ["click", ".painting button"],
+        ["eval", "new Promise((resolve) => setTimeout(resolve, 500))"],
+        ["eval", ACTIONS],
+    )
+    assert len({json.dumps(seen.results[i]) for i in (2, 5, 8)}) == 3
+
+
+def test_a_wrong_answer_is_not_called_right(bundle: Bundle) -> None:
+    site = assemble(bundle("discrete"))
+    entry = next(e for e in json.loads(site["golden.json"])["cases"][0]["outputs"] if e["name"] == "value_estimate")
+    data = bytearray(site["golden.bin"])
+    at = slice(entry["offset"], entry["offset"] + 4)
+    data[at] = (np.frombuffer(bytes(data[at]), "<f4") + np.float32(0.25)).tobytes()
+    with served({**site, "golden.bin": bytes(data)}) as server:
+        seen = visit(server.url, [["wait", CHECKED], ["eval", VERDICT], ["eval", STATES]])
+    assert seen.results[1].startswith("No: cpu is off by 0.250 at value_estimate")
+    assert {state for _, state in seen.results[2]} == {"differs"}
+
+
+def test_a_backend_that_fails_says_why(bundle: Bundle) -> None:
+    site = assemble(bundle("continuous"))
+    broken = {name: data for name, data in site.items() if not name.endswith(".wasm")}
+    with served(broken) as server:
+        seen = visit(
+            server.url,
+            [
+                ["wait", CHECKED],
+                ["eval", STATES],
+                ["eval", "document.querySelector('[data-backend=wasm] .wide').textContent"],
+                ["eval", VERDICT],
+            ],
+        )
+    assert dict(seen.results[1]) == {"cpu": "agrees", "wasm": "did not run", "webgl": "agrees"}
+    assert seen.results[2]
+    assert "1 of 3 did not run" in seen.results[3]
+
+
+@pytest.mark.parametrize("name", ["3DBall", "recurrent", "visual"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_is_accessible_and_fits_a_phone(bundle: Bundle, name: str, scheme: str) -> None:
+    seen = see(
+        bundle(name),
+        ["eval", "document.querySelectorAll('details').forEach((d) => (d.open = true))"],
+        ["eval", UNNAMED],
+        ["eval", TWINS],
+        ["eval", FAINT],
+        ["eval", "[document.documentElement.scrollWidth, innerWidth]"],
+        ["eval", "[...document.querySelectorAll('header, main, footer, h1')].length"],
+        ["eval", "document.querySelector('#pause')?.textContent ?? 'Play'"],
+        viewport={"width": 360, "height": 740},
+        colorScheme=scheme,
+        reducedMotion="reduce",
+    )
+    unnamed, twins, faint, (width, room), landmarks, button = seen.results[-6:]
+    assert (unnamed, twins, faint) == ([], [], [])
+    assert width <= room
+    assert landmarks == 4
+    assert button == "Play", "nothing moves by itself where the visitor wants it so"

@@ -1,0 +1,185 @@
+"""The page's files: all there, nothing foreign, the same bytes each time; and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from exporter.acting.policy import load_policy
+from exporter.runtimes import javascript
+from exporter.serve.scenes import other_side
+from exporter.serve.server import TYPES
+from exporter.serve.site import PAGE, assemble, write_site
+from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
+from tests.commands import export_model, files_in, is_refused
+from tests.serve.conftest import Bundle
+
+OWN = [p for p in sorted(PAGE.rglob("*")) if p.is_file()]
+
+
+@pytest.mark.parametrize("path", OWN, ids=lambda p: p.relative_to(PAGE).as_posix())
+def test_no_file_of_the_page_names_another_origin(path: Path) -> None:
+    text = path.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+    assert not re.search(r"(https?:)?//[a-z0-9.-]+\.[a-z]{2,}", text)
+    assert path.suffix in TYPES, "the server would not serve it"
+
+
+def test_every_file_that_is_named_is_there(bundle: Bundle) -> None:
+    site = assemble(bundle("continuous"))
+    for name, data in site.items():
+        folder = Path(name).parent
+        if name.endswith(".mjs"):
+            for found in re.findall(rb'^(?:import|export) .*?from "(\.[^"]+)"', data, re.M):
+                parts = [p for p in (folder / found.decode()).parts if p != "."]
+                while ".." in parts:
+                    at = parts.index("..")
+                    del parts[at - 1 : at + 1]
+                assert "/".join(parts) in site, (name, found)
+    for found in re.findall(rb'(?:src|href)="([^"#]+)"', site["index.html"]):
+        assert found.decode() in site
+    said = json.loads(site["site.json"])
+    assert [b["name"] for b in said["backends"]] == ["cpu", "wasm", "webgl"]
+    assert all(b["script"] is None or b["script"] in site for b in said["backends"])
+    assert [a["name"] for a in said["absent"]] == ["webgpu"]
+    assert all(b"sourceMappingURL" not in data for name, data in site.items() if name.startswith("vendor/"))
+
+
+def test_a_bundle_gives_the_same_bytes_each_time(bundle: Bundle) -> None:
+    assert assemble(bundle("recurrent")) == assemble(bundle("recurrent"))
+
+
+@pytest.mark.parametrize(
+    ("name", "scene", "side"),
+    [
+        ("3DBall", "ball3d", None),
+        ("GridWorld", "gridworld", None),
+        ("Hallway", "hallway", None),
+        ("Tennis-LeftBrain", "tennis", "left"),
+        ("Tennis-RightBrain", "tennis", "right"),
+        ("continuous", None, None),
+    ],
+)
+def test_known_environments_are_found_by_name_and_shape(
+    bundle: Bundle, name: str, scene: str | None, side: str | None
+) -> None:
+    said = json.loads(assemble(bundle(name))["site.json"])
+    assert (said["scene"], said["side"]) == (scene, side)
+    assert said["opponent"] == (other_side(name)[0] if side else None)
+
+
+def test_a_scene_that_is_asked_for_must_fit(bundle: Bundle) -> None:
+    assert json.loads(assemble(bundle("3DBall"), "none")["site.json"])["scene"] is None
+    assert json.loads(assemble(bundle("3DBall"), "ball3d")["site.json"])["scene"] == "ball3d"
+    with pytest.raises(UsageError, match="does not fit"):
+        assemble(bundle("3DBall"), "gridworld")
+
+
+def test_a_brain_without_the_other_plays_alone(bundle: Bundle, tmp_path: Path) -> None:
+    shutil.copytree(bundle("Tennis-LeftBrain"), tmp_path / "Tennis-LeftBrain")
+    site = assemble(tmp_path / "Tennis-LeftBrain")
+    assert json.loads(site["site.json"])["opponent"] is None
+    assert not any(name.startswith("opponent/") for name in site)
+
+
+# ---- the golden inputs -----------------------------------------------------------------------------------------------
+
+
+def tensor(data: bytes, entry: dict[str, Any]) -> np.ndarray:
+    dtype = {"int64": "<i4", "int32": "<i4", "bool": "u1", "float32": "<f4"}[entry["dtype"]]
+    count = int(np.prod(entry["shape"]))
+    return np.frombuffer(data, dtype, count, entry["offset"]).reshape(entry["shape"]).astype(entry["dtype"])
+
+
+@pytest.mark.parametrize("name", ["3DBall", "discrete", "Hallway", "visual"])
+def test_golden_answers_are_onnxruntimes(bundle: Bundle, name: str, tmp_path: Path) -> None:
+    """The reference comes from the numpy kernels; onnxruntime is the other opinion."""
+    pytest.importorskip("onnxruntime")
+    assert export_model(bundle(name) / f"{name}.bytes", "-o", tmp_path, "--to", "onnx", "--verify", "none").status == 0
+    policy = load_policy(tmp_path / name, runtime="onnxruntime")
+    site = assemble(bundle(name))
+    said = json.loads(site["golden.json"])
+    assert {c["rows"] for c in said["cases"]} >= {1, 2, 7}
+    memory = policy.signature.memory
+    assert sum(c["continues"] for c in said["cases"]) == (0 if memory is None else 3)
+    for case in said["cases"]:
+        feeds = {e["name"]: tensor(site["golden.bin"], e) for e in case["inputs"]}
+        answers = policy._run(feeds, [e["name"] for e in case["outputs"]])
+        for entry in case["outputs"]:
+            if entry.get("floored") or entry.get("ties"):
+                continue
+            expected = tensor(site["golden.bin"], entry)
+            bound = said["tolerance"][entry["name"]]
+            np.testing.assert_allclose(answers[entry["name"]], expected, rtol=bound["rtol"], atol=bound["atol"])
+
+
+def test_what_a_sampler_decides_is_not_golden(bundle: Bundle) -> None:
+    said = json.loads(assemble(bundle("sampled"))["golden.json"])
+    assert said["left_out"] == ["action"]
+    assert all(e["name"] != "action" for c in said["cases"] for e in c["outputs"])
+
+
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
+
+def test_bundles_that_cannot_be_shown_are_refused(bundle: Bundle, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="no bundle"):
+        assemble(tmp_path)
+    source = bundle("continuous") / "continuous.bytes"
+    for targets, missing in (("bytes", "tfjs/model.json"), ("tfjs", "continuous.bytes")):
+        assert export_model(source, "-o", tmp_path, "--to", targets, "--verify", "none").status == 0
+        with pytest.raises(BundleError, match=f"has no {re.escape(missing)}"):
+            assemble(tmp_path / "continuous")
+    changed = shutil.copytree(bundle("continuous"), tmp_path / "changed")
+    (changed / "tfjs" / "model.json").write_text("{}")
+    with pytest.raises(BundleError, match="changed since"):
+        assemble(changed)
+
+
+def test_without_the_npm_packages_it_says_what_to_install(
+    bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = bundle("continuous")
+    monkeypatch.setenv(javascript.JS_VARIABLE, str(tmp_path))
+    with pytest.raises(RuntimeUnavailableError, match="export-model runtimes install tfjs"):
+        assemble(folder)
+    is_refused(export_model("serve", folder, "--out", tmp_path / "page"), "runtimes install tfjs", status=3)
+    assert files_in(tmp_path) == set()
+
+
+# ---- --out -----------------------------------------------------------------------------------------------------------
+
+
+def test_out_writes_the_site_and_replaces_only_its_own(bundle: Bundle, tmp_path: Path) -> None:
+    place = tmp_path / "deep" / "page"
+    ran = export_model("serve", bundle("continuous"), "--out", place)
+    assert ran.status == 0, ran.err
+    site = assemble(bundle("continuous"))
+    assert {name: (place / name).read_bytes() for name in site} == site
+    assert {n for n in files_in(place) if (place / n).is_file()} == set(site)
+    (place / "old.txt").write_text("of an older version")
+    assert export_model("serve", bundle("3DBall"), "--out", place).status == 0
+    assert not (place / "old.txt").exists()
+    assert files_in(tmp_path / "deep") == {"page", *(f"page/{n}" for n in files_in(place))}
+
+
+@pytest.mark.parametrize("inside", ["notes.txt", "policy.json", "site.json"])
+def test_out_never_replaces_what_is_not_ours(bundle: Bundle, tmp_path: Path, inside: str) -> None:
+    place = tmp_path / "page"
+    place.mkdir()
+    (place / inside).write_text("{}")
+    is_refused(export_model("serve", bundle("continuous"), "--out", place), "is in the way")
+    assert files_in(tmp_path) == {"page", f"page/{inside}"}
+    file = tmp_path / "file"
+    file.write_text("")
+    with pytest.raises(BundleError, match="in the way"):
+        write_site({"index.html": b""}, file)
+
+
+def test_out_and_open_contradict_each_other(bundle: Bundle, tmp_path: Path) -> None:
+    is_refused(export_model("serve", bundle("continuous"), "--out", tmp_path / "x", "--open"), "--open")

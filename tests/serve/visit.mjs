@@ -1,0 +1,60 @@
+/**
+ * Opens a page in Chromium and does what stdin says; prints what was seen as JSON.
+ *
+ *     node visit.mjs MODULES CHROMIUM < {"url", "context": {…}, "steps": [[verb, …arguments], …]}
+ *
+ * `results` has an entry per step, `console` what was written there as a warning or an error, `requests` every address
+ * that was asked for.
+ */
+
+import { createRequire } from "node:module";
+import path from "node:path";
+import process from "node:process";
+import { text } from "node:stream/consumers";
+
+/** In ms: more than a busy machine takes, so that what never comes is a failure and not a hang. */
+const PATIENCE = 300_000;
+const FLAGS = [
+  "--no-sandbox",
+  "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+  ...["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+];
+
+const [modules, executablePath] = process.argv.slice(2);
+const { url, context, steps } = JSON.parse(await text(process.stdin));
+const { chromium } = createRequire(path.join(path.resolve(modules), "package.json"))("playwright-core");
+const browser = await chromium.launch({ executablePath, args: FLAGS, timeout: PATIENCE });
+const seen = { results: [], console: [], requests: [] };
+try {
+  const page = await (await browser.newContext(context)).newPage();
+  page.setDefaultTimeout(PATIENCE);
+  page.on("console", (message) => {
+    if (["warning", "error"].includes(message.type())) seen.console.push(`${message.type()}: ${message.text()}`);
+  });
+  page.on("pageerror", (error) => seen.console.push(`pageerror: ${error.stack}`));
+  page.on("request", (request) => seen.requests.push(request.url()));
+  await page.goto(url);
+  const verbs = {
+    // Not waitForFunction: it evaluates inside the page, whose policy forbids that.
+    async wait(expression) {
+      const end = Date.now() + PATIENCE;
+      while (!(await page.evaluate(expression))) {
+        if (Date.now() > end) throw new Error(`it never came to pass that ${expression}`);
+        await page.waitForTimeout(100);
+      }
+    },
+    eval: (expression) => page.evaluate(expression),
+    click: (selector) => page.click(selector),
+    select: async (selector, value) => void (await page.selectOption(selector, value)),
+    fill: (selector, value) => page.fill(selector, value),
+    focus: (selector) => page.focus(selector),
+    press: (key) => page.keyboard.press(key),
+    shot: async (file, fullPage = true) => void (await page.screenshot({ path: file, fullPage })),
+  };
+  for (const [verb, ...rest] of steps) seen.results.push((await verbs[verb](...rest)) ?? null);
+} catch (error) {
+  seen.failure = error.message;
+} finally {
+  await browser.close();
+}
+console.log(JSON.stringify(seen));
