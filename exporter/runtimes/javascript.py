@@ -89,7 +89,7 @@ def install_packages(progress: Progress) -> Path:
         with built_beside(target, _UNFINISHED, _has_packages) as building:
             for name in ("package.json", "package-lock.json"):
                 shutil.copyfile(JS_SOURCE / name, building / name)
-            progress("installing TensorFlow.js, onnxruntime-web and playwright-core with npm (110 MB, 460 MB on disk)")
+            progress("installing TensorFlow.js, onnxruntime-web and playwright-core with npm (110 MB, 480 MB on disk)")
             _run_npm_ci(npm, building)
     except OSError as error:
         raise RuntimeUnavailableError(

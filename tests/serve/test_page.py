@@ -53,7 +53,8 @@ def see(bundle: Path, *steps: list[object], scene: str = "auto", **context: obje
     """A visit once the check is done; nothing may be written to the console, and no other origin be asked."""
     with served(assemble(bundle, scene)) as server:
         seen = visit(server.url, [["wait", CHECKED], *steps], **context)
-        assert seen.console == []
+        # Chromium's own words where there is no graphics card; the page says so in its table.
+        assert [said for said in seen.console if said != "warning: No available adapters."] == []
         assert [address for address in seen.requests if not address.startswith(server.url)] == []
         return seen
 

@@ -67,7 +67,7 @@ export class Host {
       this.#loaded.add(script);
       if (backend === "wasm") this.#tf.wasm.setWasmPaths(new URL("vendor/", document.baseURI).href);
     }
-    const reason = unavailable(backend);
+    const reason = await unavailable(backend);
     if (reason !== null) throw new Error(reason);
     const started = await this.#tf.setBackend(backend);
     if (!started || this.#tf.getBackend() !== backend) throw new Error(`the browser does not start ${backend}`);
@@ -88,8 +88,11 @@ export class Host {
 }
 
 /** Why a backend cannot be had, where that is known before trying (trying writes errors to the console). */
-function unavailable(backend) {
-  if (backend === "webgpu" && navigator.gpu === undefined) return "this browser has no WebGPU";
+async function unavailable(backend) {
+  if (backend === "webgpu") {
+    if (navigator.gpu === undefined) return "this browser has no WebGPU";
+    return (await navigator.gpu.requestAdapter()) === null ? "this device has nothing that WebGPU runs on" : null;
+  }
   if (backend !== "webgl") return null;
   const canvas = document.createElement("canvas");
   const context = canvas.getContext("webgl2") ?? canvas.getContext("webgl");
