@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from converters.runner.process import LoadedModel
+from signatures.memories import divided, joined
 from signatures.roles import Role
 from signatures.spec import PolicySignature, SourceMap, TensorSpec
 
@@ -77,8 +78,11 @@ class Original:
         placed = self._feeds(feeds, zero_noise=False)
         fetches = {name: self.source.fetches[name] for name in self.source.fetches if not self._drawn(name)}
         logits = [b for b in self.source.branches if b is not None] if self._has_logits() else []
-        values = self.model.run(placed, list(dict.fromkeys([*fetches.values(), *logits])))
+        parts = {s.name: self.source.parts[s.name] for s in self.signature.outputs if s.name in self.source.parts}
+        tensors = [*fetches.values(), *(p.tensor for given in parts.values() for p in given), *logits]
+        values = self.model.run(placed, list(dict.fromkeys(tensors)))
         results = {name: values[tensor] for name, tensor in fetches.items()}
+        results.update({name: joined(given, values) for name, given in parts.items()})
         scores = [values[b] for b in logits]
         for spec in self.signature.outputs:
             if spec.name in results or not self._derivable(spec):
@@ -109,6 +113,9 @@ class Original:
     def _feeds(self, feeds: Arrays, *, zero_noise: bool) -> dict[str, np.ndarray]:
         batch = self.signature.rows(feeds)
         placed = {tensor: feeds[name] for name, tensor in self.source.feeds.items()}
+        for spec in self.signature.inputs:
+            if spec.name in self.source.parts:
+                placed.update(divided(self.source.parts[spec.name], feeds[spec.name]))
         placed.update({name: np.asarray(value) for name, value in self.source.fixed.items()})
         placed.update({n: np.full([1] * rank, batch, np.int32) for n, rank in self.source.batch_sizes.items()})
         for tensor, dims in self.source.noise.items():

@@ -1,0 +1,25 @@
+"""docs/figures.md is what ``python -m tests.figures`` wrote, and what other pages quote of it is there."""
+
+from __future__ import annotations
+
+import json
+
+from tests import figures
+from tests.commands import ROOT
+
+CONTENT = json.loads(figures.FIGURES.read_text(encoding="utf-8"))
+INDEX = (ROOT / "docs/index.md").read_text(encoding="utf-8")
+
+
+def test_the_page_is_that_of_the_figures() -> None:
+    assert figures.PAGE.read_text(encoding="utf-8") == figures.page(CONTENT)
+
+
+def test_what_the_front_page_quotes() -> None:
+    cells = CONTENT["cells"]
+    assert f"{sum(c['comparisons'] for c in cells):,} comparisons in {len(CONTENT['runtimes']) - 1} runtimes" in INDEX
+    assert not CONTENT["failed"]
+    assert sum(c["failures"] for c in cells) == 0
+    elements = [(float(d), n) for c in cells for d, n in c["elements"].items() if c["runtime"] != "numpy"]
+    below = sum(n for decade, n in elements if decade < 0.99e-5)
+    assert below / sum(n for _, n in elements) > 0.999

@@ -1,0 +1,64 @@
+"""Links of README.md and docs/: files and headings exist, addresses are addresses."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlparse
+
+import pytest
+
+from tests.commands import ROOT
+from tests.docs.blocks import name_of, pages
+
+_FENCED = re.compile(r"^( *)(`{3,}).*?^\1\2\s*$", re.MULTILINE | re.DOTALL)
+_CODE = re.compile(r"`[^`\n]+`")
+_LINK = re.compile(r"(?<!\!)\[[^\]]+\]\(([^)\s]+)\)")
+_IMAGE = re.compile(r"\!\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def links(page: Path) -> list[str]:
+    prose = _CODE.sub("code", _FENCED.sub("", page.read_text(encoding="utf-8")))
+    return [*_LINK.findall(prose), *_IMAGE.findall(prose)]
+
+
+def anchors(page: Path) -> Iterator[str]:
+    """What a forge calls the headings of a page."""
+    seen: Counter[str] = Counter()
+    prose = _FENCED.sub("", page.read_text(encoding="utf-8"))
+    for heading in re.findall(r"^#+ (.*)$", prose, re.MULTILINE):
+        slug = re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+        yield f"{slug}-{seen[slug]}" if seen[slug] else slug
+        seen[slug] += 1
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_links_resolve(page: Path) -> None:
+    for link in links(page):
+        address = urlparse(link)
+        if address.scheme:
+            assert address.scheme == "https", link
+            assert "." in address.netloc, link
+            continue
+        target = (page.parent / address.path).resolve() if address.path else page
+        assert target.is_relative_to(ROOT), f"{link} leaves the repository"
+        assert target.exists(), f"{name_of(page)} links to {link}"
+        if address.fragment:
+            assert address.fragment in set(anchors(target)), f"{name_of(page)} links to {link}"
+
+
+def test_every_page_can_be_reached() -> None:
+    """From index.md, by the tables of contents."""
+    index = (ROOT / "docs/index.md").read_text(encoding="utf-8")
+    listed = set(
+        re.findall(r"^[a-z][a-z\-/]*$", "".join(re.findall(r"```\{toctree\}(.*?)```", index, re.DOTALL)), re.M)
+    )
+    there = {p.relative_to(ROOT / "docs").with_suffix("").as_posix() for p in pages() if p.parent != ROOT} - {"index"}
+    assert listed == there
+
+
+def test_headings_are_found() -> None:
+    assert "pytorch-checkpoints" in set(anchors(ROOT / "docs/sources.md"))
+    assert "sources.md#pytorch-checkpoints" in links(ROOT / "docs/index.md")

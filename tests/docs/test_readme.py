@@ -1,0 +1,46 @@
+"""The first command of the README: ``make demo``."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands import ROOT
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def make() -> str:
+    found = shutil.which("make")
+    if found is None:
+        pytest.skip("make is not here; get it with: apt-get install make")
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("docs")
+def test_make_demo_ends_with_something_to_look_at(make: str, tmp_path: Path) -> None:
+    """In the environment that is there: ``--old-file install`` keeps make from setting up another."""
+    binaries, out = Path(sys.executable).parent, tmp_path / "exported"
+    command = [make, "--old-file", "install", "demo", f"BIN={binaries}", f"OUT={out}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("PASSED: ") == 2
+    assert f"{out}/parity.html" in done.stdout
+    assert f"export-model serve {out}/3DBall" in done.stdout
+    assert (out / "parity.html").stat().st_size > 10_000
+    assert {p.name for p in out.iterdir()} == {"3DBall", "recurrent", "parity.html"}
+
+
+def test_the_commands_of_the_readme_are_goals_of_the_makefile(make: str) -> None:
+    goals = re.findall(r"^make (\w+)", README, re.MULTILINE)
+    assert goals[:2] == ["demo", "test"]
+    for goal in goals:
+        done = subprocess.run([make, "--dry-run", goal], cwd=ROOT, capture_output=True, check=False)
+        assert done.returncode == 0, goal

@@ -1,0 +1,190 @@
+"""A folder in which the names that the documentation uses exist, and what runs its blocks there."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.barracuda.vocabulary import Activation, LayerType
+from exporter.pipeline import ExportOptions, export
+from fixtures import path as fixture
+from tests.barracuda.nn_files import Maker, write_nn
+from tests.commands import ROOT
+from tests.docs.blocks import Block
+
+TRAINED = ROOT / "fixtures/trained/3DBall"
+MODULES = ROOT / "converters/runner/js/node_modules"
+
+
+def furnish(folder: Path) -> None:
+    """Make what the pages take for given: see each line."""
+    shutil.copytree(TRAINED, folder / "results/first_run/3DBall")
+    shutil.copy(TRAINED / "frozen_graph_def.pb", folder / "3DBall.bytes")
+    shutil.copy(TRAINED / "frozen_graph_def.pb", folder / "frozen_graph_def.pb")
+    shutil.copy(fixture("recurrent"), folder / "runner.bytes")
+    (folder / "3DBall.nn").write_bytes(small_nn())
+    for name in ("sb3_discrete.onnx", "torch_actor.onnx", "torch_actor.onnx.data"):
+        shutil.copy(ROOT / "fixtures/sb3" / name, folder)
+    sources = [folder / "3DBall.bytes", folder / "runner.bytes"]
+    list(export(sources, ExportOptions(folder / "exported", verify="none")))
+    bundle = folder / "exported/3DBall"
+    for place in ("out", "last_week", "today"):
+        shutil.copytree(bundle, folder / place / "3DBall")
+    shutil.copytree(bundle / "saved_model", folder / "saved_model")
+    shutil.copytree(bundle / "tfjs", folder / "their_tfjs")
+    shutil.copy(bundle / "3DBall.onnx", folder / "theirs.onnx")
+    shutil.copy(bundle / "3DBall.onnx", folder / "3DBall.onnx")
+    (folder / "fixtures").symlink_to(ROOT / "fixtures")
+    if MODULES.is_dir():
+        (folder / "node_modules").symlink_to(MODULES)
+
+
+def small_nn() -> bytes:
+    """A Barracuda model of 3DBall's size."""
+    random = np.random.default_rng(0)
+    maker = Maker()
+    value = maker.input("vector_observation", 1, 1, 8)
+    for name, size, activation in (("hidden", 16, Activation.TANH), ("action", 2, Activation.NONE)):
+        before = 8 if name == "hidden" else 16
+        weights = {"kernel": random.normal(size=(before, 1, 1, size)) * 0.4, "bias": np.zeros((1, 1, 1, size))}
+        value = maker.layer(name, LayerType.DENSE, value, data=weights, activation=activation)
+    return write_nn(maker.model())
+
+
+class Workshop:
+    """Runs the blocks of one page, one after the other, in one folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._programs = 0
+        self._last = ""
+
+    def run(self, block: Block) -> None:
+        """Run a block, or look at it, as its language and the page say."""
+        if block.verb == "skip":
+            assert len(block.argument) > 10, f"{block.where}: skipped without a reason"
+            return
+        HOW[block.language](self, block)
+
+    def shell(self, block: Block) -> None:
+        command = ["bash", "-euo", "pipefail", "-c", block.text]
+        if block.verb == "until":
+            self._interrupted(command, block)
+        else:
+            self._finished(command, block)
+
+    def python(self, block: Block) -> None:
+        text = f"{self._last}\n\n{block.text}" if block.verb == "continues" else block.text
+        self._last = text
+        self._finished([sys.executable, self._program(text, "py")], block)
+
+    def javascript(self, block: Block) -> None:
+        node = shutil.which("node")
+        if node is None or not MODULES.is_dir():
+            pytest.skip("Node or its packages are not here; get them with: make install")
+        check = ["--check"] if block.verb == "check" else []
+        self._finished([node, *check, self._program(block.text, "mjs")], block)
+
+    def yaml(self, block: Block) -> None:
+        assert pytest.importorskip("yaml").safe_load(block.text), block.where
+
+    def toml(self, block: Block) -> None:
+        assert tomllib.loads(block.text), block.where
+
+    def json(self, block: Block) -> None:
+        assert json.loads(block.text), block.where
+
+    def shown(self, block: Block) -> None:
+        """Output, a picture, or a language of another machine: there must be no command in it."""
+        first = block.text.split(" ")[0]
+        assert first not in ("export-model", "python", "pip", "make"), f"{block.where}: a command in a block of text"
+
+    # ---- processes
+
+    def _program(self, text: str, suffix: str) -> str:
+        self._programs += 1
+        name = f"program{self._programs}.{suffix}"
+        (self.folder / name).write_text(text, encoding="utf-8")
+        return name
+
+    def _environment(self) -> dict[str, str]:
+        own = Path(sys.executable).parent
+        return {
+            **os.environ,
+            "PATH": f"{own}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": str(ROOT),
+            "GITHUB_STEP_SUMMARY": str(self.folder / "summary.md"),
+            "TF_CPP_MIN_LOG_LEVEL": "3",
+            "CUDA_VISIBLE_DEVICES": "-1",
+        }
+
+    def _finished(self, command: list[str], block: Block) -> None:
+        done = subprocess.run(
+            command,
+            cwd=self.folder,
+            env=self._environment(),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            encoding="utf-8",
+            check=False,
+        )
+        wanted = int(block.argument) if block.verb == "status" else 0
+        said = f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+        assert done.returncode == wanted, f"{block.where}: status {done.returncode}\n{block.text}\n{said}"
+
+    def _interrupted(self, command: list[str], block: Block) -> None:
+        """Start it, read until it has said the text; where that is an address, open it; then Ctrl-C.
+
+        The page's port may be taken on this machine, so a server gets a free one.
+        """
+        if block.text.startswith("export-model serve "):
+            command = [*command[:-1], block.text.replace("export-model serve ", "export-model serve --port 0 ", 1)]
+        process = subprocess.Popen(
+            command,
+            cwd=self.folder,
+            env={**self._environment(), "PYTHONUNBUFFERED": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            start_new_session=True,
+        )
+        assert process.stdout is not None
+        try:
+            lines: list[str] = []
+            for line in process.stdout:
+                lines.append(line)
+                if block.argument in line:
+                    break
+            assert lines and block.argument in lines[-1], f"{block.where}: {''.join(lines)}"
+            address = next((word for word in lines[-1].split() if word.startswith("http://")), None)
+            if address is not None:
+                with urllib.request.urlopen(address) as answer:
+                    assert answer.status == 200
+        finally:
+            os.killpg(process.pid, signal.SIGINT)
+            process.stdout.close()
+            process.wait()
+
+
+HOW = {
+    "sh": Workshop.shell,
+    "python": Workshop.python,
+    "js": Workshop.javascript,
+    "yaml": Workshop.yaml,
+    "toml": Workshop.toml,
+    "json": Workshop.json,
+    "text": Workshop.shown,
+    "csharp": Workshop.shown,
+    "": Workshop.shown,
+}

@@ -1,0 +1,274 @@
+"""``python -m tests.figures``: how far apart the runtimes are, by kind of policy.
+
+It writes docs/figures.json and docs/figures.md. Every frozen graph of ../shared/genuine and ../shared/corpus is
+exported to four formats and verified in all runtimes that are installed; in browsers too with ``--browsers``. The page
+says nothing that depends on the machine's place or speed.
+``python -m tests.figures --page`` writes the page anew from the figures that are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import statistics
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from exporter.parity.histogram import added, to_dict
+from exporter.parity.pool import RuntimePool
+from exporter.parity.report import Comparison, ParityReport
+from exporter.pipeline import ExportOptions, export
+from exporter.runtimes import RUNTIMES, available_runtimes
+from signatures.roles import Role
+from signatures.spec import PolicySignature
+from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+FIGURES, PAGE = DOCS / "figures.json", DOCS / "figures.md"
+KINDS = {
+    "continuous": "continuous actions, vectors only",
+    "discrete": "discrete actions, vectors only",
+    "cameras": "cameras",
+    "memory": "LSTM memory",
+    "sac": "SAC",
+}
+FORMATS = ("bytes", "saved_model", "tfjs", "onnx")
+
+
+def kind_of(signature: PolicySignature) -> str:
+    """One of KINDS: what is hardest about the policy decides."""
+    if signature.algorithm == "SAC":
+        return "sac"
+    if signature.memory is not None:
+        return "memory"
+    if any(s.role is Role.VISUAL for s in signature.inputs):
+        return "cameras"
+    return "continuous" if signature.action_space == "continuous" else "discrete"
+
+
+#: Where it is from, policy, kind, report.
+_Measured = tuple[str, str, str, ParityReport]
+
+
+@dataclass
+class Cell:
+    """All comparisons of one format in one runtime over the policies of one kind."""
+
+    policies: set[str] = field(default_factory=set)
+    comparisons: int = 0
+    failures: int = 0
+    #: Policy → its worst difference; outputs that have a tolerance of their own are in ``apart``.
+    worst: dict[str, float] = field(default_factory=dict)
+    apart: dict[str, float] = field(default_factory=dict)
+    rounding: int = 0
+    draws: int = 0
+    least_p: float = 1.0
+    elements: tuple[int, ...] = ()
+
+    def add(self, policy: str, comparison: Comparison) -> None:
+        self.policies.add(policy)
+        self.comparisons += 1
+        self.failures += not comparison.passed
+        if comparison.kind == "draws":
+            self.draws += 1
+            self.least_p = min(self.least_p, 1 - comparison.max_abs_diff)
+            return
+        self.rounding += bool(comparison.rounding)
+        place, key = (self.apart, comparison.output) if comparison.tolerance.reason else (self.worst, policy)
+        place[key] = max(place.get(key, 0.0), comparison.max_abs_diff)
+        self.elements = added(self.elements, comparison.histogram)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "policies": len(self.policies),
+            "comparisons": self.comparisons,
+            "failures": self.failures,
+            "worst": _three(max(self.worst.values(), default=0.0)),
+            "median": _three(statistics.median(self.worst.values() or [0.0])),
+            "apart": {output: _three(worst) for output, worst in sorted(self.apart.items())},
+            "rounding": self.rounding,
+            "draws": self.draws,
+            "least_p": _three(self.least_p),
+            "elements": to_dict(self.elements) if self.elements else {},
+        }
+
+
+def _three(value: float) -> float:
+    """Three digits; more depend on the processor."""
+    return float(f"{value:.3g}")
+
+
+def sources() -> list[tuple[str, Path]]:
+    """(where it is from, file) of every frozen graph."""
+    genuine = [("genuine", folder / case["frozen"]["file"]) for folder, case in genuine_cases()]
+    return [*genuine, *(("corpus", path) for path in frozen_corpus())]
+
+
+def measured(files: Sequence[tuple[str, Path]], runtimes: Sequence[str]) -> Iterator[_Measured]:
+    """(where from, policy, kind, report) of each policy."""
+    with RuntimePool() as pool:
+        for number, (origin, file) in enumerate(files, 1):
+            with tempfile.TemporaryDirectory() as scratch:
+                for result in export([file], ExportOptions(Path(scratch), verify=runtimes), pool=pool):
+                    assert result.report is not None
+                    signature = result.policy.signature
+                    yield origin, f"{number}/{result.policy.name}", kind_of(signature), result.report
+            print(f"{number} of {len(files)}: {file.name}", file=sys.stderr, flush=True)
+
+
+def figures(files: Sequence[tuple[str, Path]], runtimes: Sequence[str]) -> dict[str, Any]:
+    """Everything that is measured, as JSON."""
+    cells: dict[tuple[str, str, str], Cell] = defaultdict(Cell)
+    versions: dict[str, str] = {}
+    counts: dict[str, int] = defaultdict(int)
+    kinds: dict[str, int] = defaultdict(int)
+    failed: list[str] = []
+    for origin, policy, kind, report in measured(files, runtimes):
+        counts[origin] += 1
+        kinds[kind] += 1
+        if report.passed is not True:
+            failed.append(policy)
+        for comparison in report.comparisons:
+            cells[kind, comparison.format, comparison.runtime].add(policy, comparison)
+        versions.update({n: str(e["version"]) for n, e in report.runtimes.items() if e["status"] == "ran"})
+    return {
+        "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        "files": len(files),
+        "policies": dict(counts),
+        "kinds": {k: kinds[k] for k in KINDS if kinds[k]},
+        "failed": failed,
+        "runtimes": {r.name: versions[r.name] for r in RUNTIMES if r.name in versions},
+        "cells": [{"kind": k, "format": f, "runtime": r, **c.to_dict()} for (k, f, r), c in sorted(cells.items())],
+    }
+
+
+# ------------------------------------------------------------------ the page
+
+
+def _number(value: float) -> str:
+    return "0" if value == 0 else f"{value:.1e}".replace("e-0", "e-").replace("e+0", "e+")
+
+
+def _worst(cell: Mapping[str, Any] | None) -> str:
+    return "" if cell is None else f"{_number(cell['worst'])} ({_number(cell['median'])})"
+
+
+def _row(cells: Iterable[object]) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def _table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
+    return [_row(head), "|" + "---|" * len(head), *map(_row, rows), ""]
+
+
+def page(content: Mapping[str, Any]) -> str:
+    """docs/figures.md."""
+    cells = {(c["kind"], c["format"], c["runtime"]): c for c in content["cells"]}
+    order = [r for r in content["runtimes"] if r != "numpy"]
+    rows = [(f, r) for f in FORMATS for r in order if any((k, f, r) in cells for k in KINDS)]
+    kinds = list(content["kinds"])
+    origins, comparisons = content["policies"], sum(c["comparisons"] for c in content["cells"])
+    failures = sum(c["failures"] for c in content["cells"])
+    apart: dict[tuple[str, str], float] = {}
+    for cell in content["cells"]:
+        for output, worst in cell["apart"].items():
+            apart[cell["kind"], output] = max(worst, apart.get((cell["kind"], output), 0.0))
+    lines = [
+        "# Figures",
+        "",
+        "<!-- Written by: python -m tests.figures. Do not edit. -->",
+        "",
+        f"Measured on {content['date']} by `python -m tests.figures`: {content['files']} frozen graphs, which are "
+        f"{sum(origins.values())} policies ({origins.get('genuine', 0)} written by the trainers of "
+        f"ML-Agents 0.3 to 0.22, {origins.get('corpus', 0)} from public repositories), each exported to four "
+        f"formats and run in {len(order)} independent runtimes. {comparisons:,} comparisons, {failures} failures. "
+        "The reference is TensorFlow running the original file; what is fed, and what counts as agreement, is in "
+        "[agreement.md](agreement.md).",
+        "",
+        "## Worst difference",
+        "",
+        "The largest |a − b| of any element of any output, over all inputs: also the ones of ±1e3, where the "
+        "outputs of a policy without a normaliser are thousands, and one unit in their last place is 1e-4 and more. "
+        "That is why the bound is relative above 1, and why the next table counts elements. In brackets the median of "
+        "the policies' own worst.",
+        "",
+        *_table(
+            ["format", "runtime", *(f"{KINDS[k]} ({content['kinds'][k]})" for k in kinds)],
+            [[f, r, *(_worst(cells.get((k, f, r))) for k in kinds)] for f, r in rows],
+        ),
+        *(
+            ["Not in the table, as they have a tolerance of their own: " + "; ".join(own) + ".", ""]
+            if (own := [f"`{o}` of {KINDS[k]}, at most {_number(w)}" for (k, o), w in apart.items()])
+            else []
+        ),
+        "## Elements by size of the difference",
+        "",
+        "Of all elements compared, how many differ by how much; the last column counts the outputs that "
+        "passed by what float32 rounding was measured to explain.",
+        "",
+        *_table(
+            ["format", "runtime", "elements", "equal", "below 1e-6", "below 1e-5", "above", "by rounding"],
+            [[f, r, *_spread([cells[k, f, r] for k in kinds if (k, f, r) in cells])] for f, r in rows],
+        ),
+        "## Draws",
+        "",
+        "Actions drawn inside the graph are held against their distribution; the false alarm rate is 1e-6 a test.",
+        "",
+        *_table(
+            ["format", "runtime", "tests", "smallest p"],
+            [
+                [f, r, sum(c["draws"] for c in drawn), _number(min(c["least_p"] for c in drawn))]
+                for f, r in rows
+                if (drawn := [cells[k, f, r] for k in kinds if (k, f, r) in cells and cells[k, f, r]["draws"]])
+            ],
+        ),
+        "## Runtimes",
+        "",
+        *_table(["runtime", "version"], [[r, v] for r, v in content["runtimes"].items()]),
+    ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _spread(found: Sequence[Mapping[str, Any]]) -> list[object]:
+    counts: dict[float, int] = defaultdict(int)
+    for cell in found:
+        for decade, count in cell["elements"].items():
+            counts[float(decade)] += count
+    total = sum(counts.values())
+    below = [sum(n for d, n in counts.items() if 0 < d < edge) for edge in (0.99e-6, 0.99e-5)]
+    equal, above = counts[0.0], total - counts[0.0] - below[1]
+    share = [f"{n / total:.3%}" if n else "0" for n in (equal, below[0], below[1] - below[0], above)]
+    return [f"{total:,}", *share, sum(c["rounding"] for c in found)]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.figures", description=__doc__.splitlines()[0])
+    parser.add_argument("--browsers", action="store_true", help="also the runtimes in Chromium")
+    parser.add_argument("--only", default="", help="only files whose path holds this; nothing is written to docs/")
+    parser.add_argument("--page", action="store_true", help="only the page, from the figures that are there")
+    options = parser.parse_args()
+    if not options.page:
+        files = [(origin, f) for origin, f in sources() if options.only in str(f)]
+        if not files or not SHARED.is_dir():
+            print("not measured: ../shared is not beside this checkout")
+            return 0
+        automatic = {r.name for r in RUNTIMES if r.automatic or options.browsers}
+        content = figures(files, [i.name for i in available_runtimes() if i.installed and i.name in automatic])
+        if options.only:
+            print(page(content))
+            return 1 if content["failed"] else 0
+        FIGURES.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    content = json.loads(FIGURES.read_text(encoding="utf-8"))
+    PAGE.write_text(page(content), encoding="utf-8")
+    print(f"wrote {PAGE.relative_to(DOCS.parent)}; failed: {', '.join(content['failed']) or 'none'}")
+    return 1 if content["failed"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
