@@ -21,7 +21,7 @@ from signatures.roles import Role
 from signatures.spec import Policy, TensorSpec
 
 _FEED = {
-    Role.VECTOR: "the agent's vector observation, as the environment gives it (normalised inside the policy)",
+    Role.VECTOR: "the agent's vector observation, as the environment gives it{normalised}",
     Role.VISUAL: "camera image, {layout}, colours {colours}, first row at the top",
     Role.ENTITIES: "variable-length observation",
     Role.NOISE: "N(0, 1) draws, or zeros for the action without chance",
@@ -170,7 +170,11 @@ def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
         return f"the discrete state, an integer from {known['low']} to {known['high']}"
     own = preprocess.get("range") == [0, 255]
     colours = "from 0 to 255 (bytes as they are)" if own else "from 0 to 1 (divide bytes by 255)"
-    return _FEED.get(spec.role, spec.role.value).format(layout=preprocess.get("layout", "NHWC"), colours=colours)
+    return _FEED.get(spec.role, spec.role.value).format(
+        layout=preprocess.get("layout", "NHWC"),
+        colours=colours,
+        normalised=" (normalised inside the policy)" if "std" in (spec.distribution or {}) else "",
+    )
 
 
 def _row(spec: TensorSpec, text: str) -> list[str]:

@@ -433,3 +433,9 @@ def test_a_drawn_action_is_described_in_both_forms(tmp_path: Path) -> None:
         ("deterministic_action", "deterministic", None),
         ("action_log_probs", "log_probs", None),
     ]
+
+
+def test_inspect_says_normalised_only_where_the_policy_does_it() -> None:
+    folder = Path(__file__).resolve().parents[2] / "fixtures" / "trained" / "3DBall"
+    assert "(normalised inside the policy)" in export_model("inspect", folder).out
+    assert "normalised" not in export_model("inspect", fixture("discrete")).out
