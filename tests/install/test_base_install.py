@@ -196,4 +196,4 @@ def test_what_can_be_verified_alone_is_called_not_verified(installed: Installed)
 
 def test_a_module_starts_it_too(installed: Installed) -> None:
     done = installed.run("python", "-m", "exporter", "--version")
-    assert (done.returncode, done.stdout.split()[-1]) == (0, __version__)
+    assert (done.returncode, done.stdout.splitlines()[0].split()[-1]) == (0, __version__)

@@ -14,7 +14,7 @@ from onnx import TensorProto, numpy_helper
 
 from converters.onnx.reader import read_onnx
 from exporter.sources import read_source
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
+from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.onnx_reader.models import Array, constant, declared, floats, helper, model, node, read, save
 
 X = {"x": (np.float32, ["batch", 4])}
@@ -235,7 +235,8 @@ def test_a_small_file_cannot_ask_for_much_memory(tmp_path: Path) -> None:
         {"x": (np.float32, ["batch", 1 << 20])},
         ["action"],
     )
-    read(message, tmp_path)  # nothing that large is made
+    with pytest.raises(GraphError, match="1099511627776 elements"):  # nothing that large is made
+        read(message, tmp_path)
 
 
 def test_no_nodes(tmp_path: Path) -> None:
