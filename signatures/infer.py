@@ -15,6 +15,7 @@ import numpy as np
 
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.graph import Graph, Node, TensorShape, node_of, normal_ref, split_ref
+from signatures.memories import SeparateMemory
 from signatures.roles import (
     ACTION_NAMES,
     CANONICAL,
@@ -53,6 +54,7 @@ class SourceFacts:
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``notes``: what the user should know of this source.
     - ``labels``: names of observations (by placeholder) and actions, where the source carries them.
+    - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined.
     """
 
     roles: Mapping[str, Role] = field(default_factory=dict)
@@ -66,6 +68,7 @@ class SourceFacts:
     rows: int | None = None
     notes: tuple[str, ...] = ()
     labels: Mapping[str, Any] = field(default_factory=dict)
+    memories: tuple[SeparateMemory, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +161,7 @@ def find_brains(
     if scopes:
         depth = min(scopes.values())
         return tuple(_brain(graph, scope, fed) for scope, d in scopes.items() if d == depth)
-    return (_unnamed(graph, fed, set(declared or ())),)
+    return (_unnamed(graph, fed, set(declared or ()), given),)
 
 
 def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
@@ -245,9 +248,10 @@ def _close(name: str, names: Sequence[str]) -> str | None:
     return f"close to it: {', '.join(near)}" if near else None
 
 
-def _unnamed(graph: Graph, fed: set[str], declared: set[str]) -> Brain:
+def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role]) -> Brain:
     """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
     read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
+    fed = fed - set(known)
     sinks = [n for n in graph.nodes if n.name not in read and n.name in fed and n.op not in _PLACEHOLDERS]
     if not sinks:
         raise NotAPolicyError(
@@ -266,7 +270,8 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str]) -> Brain:
         )
     node = chosen[0]
     output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
-    return Brain("", (output,), _constants(graph, ""), tuple(n.name for n in sinks if n is not node))
+    others = tuple((name.rsplit("/", 1)[-1], role, name) for name, role in known.items())
+    return Brain("", (output, *others), _constants(graph, ""), tuple(n.name for n in sinks if n is not node))
 
 
 # ------------------------------------------------------------------ inputs

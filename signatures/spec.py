@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from signatures.graph import Graph
 from signatures.labels import parsed
+from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Constant, Role
 
 
@@ -181,6 +182,8 @@ class SourceMap:
     - ``branches``: the tensors that the draws of a sampled action are made from, in branch order (None where the
       source cannot be asked for one).
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
+    - ``parts``: inputs and outputs that stand for several tensors of the source, or for one of another shape (memories
+      of their own, joined to one row): they are not among ``feeds`` and ``fetches``.
     """
 
     feeds: Mapping[str, str] = field(default_factory=dict)
@@ -191,6 +194,7 @@ class SourceMap:
     noise_kept: bool = False
     branches: tuple[str | None, ...] = ()
     rows: int | None = None
+    parts: Mapping[str, tuple[SourcePart, ...]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """What policy.json keeps of it: feeds and fetches are the ``source`` of its inputs and outputs."""
@@ -201,21 +205,29 @@ class SourceMap:
             "noise_kept": self.noise_kept,
             "branches": list(self.branches),
             "rows": self.rows,
+            **({"parts": {n: [p.to_dict() for p in parts] for n, parts in self.parts.items()}} if self.parts else {}),
         }
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any], signature: PolicySignature) -> SourceMap:
         """The inverse, with the feeds and fetches of ``signature``."""
+        parts = {n: tuple(SourcePart.from_dict(p) for p in given) for n, given in entry.get("parts", {}).items()}
         return cls(
-            feeds={s.name: s.source for s in signature.inputs if isinstance(s.source, str)},
-            fetches={s.name: s.source for s in signature.outputs if isinstance(s.source, str)},
+            feeds=sources(signature.inputs, parts),
+            fetches=sources(signature.outputs, parts),
             fixed={n: np.array(v["value"], v["dtype"]) for n, v in entry.get("fixed", {}).items()},
             batch_sizes=dict(entry.get("batch_sizes", {})),
             noise={n: tuple(shape) for n, shape in entry.get("noise", {}).items()},
             noise_kept=bool(entry.get("noise_kept", False)),
             branches=tuple(entry.get("branches", ())),
             rows=entry.get("rows"),
+            parts=parts,
         )
+
+
+def sources(specs: tuple[TensorSpec, ...], parts: Collection[str]) -> dict[str, str]:
+    """Canonical name → the source's tensor, of those that stand for one tensor as it is."""
+    return {s.name: s.source for s in specs if isinstance(s.source, str) and s.name not in parts}
 
 
 @dataclass(frozen=True, slots=True)

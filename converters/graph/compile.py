@@ -13,6 +13,7 @@ from converters.graph.options import CompileOptions
 from converters.graph.passes.companions import LOG_PROBS, add_companions
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import batch_size_rank, complete_shapes, constant_value, set_values, settle_inputs
+from converters.graph.passes.memories import join_memories
 from converters.graph.passes.naming import name_tensors
 from converters.graph.passes.noise import lift_noise, samplers, unseeded
 from converters.graph.passes.normalise import normalise
@@ -25,8 +26,9 @@ from converters.graph.types import static_shape
 from signatures.errors import UsageError
 from signatures.graph import Graph, Node, node_of, split_ref, topological
 from signatures.infer import ActionMeaning, Brain, Head, SourceFacts, action_meaning, classify_inputs, find_brains
+from signatures.memories import SourcePart
 from signatures.roles import Constant, Role
-from signatures.spec import Policy, SourceMap
+from signatures.spec import Policy, SourceMap, sources
 
 #: The name of the string constant in which our GraphDefs carry their contract.
 CONTRACT_NODE = "export_model_contract"
@@ -42,11 +44,14 @@ def compile_graph(
     Raises NotAPolicyError, SignatureError, UnsupportedOpError, GraphError, UsageError.
     """
     options, facts = options or CompileOptions(), facts or SourceFacts()
-    options = _by_nodes(graph, options)
+    joined = join_memories(graph, _by_nodes(graph, options), facts)
+    graph, options, facts = joined.graph, joined.options, joined.facts
     original, graph = graph, set_values(graph, options.values)
     brains = find_brains(graph, options.outputs, facts.outputs)
     return [
-        _Compiler(graph, original, brain, options, facts).run(f"{name}-{brain.label}" if len(brains) > 1 else name)
+        _Compiler(graph, original, brain, options, facts, joined.parts).run(
+            f"{name}-{brain.label}" if len(brains) > 1 else name
+        )
         for brain in _chosen_brains(brains, options.brain)
     ]
 
@@ -80,6 +85,8 @@ class _Compiler:
     brain: Brain
     options: CompileOptions
     facts: SourceFacts
+    #: the source's tensors that the memory was joined from
+    parts: Mapping[Role, tuple[SourcePart, ...]] = field(default_factory=dict)
     meanings: dict[str, ActionMeaning] = field(default_factory=dict)
 
     def run(self, name: str) -> Policy:
@@ -198,9 +205,11 @@ class _Compiler:
             _tensor(source[n]): constant_value(source[n], 1) for n, r in roles.items() if r is Role.SEQUENCE_LENGTH
         }
         given = {_tensor(self.original[n]): constant_value(self.original[n], v) for n, v in self.options.values.items()}
+        signature = policy.signature
+        parts = {s.name: self.parts[s.role] for s in (*signature.inputs, *signature.outputs) if s.role in self.parts}
         return SourceMap(
-            feeds={s.name: s.source for s in policy.signature.inputs if isinstance(s.source, str)},
-            fetches={s.name: s.source for s in policy.signature.outputs if isinstance(s.source, str)},
+            feeds=sources(signature.inputs, parts),
+            fetches=sources(signature.outputs, parts),
             fixed={**fixed, **given},
             batch_sizes={
                 _tensor(source[n]): batch_size_rank(source, source[n]) for n, r in roles.items() if r is Role.BATCH_SIZE
@@ -209,6 +218,7 @@ class _Compiler:
             noise_kept=self.options.noise == "keep" and not self.options.deterministic,
             branches=branches,
             rows=self.facts.rows,
+            parts=parts,
         )
 
 

@@ -38,7 +38,12 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     number = 0 if version is None or version.size != 1 else int(version.reshape(()))
     graph, notes = _with_rows_first(model)
     rows = 1 if model.one_row or notes else model.batch
-    facts = SourceFacts(image_layout=_image_layout(model), rows=rows, outputs=dict.fromkeys(model.outputs.values()))
+    facts = SourceFacts(
+        image_layout=_image_layout(model),
+        rows=rows,
+        outputs=dict.fromkeys(model.outputs.values()),
+        memories=model.memories,
+    )
     if model.producer.startswith("tf2onnx"):
         facts = _of_tensorflow(model, facts, number)
     elif number:
@@ -118,9 +123,10 @@ def _with_rows_first(model: OnnxModel) -> tuple[Graph, list[str]]:
     """
     graph, notes = model.graph, []
     names = NameScope(n.name for n in graph.nodes)
+    separate = {m.output for m in model.memories}
     for value, name in model.outputs.items():
         shape = model.shapes.get(name)
-        if shape is None or len(shape) != 3 or shape[0] != 1 or not isinstance(shape[1], str):
+        if name in separate or shape is None or len(shape) != 3 or shape[0] != 1 or not isinstance(shape[1], str):
             continue
         if value != "recurrent_out" and model.batch != 1:
             continue

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.types import Dim
+from converters.graph.types import BATCH, Dim, TensorType
+from converters.onnx.memories import OnnxMemory, separate_memories
 from converters.onnx.proto import array_of, load_external, tensors
 from converters.onnx.raising.drafting import MAX_NODES
 from converters.onnx.raising.node import DTYPES, STANDARD
@@ -18,11 +19,12 @@ from converters.onnx.raising.table import TABLE
 from converters.recognise import read_bytes
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.graph import Graph, TensorShape
+from signatures.memories import SeparateMemory
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
 
 #: Opsets that are read. Before 7 broadcasting was an attribute of each op.
 FIRST_OPSET = 7
-_FLOAT16, _BFLOAT16, _DOUBLE = 10, 16, 11
+_FLOAT, _FLOAT16, _BFLOAT16, _DOUBLE = 1, 10, 16, 11
 _INT = 2  # AttributeProto.AttributeType
 #: The scalar that TensorFlow's recurrent policies take: how many steps a sequence has. A policy runs one.
 _SEQUENCE_LENGTH = "sequence_length"
@@ -55,6 +57,8 @@ class OnnxModel:
     doubles: bool = False
     #: node → shape, for inputs and outputs
     shapes: Mapping[str, tuple[Dim, ...] | None] = field(default_factory=dict)
+    #: inputs and outputs of their own that are one memory
+    memories: tuple[SeparateMemory, ...] = ()
 
 
 def read_onnx(path: Path) -> OnnxModel:
@@ -64,12 +68,13 @@ def read_onnx(path: Path) -> OnnxModel:
     graph = model.graph
     constants = {t.name for t in graph.initializer}
     declared = [v for v in graph.input if v.name not in constants]
-    batch = _fixed_batch(declared)
+    memories, axes = _memories(graph, declared)
+    batch = _fixed_batch(declared, axes)
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
     reserved = [v.name for v in (*declared, *graph.output)] + [c for c in CONSTANT_NAMES if c in constants]
     raiser = Raiser(TABLE, opsets, reserved, batch)
     for value in declared:
-        _input(raiser, value, batch)
+        _input(raiser, value, batch, axes.get(value.name, 0))
     for tensor in graph.initializer:
         raiser.initializer(tensor.name, array_of(tensor))
     raiser.run(graph.node)
@@ -89,6 +94,7 @@ def read_onnx(path: Path) -> OnnxModel:
         any(a.name == "seed" and a.type == _INT for n in graph.node for a in n.attribute),
         any(t.data_type == _DOUBLE for t in tensors(graph)),
         {n: raiser.type_of(n).shape for n in (*(raiser.values[v.name] for v in declared), *outputs.values())},
+        _joint(raiser, memories, outputs),
     )
 
 
@@ -217,12 +223,34 @@ def _dims(value: Any) -> tuple[int | None, ...] | None:
     return tuple(int(d.dim_value) if d.HasField("dim_value") and d.dim_value > 0 else None for d in kind.shape.dim)
 
 
-def _fixed_batch(declared: Sequence[Any]) -> int | None:
+def _memories(graph: Any, declared: Sequence[Any]) -> tuple[tuple[OnnxMemory, ...], dict[str, int]]:
+    floats = frozenset(v.name for v in declared if v.type.tensor_type.elem_type == _FLOAT)
+    return separate_memories(
+        graph, {v.name: _dims(v) for v in declared}, {v.name: _dims(v) for v in graph.output}, floats
+    )
+
+
+def _joint(raiser: Raiser, memories: Sequence[OnnxMemory], outputs: Mapping[str, str]) -> tuple[SeparateMemory, ...]:
+    """The memories by nodes; empty where one of them could not be made."""
+    if any(m.output not in outputs for m in memories):
+        return ()
+    found = []
+    for memory in memories:
+        node = raiser.values[memory.input]
+        shape = tuple(None if isinstance(d, str) else d for d in raiser.type_of(node).shape or ())
+        found.append(SeparateMemory(node, outputs[memory.output], shape, shape, memory.part))
+    return tuple(found)
+
+
+def _fixed_batch(declared: Sequence[Any], axes: Mapping[str, int]) -> int | None:
     """The number of rows that all inputs were exported with, None where an input leaves any length free.
 
     torch.onnx.export fixes every length that ``dynamic_axes`` does not name; Stable-Baselines3's and rsl_rl's recipes
-    name none.
+    name none. ``axes`` are the batch axes of memories; one that is fixed fixes the model, whatever else is left free.
     """
+    memories = {dims[axes[v.name]] for v in declared if v.name in axes and (dims := _dims(v)) is not None}
+    if memories:
+        return memories.pop() if len(memories) == 1 else None
     shapes = [_dims(v) for v in declared]
     if any(dims is None or None in dims for dims in shapes):
         return None
@@ -230,7 +258,7 @@ def _fixed_batch(declared: Sequence[Any]) -> int | None:
     return leading.pop() if len(leading) == 1 else None
 
 
-def _input(raiser: Raiser, value: Any, batch: int | None) -> None:
+def _input(raiser: Raiser, value: Any, batch: int | None, axis: int) -> None:
     kind = value.type.tensor_type
     if not value.type.HasField("tensor_type") or kind.elem_type not in DTYPES or kind.elem_type == _DOUBLE:
         wide = value.type.HasField("tensor_type") and kind.elem_type in (_FLOAT16, _BFLOAT16, _DOUBLE)
@@ -245,9 +273,11 @@ def _input(raiser: Raiser, value: Any, batch: int | None) -> None:
     assumed = None
     if value.name.split(":")[0].rpartition("/")[2] == _SEQUENCE_LENGTH and dtype.kind in "iu" and not dims:
         assumed, dims = np.ones((), dtype), ()
-    elif batch is not None and dims is not None and len(dims) > 1:
-        dims = (None, *dims[1:])
-    raiser.placeholder(value.name, dtype, TensorShape(dims), assumed)
+    elif batch is not None and dims is not None and len(dims) > 1 and dims[axis] == batch:
+        dims = (*dims[:axis], None, *dims[axis + 1 :])
+    node = raiser.placeholder(value.name, dtype, TensorShape(dims), assumed)
+    if axis and dims is not None:
+        raiser.types[node] = TensorType(dtype, tuple(BATCH if i == axis else d or 0 for i, d in enumerate(dims)))
 
 
 def _outputs(raiser: Raiser, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:

@@ -1,0 +1,75 @@
+"""Memories that a source takes as several tensors (``h_in``, ``c_in``), and how one row per agent is made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class SourcePart:
+    """A tensor of the source that holds some columns of the memory [B, n]: ``shape`` has None where its batch is.
+
+    PyTorch's states are [layers, B, hidden]; a row of them is layer after layer.
+    """
+
+    tensor: str
+    shape: tuple[int | None, ...]
+
+    @property
+    def axis(self) -> int:
+        """The batch axis."""
+        return self.shape.index(None)
+
+    @property
+    def size(self) -> int:
+        """Numbers per row."""
+        return math.prod(d for d in self.shape if d is not None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in policy.json."""
+        return {"tensor": self.tensor, "shape": list(self.shape)}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> SourcePart:
+        """The inverse of ``to_dict``; raises ValueError where the shape has not one batch axis."""
+        shape = tuple(entry["shape"])
+        if shape.count(None) != 1:
+            raise ValueError(f"the shape {list(shape)} of {entry['tensor']!r} has not one batch axis")
+        return cls(entry["tensor"], shape)
+
+
+def divided(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, np.ndarray]:
+    """What the source is fed for a memory [B, n]: each part's columns in its shape."""
+    ends = np.cumsum([part.size for part in parts])
+    fed = {}
+    for part, columns in zip(parts, np.split(memory, ends[:-1], axis=1), strict=True):
+        rest = [d for d in part.shape if d is not None]
+        rows = columns.reshape(columns.shape[0], *rest)
+        fed[part.tensor] = np.ascontiguousarray(np.moveaxis(rows, 0, part.axis))
+    return fed
+
+
+def joined(parts: Sequence[SourcePart], values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The memory [B, n] that the source gave in ``parts``; the inverse of ``divided``."""
+    rows = [np.moveaxis(values[part.tensor], part.axis, 0) for part in parts]
+    return np.concatenate([r.reshape(r.shape[0], -1) for r in rows], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class SeparateMemory:
+    """One of several memories of a graph: the placeholder ``input`` is fed what the tensor ``output`` gave.
+
+    ``taken`` and ``given`` are their shapes, None where the batch is. ``part`` is ``h`` or ``c``, empty where it is
+    not known.
+    """
+
+    input: str
+    output: str
+    taken: tuple[int | None, ...]
+    given: tuple[int | None, ...]
+    part: str = ""
