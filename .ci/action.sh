@@ -48,6 +48,8 @@ export-model "$command" "${runtimes[@]}" --junit "$report/parity.xml" --html "$r
   "${summary[@]}" "${arguments[@]}" -- "${paths[@]}" || status=$?
 if [ -n "${GITHUB_OUTPUT:-}" ]; then echo "status=$status" >>"$GITHUB_OUTPUT"; fi
 if [ "$status" -ne 0 ]; then
-  echo "::error title=export-model $command::ended with status $status; see $report/parity.html" >&2
+  see=""
+  if [ -f "$report/parity.html" ]; then see="; see $report/parity.html"; fi
+  echo "::error title=export-model $command::ended with status $status$see" >&2
 fi
 exit "$status"

@@ -79,7 +79,7 @@ def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
         yield
     except OSError as error:
         raise BundleError(
-            what, where=str(place), why=error.strerror, fix="make room or rights there, or choose another -o"
+            what, where=str(place), why=error.strerror, fix="make room or rights there, or choose another place"
         ) from error
 
 
@@ -186,7 +186,7 @@ def read_policy_json(folder: Path) -> dict[str, Any]:
     path = folder / POLICY
     try:
         content: dict[str, Any] = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise BundleError(
             "is no bundle", where=str(folder), why=f"it has no {POLICY}", fix="give the folder that export-model wrote"
         ) from error

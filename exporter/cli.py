@@ -54,7 +54,7 @@ def _pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     for value in values:
         name, equals, rest = value.partition("=")
         if not equals or not name or not rest:
-            raise UsageError(f"{flag} {value}: NAME=VALUE is expected")
+            raise UsageError(f"{flag} {value}: NAME=VALUE is expected", fix=f"for example {flag} action=Identity")
         pairs[name] = rest
     return pairs
 
@@ -235,6 +235,7 @@ def export_command(
             results.append(result)
             progress.clear()
             console.result(result)
+    console.check_rules([r.report for r in results if r.report is not None])
     console.json({"policies": [_result_dict(r) for r in results]})
     console.next_step(results, options.compile.names, options.targets)
     console.write_reports(lambda: _entries(results, parity["steps"]))
@@ -339,6 +340,7 @@ def verify_command(
             reports.append(report)
             progress.clear()
             console.verified(report, folder)
+    console.check_rules(reports)
     console.json({"reports": [r.to_dict() for r in reports]})
     console.write_reports(lambda: _bundle_entries(reports, bundles, parity["steps"]))
     if any(r.passed is False for r in reports):
@@ -392,6 +394,7 @@ def compare_command(
             progress=progress,
         )
     console.verified(report, ", ".join(map(str, candidates)))
+    console.check_rules([report])
     console.json({"reports": [report.to_dict()]})
     console.write_reports(lambda: [Entry(report, steps=parity["steps"])])
     if report.passed is False:

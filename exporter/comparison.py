@@ -22,6 +22,7 @@ from converters.graph.options import CompileOptions
 from converters.interface import Interface, Port, interfaces_of
 from converters.runner.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun
+from exporter.bundle import POLICY, read_policy_json
 from exporter.parity.compare import compare
 from exporter.parity.entrants import Entrant, Failure, Feeds, unload
 from exporter.parity.pool import RUNTIMES_OF, RuntimePool, chosen_runtimes
@@ -62,6 +63,8 @@ class _Candidate:
     #: outputs that the candidate draws, because it makes the noise that the reference is fed
     drawn: frozenset[str]
     problems: tuple[_Problem, ...]
+    #: outputs that export-model made for the reference, and that this one has none of
+    spared: tuple[str, ...] = ()
 
     @property
     def missing(self) -> list[str]:
@@ -91,8 +94,9 @@ def compare_artefacts(
     if not interfaces:
         raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
     aliases = _mapped(_aliases(policy, reference), names or {}, [i for _, i in interfaces])
+    made = _made_here(reference, policy)
     labels = _labels(interfaces)
-    matched = [_match(label, found, policy, aliases) for label, (_, found) in zip(labels, interfaces, strict=True)]
+    matched = [_match(lb, found, policy, aliases, made) for lb, (_, found) in zip(labels, interfaces, strict=True)]
     used, known = chosen_runtimes(runtimes, [m.interface.format for m in matched])
     with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
         artifact = write_frozen(policy, WriteOptions("{}"))
@@ -114,6 +118,8 @@ def compare_artefacts(
                 yield from _entrants(candidate, policy, numpy_model, used, pool, failure)
 
         report = verify(subject, used, known, pool, options, progress, field=field)
+    notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
+    report = replace(report, notes=(*report.notes, *notes))
     if report.passed is None and not allow_unverified:
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",
@@ -214,7 +220,17 @@ def _find(name: str, ports: Sequence[Port]) -> Port | None:
     return next((p for p in ports if p.name == name), None) or next((p for p in ports if _base(p.name) == name), None)
 
 
-def _match(label: str, interface: Interface, policy: Policy, aliases: Mapping[str, Sequence[str]]) -> _Candidate:
+def _made_here(path: Path, policy: Policy) -> frozenset[str]:
+    """Outputs of the reference that its source had not, as a bundle's policy.json says (or the graph that was read)."""
+    made = {s.name for s in policy.signature.outputs if s.source is None}
+    if (path / POLICY).is_file():
+        made |= {entry["name"] for entry in read_policy_json(path)["outputs"] if entry.get("source") is None}
+    return frozenset(made)
+
+
+def _match(
+    label: str, interface: Interface, policy: Policy, aliases: Mapping[str, Sequence[str]], made: frozenset[str]
+) -> _Candidate:
     """The candidate's ports for the reference's names, and what does not fit."""
     problems: list[_Problem] = []
 
@@ -228,9 +244,10 @@ def _match(label: str, interface: Interface, policy: Policy, aliases: Mapping[st
     noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
     reached = {s.name: policy.graph.ancestors([s.name]) for s in signature.outputs}
     drawn = frozenset(name for name in found if reached[name] & noise)
+    # What was made for the reference may be missing where all of it is: then the candidate is of another maker.
+    spared = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
     for spec in signature.outputs:
-        # What the reference's file has not either (an action without chance that was made for it) may be missing.
-        if spec.name not in found and (spec.source is not None or not found):
+        if spec.name not in found and spec.name not in spared:
             text = f"there is no output {aliases[spec.name][0]!r}; there are {_names(interface.outputs)}"
             problems.append(_Problem(spec.name, text))
     for spec in lacking:
@@ -246,7 +263,8 @@ def _match(label: str, interface: Interface, policy: Policy, aliases: Mapping[st
         for port in left:
             text = f"it takes an input {port.name!r} that the reference has not"
             problems.append(_Problem(port.name, text, blocking=True))
-    return _Candidate(label, interface, inputs, {n: p.name for n, p in found.items()}, constant, drawn, tuple(problems))
+    outputs = {n: p.name for n, p in found.items()}
+    return _Candidate(label, interface, inputs, outputs, constant, drawn, tuple(problems), spared)
 
 
 def _names(ports: Sequence[Port]) -> str:

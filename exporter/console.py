@@ -107,6 +107,20 @@ class Console:
 
         return read_tolerances(self.tolerances)
 
+    def check_rules(self, reports: Sequence[ParityReport]) -> None:
+        """Raise UsageError where a rule of ``--tolerances`` covered no comparison: a name in it is mistyped."""
+        for number, rule in enumerate(self.rules(), 1):
+            if any(rule.covers(r.policy, c.format, c.runtime, c.output) for r in reports for c in r.comparisons):
+                continue
+            parts = {n: getattr(rule, n) for n in ("policy", "format", "runtime", "output")}
+            said = ", ".join(f"{n} {v!r}" for n, v in parts.items() if v is not None)
+            raise UsageError(
+                f"--tolerances: entry {number} covers no comparison",
+                where=str(self.tolerances),
+                why=f"it is for {said}",
+                fix="check its names against the report, or take it out",
+            )
+
     def progress(self) -> Progress:
         """For the steps of a command; nothing where stdout is for a program and stderr should stay empty."""
         return Progress(quiet=self.quiet or self._silent, verbose=self.verbose)

@@ -13,9 +13,12 @@ from converters.recognise import FileKind, not_readable, recognise_path
 from converters.registry import reader
 from converters.source import ReadOptions, SourceModel
 from signatures.digest import sha256_hex
-from signatures.errors import ExportModelError, GraphError, SourceError
+from signatures.errors import ExportModelError, GraphError, SourceError, UsageError
 from signatures.spec import Policy
 
+#: Kinds of source that have checkpoints of several steps, and those whose sensors have to be said.
+_STEPS = frozenset(("run_folder", "checkpoint", "raw_graph", "meta_graph", "bundle"))
+_SENSORS = frozenset(("torch_checkpoint", "run_folder"))
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
 
@@ -100,10 +103,24 @@ def read_source(path: Path | str, options: ReadOptions | None = None) -> Source:
     read = reader(kind.key)
     if read is None:
         raise not_readable(kind, path)
+    options = options or ReadOptions()
+    _check_options(kind, path, options)
     with naming(path):
-        models = read(path, options or ReadOptions())
+        models = read(path, options)
         files = sorted({f for model in models for f in model.files})
         return Source(path, kind, _digest(files), sum(f.stat().st_size for f in files), models)
+
+
+def _check_options(kind: FileKind, path: Path, options: ReadOptions) -> None:
+    """Raise UsageError where an option was given that this kind of source has no use for."""
+    for flag, given, kinds in (("--step", options.step is not None, _STEPS), ("--sensors", options.sensors, _SENSORS)):
+        if given and kind.key not in kinds:
+            raise UsageError(
+                f"{flag} says nothing about this source",
+                where=str(path),
+                why=f"it is {kind.label}",
+                fix=f"leave {flag} out, or give " + ("a checkpoint or a run's folder" if flag == "--step" else "a .pt"),
+            )
 
 
 def _digest(files: Sequence[Path]) -> str:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 from exporter.parity.report import Comparison, ParityReport
+from exporter.parity.statistics import FALSE_ALARM
 from exporter.tables import size_text, table
 
 
@@ -32,11 +33,10 @@ def comparison_table(report: ParityReport) -> str:
     """Every comparison on a line of its own."""
     rows = []
     for c in report.comparisons:
-        sizes = [
-            f"{c.max_abs_diff:.2e}",
-            f"{c.max_rel_diff:.2e}",
-            allowed(c) if c.kind in ("numbers", "rollout") else "",
-        ]
+        if c.kind in ("numbers", "rollout"):
+            sizes = [f"{c.max_abs_diff:.2e}", f"{c.max_rel_diff:.2e}", allowed(c)]
+        else:  # a difference means something else there: draws have a p-value, a size has bytes
+            sizes = ["", "", f"p >= {FALSE_ALARM:g}: p = {1 - c.max_abs_diff:.2g}" if c.kind == "draws" else ""]
         rows.append([c.format, c.runtime, c.output, c.kind, *sizes, c.worst_input or "", "ok" if c.passed else "FAIL"])
     head = ("format", "runtime", "output", "kind", "max |Δ|", "max |Δ| / |b|", "allowed", "worst input", "verdict")
     return table(head, rows)
@@ -54,8 +54,9 @@ def _worst_by_output(group: Iterable[Comparison]) -> list[str]:
     for c in group:
         if c.kind == "failure":
             continue
-        text = "drawn" if c.kind in ("draws", "shape") else f"{c.max_abs_diff:.1e}" if c.max_abs_diff else "0"
-        value = -1.0 if c.kind in ("draws", "shape") else c.max_abs_diff
+        told = {"draws": "drawn", "shape": "drawn", "size": "kept" if c.passed else "exceeded"}.get(c.kind)
+        text = told or (f"{c.max_abs_diff:.1e}" if c.max_abs_diff else "0")
+        value = c.max_abs_diff if told is None else -1.0
         if c.output not in worst or value > worst[c.output][0]:
             worst[c.output] = (value, text)
     return [f"{name} {text}" for name, (_, text) in worst.items()]
@@ -76,6 +77,8 @@ def explanation(c: Comparison) -> list[str]:
     where = f"{c.format} in {c.runtime}"
     if c.kind == "failure":
         return [f"{where}: {c.reason}"]
+    if c.kind == "size":
+        return [f"{c.format} is too large: {c.reason}"]
     text = f"{where}: {c.output} differs"
     if c.reason:
         text += f": {c.reason}"
@@ -131,11 +134,19 @@ def verdict(report: ParityReport) -> str:
     """One line."""
     if report.passed is None:
         return "NOT VERIFIED: no independent runtime ran"
-    count = len({(c.format, c.runtime) for c in report.comparisons if c.format != "reference"})
+    pairs = {
+        (c.format, c.runtime)
+        for c in report.comparisons
+        if c.format not in ("reference", "golden") and c.kind != "size"
+    }
+    count, seen = len(pairs), {kind.partition(":")[0] for kind, _ in pairs}
+    unseen = [kind for kind in report.sizes if kind.partition(":")[0] not in seen]
+    rest = f"; not verified: {', '.join(unseen)}" if unseen else ""
     if report.verdict == "self-consistent":
-        return f"SELF-CONSISTENT: {count} format/runtime pairs agree with {report.reference}; nothing runs the source"
+        rest = f"; nothing runs the source{rest}"
+        return f"SELF-CONSISTENT: {count} format/runtime pairs agree with {report.reference}{rest}"
     if report.passed:
-        return f"PASSED: {count} format/runtime pairs agree with {report.reference}"
+        return f"PASSED: {count} format/runtime pairs agree with {report.reference}{rest}"
     return f"FAILED: {len(report.failures)} of {len(report.comparisons)} comparisons disagree with {report.reference}"
 
 

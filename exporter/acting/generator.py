@@ -21,7 +21,7 @@ class Generator:
     """Uniform and normal draws; the state is four words of 32 bits."""
 
     def __init__(self, seed: int) -> None:
-        if not 0 <= seed <= MAX_SEED:
+        if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
             raise UsageError(f"the seed is {seed}", fix=f"give a whole number from 0 to {MAX_SEED}")
         low, high = _mixed(seed & _MASK), _mixed((seed >> 32) ^ 0x9E3779B9)
         self._a, self._b, self._c, self._counter = low, high, low ^ high, 1
@@ -54,6 +54,11 @@ class Generator:
         """An index of ``log_probs`` ([n], unnormalised will do), by its probability; one uniform draw."""
         wide = [float(v) for v in log_probs]
         best = max(wide)
+        if not best > -math.inf:
+            raise UsageError(
+                f"nothing can be drawn from the log-probabilities {wide}",
+                fix="allow an action of every branch in masks, and give observations that are numbers",
+            )
         weights = [math.exp(v - best) if v > -math.inf else 0.0 for v in wide]
         left = self.uniform() * sum(weights)
         for index, weight in enumerate(weights):

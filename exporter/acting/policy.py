@@ -129,7 +129,12 @@ class LoadedPolicy:
         return dict(observations)
 
     def _fitting(self, spec: TensorSpec, value: npt.ArrayLike, rows: int | None) -> Array:
-        array = np.asarray(value, spec.dtype)
+        try:
+            array = np.asarray(value, spec.dtype)
+        except (TypeError, ValueError) as error:
+            raise UsageError(
+                f"{spec.name!r} is no array of numbers", why=str(error), fix="give rows of one length"
+            ) from error
         if array.ndim == len(spec.shape) - 1:
             array = array[None]
         same = array.ndim == len(spec.shape) and all(

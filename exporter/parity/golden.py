@@ -73,7 +73,11 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
         if spec.name in given:
             continue
         if spec.role not in _DEFAULTS:
-            raise UsageError(f"--golden: the input {spec.name!r} was not recorded", where=str(path))
+            raise UsageError(
+                f"--golden: the input {spec.name!r} was not recorded",
+                where=str(path),
+                fix="record every observation; memory, noise and masks may be left out",
+            )
         if spec.role is Role.NOISE:
             noiseless.add(spec.name)
         shape = tuple(rows if i == 0 else n or 1 for i, n in enumerate(spec.shape))
@@ -126,7 +130,12 @@ def _rows(path: Path, signature: PolicySignature, given: Mapping[str, np.ndarray
     counts = {name: len(array) for name, array in given.items() if name in free}
     if not counts or min(counts.values()) != max(counts.values()) or not min(counts.values()):
         said = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
-        raise UsageError("--golden: the arrays have not the same number of rows", where=str(path), why=f"rows: {said}")
+        raise UsageError(
+            "--golden: the arrays have not the same number of rows",
+            where=str(path),
+            why=f"rows: {said}",
+            fix="give every array a row for each recorded step",
+        )
     return min(counts.values())
 
 

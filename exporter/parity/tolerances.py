@@ -48,7 +48,11 @@ _EXCEPTIONS = (
     _Exception(
         "action_probs",
         "SAC",
-        Tolerance(5e-3, 5e-3, "log(1 - tanh(x)^2 + eps) cancels where the action saturates (measured: 2.6e-3)"),
+        Tolerance(
+            5e-3,
+            5e-3,
+            "log(1 - tanh(x)^2 + eps) cancels where the action saturates (measured: 2.6e-3, and 4.7e-2 above 8)",
+        ),
     ),
 )
 

@@ -69,6 +69,8 @@ def short(c: Comparison) -> str:
     """A difference in a few characters."""
     if c.kind in ("draws", "shape"):
         return "drawn" if c.passed else "✗ drawn"
+    if c.kind == "size":
+        return "kept" if c.passed else "✗ exceeded"
     if c.reason and not c.passed:
         return f"✗ {c.reason.split(' instead of')[0]}" if len(c.reason) < 40 else "✗"
     return "0" if c.max_abs_diff == 0 else f"{c.max_abs_diff:.1e}"

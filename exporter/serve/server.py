@@ -20,6 +20,7 @@ TYPES: Mapping[str, str] = {
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".mjs": "text/javascript; charset=utf-8",
+    ".mts": "text/plain; charset=utf-8",
     ".json": "application/json",
     ".wasm": "application/wasm",
     ".bin": "application/octet-stream",

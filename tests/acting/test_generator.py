@@ -46,6 +46,12 @@ def test_what_has_no_probability_is_never_chosen(seed: int, allowed: int) -> Non
     assert Generator(seed).choice(scores) == allowed
 
 
+@pytest.mark.parametrize("scores", [[-np.inf, -np.inf], [np.nan, np.nan]])
+def test_where_nothing_can_be_drawn_it_says_so(scores: list[float]) -> None:
+    with pytest.raises(UsageError, match="nothing can be drawn"):
+        Generator(0).choice(np.array(scores, np.float32))
+
+
 @given(seed=st.integers(0, MAX_SEED))
 def test_a_seed_says_all(seed: int) -> None:
     one, other = Generator(seed), Generator(seed)
@@ -58,7 +64,7 @@ def test_near_seeds_are_far_apart() -> None:
     assert fit((np.array(first) * 16).astype(int), np.log(np.full(16, 1 / 16, np.float32))) >= FALSE_ALARM
 
 
-@pytest.mark.parametrize("seed", [-1, MAX_SEED + 1])
-def test_other_seeds_are_refused(seed: int) -> None:
+@pytest.mark.parametrize("seed", [-1, MAX_SEED + 1, 1.5])
+def test_other_seeds_are_refused(seed: float) -> None:
     with pytest.raises(UsageError, match="the seed is"):
-        Generator(seed)
+        Generator(seed)  # type: ignore[arg-type]

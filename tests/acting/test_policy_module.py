@@ -93,6 +93,16 @@ def test_the_generator_draws_the_same(seed: int, bundles: Bundles) -> None:
     np.testing.assert_allclose(answer[5:], normal, rtol=1e-14)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_nothing_can_be_drawn_it_says_so(kind: str, bundles: Bundles) -> None:
+    """A NaN in the observation: no action at all, not the number -1."""
+    width = load_policy(bundles("discrete")).signature.observations[0].shape[1]
+    nan = {"state": {"data": [1e39] * (width or 1), "shape": [1, width]}}  # JSON has no NaN; infinities make one
+    requests = [{"observations": nan, "options": o} for o in ({"seed": 1}, {})]
+    for answer in drive(bundles("discrete"), kind, requests):
+        assert "nothing can be drawn" in answer.get("error", ""), answer
+
+
 def test_flat_and_nested_numbers_are_one(bundles: Bundles) -> None:
     forms: list[Any] = [[0.5] * 8, [[0.5] * 8], {"state": [0.5] * 8}, {"state": {"data": [0.5] * 8, "shape": [1, 8]}}]
     answers = drive(
@@ -108,6 +118,10 @@ def test_what_is_missing_or_wrong_is_named(bundles: Bundles) -> None:
         ({"observations": {"state": [0.0] * 7}}, "'state' has 7 numbers; [agents, 8] is wanted"),
         ({"observations": {"state": [0.0] * 8, "stat": 1}}, "there is no observation 'stat'"),
         ({"observations": [0.0] * 8, "options": {"seed": -1}}, "the seed is -1"),
+        ({"observations": {"state": [[0.0] * 6] * 4}}, "[agents, 8] is wanted"),
+        ({"observations": {"state": [[0.0] * 4] * 2}}, "[agents, 8] is wanted"),
+        ({"observations": {"state": [[0.0] * 7 + ["0"]]}}, "'state' holds a string"),
+        ({"observations": {"state": [[0.0] * 7 + [None]]}}, "'state' holds an object"),
     ]
     answers = drive(bundles("continuous"), "tfjs", [r for r, _ in requests])
     for answer, (_, words) in zip(answers, requests, strict=True):

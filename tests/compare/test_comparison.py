@@ -113,6 +113,13 @@ def test_the_names_of_the_source_are_known_too(bundles: Bundles, tmp_path: Path,
     assert compare_artefacts(fixture("recurrent"), [file], runtimes=RUNTIMES, pool=pool).passed is True
 
 
+def test_what_was_made_for_a_bundle_is_not_asked_of_its_source(bundles: Bundles, pool: RuntimePool) -> None:
+    report = compare_artefacts(bundles("recurrent"), [fixture("recurrent")], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is True
+    assert any("never had it: deterministic_action" in note for note in report.notes)
+    assert {c.output for c in report.comparisons} == {"action", "action_probs", "recurrent_out"}
+
+
 def test_a_lost_name_is_a_failure_that_says_what_to_map(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
     file = edited(
         bundles("discrete") / "discrete.onnx", tmp_path / "theirs.onnx", lambda m: renamed(m, "action", "Identity")
@@ -197,6 +204,44 @@ def test_noise_that_the_candidate_draws_itself_is_not_compared_by_numbers(
     report = compare_artefacts(fixture("sampled"), [kept.folder], runtimes=RUNTIMES, pool=pool)
     assert report.passed is True
     assert {c.kind for c in report.comparisons if c.output == "action"} == {"shape", "draws"}
+
+
+def drawing(spread: float | None) -> Callable[[onnx.ModelProto], None]:
+    """An edit that takes the input ``epsilon`` away: drawn inside, ``spread`` times N(0, 1), or one value (None)."""
+
+    def edit(model: onnx.ModelProto) -> None:
+        graph = model.graph
+        graph.input.remove(next(v for v in graph.input if v.name == "epsilon"))
+        if spread is None:
+            graph.initializer.append(numpy_helper.from_array(np.full((1, 2), 0.3, np.float32), "epsilon"))
+            return
+        for name, value in (("from", [0]), ("to", [1]), ("two", [2])):
+            graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), name))
+        graph.initializer.append(numpy_helper.from_array(np.array([spread], np.float32), "spread"))
+        nodes = [
+            helper.make_node("Shape", ["state"], ["of"]),
+            helper.make_node("Slice", ["of", "from", "to"], ["rows"]),
+            helper.make_node("Concat", ["rows", "two"], ["size"], axis=0),
+            helper.make_node("ConstantOfShape", ["size"], ["zeros"]),
+            helper.make_node("RandomNormalLike", ["zeros"], ["normal"]),
+            helper.make_node("Mul", ["normal", "spread"], ["epsilon"]),
+            *graph.node,
+        ]
+        del graph.node[:]
+        graph.node.extend(nodes)
+
+    return edit
+
+
+@pytest.mark.parametrize(("spread", "right"), [(1.0, True), (1.5, False), (0.0, False), (np.nan, False), (None, False)])
+def test_a_candidate_that_draws_its_own_noise_is_held_to_the_distribution(
+    spread: float | None, right: bool, bundles: Bundles, tmp_path: Path, pool: RuntimePool
+) -> None:
+    file = edited(bundles("continuous") / "continuous.onnx", tmp_path / "theirs.onnx", drawing(spread))
+    report = compare_artefacts(fixture("continuous"), [file], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is right, report.failures
+    assert {f.output for f in report.failures} <= {"action", "action_probs"}
+    assert right or "action" in {f.output for f in report.failures}
 
 
 def test_bad_maps_are_refused(bundles: Bundles, pool: RuntimePool) -> None:

@@ -28,6 +28,7 @@ SITE = {
     "golden.bin": b"\0\1",
     "site.json": b"{}",
     "icon.svg": b"<svg/>",
+    "model/policy.d.mts": b"export {}",
 }
 TYPES = {
     "index.html": "text/html; charset=utf-8",
@@ -38,6 +39,7 @@ TYPES = {
     "golden.bin": "application/octet-stream",
     "site.json": "application/json",
     "icon.svg": "image/svg+xml",
+    "model/policy.d.mts": "text/plain; charset=utf-8",
 }
 
 

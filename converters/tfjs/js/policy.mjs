@@ -17,6 +17,8 @@
 /** The largest seed that a number holds exactly. */
 const MAX_SEED = Number.MAX_SAFE_INTEGER;
 
+const NOTHING_LEFT = "a branch whose actions are all forbidden by its masks, or an observation that is NaN";
+
 const OBSERVATIONS = new Set(["vector_observation", "visual_observation", "variable_length_observation"]);
 
 /** sfc32 (PractRand's Small Fast Counting generator); the same as exporter/acting/generator.py. */
@@ -60,6 +62,7 @@ export class Generator {
   /** An index of `logProbs` by its probability. */
   choice(logProbs) {
     const best = Math.max(...logProbs);
+    if (!(best > -Infinity)) throw new Error(`nothing can be drawn from the log-probabilities ${logProbs}: ${NOTHING_LEFT}`);
     const weights = Array.from(logProbs, (v) => (v > -Infinity ? Math.exp(v - best) : 0));
     let left = this.uniform() * weights.reduce((sum, w) => sum + w, 0);
     for (const [index, weight] of weights.entries()) {
@@ -125,8 +128,10 @@ async function withTfjs(tf, source) {
 
 async function withOnnx(ort, source, contract) {
   const session = await ort.InferenceSession.create(source);
-  const beside = typeof source === "string" ? new URL("policy.json", new URL(source, globalThis.location?.href)).href : null;
-  const own = contract === undefined && beside !== null ? await fetched(beside) : undefined;
+  let own;
+  if (contract === undefined && typeof source === "string") {
+    own = await fetched(new URL("policy.json", new URL(source, globalThis.location?.href)).href);
+  }
   const run = async (feeds, names) => {
     const given = {};
     for (const [name, { data, shape, dtype }] of Object.entries(feeds)) {
@@ -263,7 +268,10 @@ export class Policy {
       let start = 0;
       return (branches.length > 0 ? branches : [row.length]).map((count) => {
         const part = row.slice(start, (start += count));
-        return deterministic ? part.indexOf(Math.max(...part)) : this.#generator.choice(part);
+        if (!deterministic) return this.#generator.choice(part);
+        const best = part.indexOf(Math.max(...part));
+        if (best < 0) throw new Error(`the log-probabilities ${part} have no largest: ${NOTHING_LEFT}`);
+        return best;
       });
     });
   }
@@ -322,6 +330,9 @@ function fitting({ name, shape: wanted, dtype }, value, rows) {
     if (ArrayBuffer.isView(value) || free === 0) {
       if (free > 0) throw new Error(`'${name}' has a free axis: give nested arrays or { data, shape }`);
       shape = [flat.length / known, ...inner];
+      // Nested arrays say their own shape: rows of another length are no agents.
+      const said = nested(value);
+      if (said.length > 1 && said.length === wanted.length) shape = said;
     } else {
       shape = nested(value);
       if (shape.length === wanted.length - 1) shape = [1, ...shape];
@@ -332,6 +343,10 @@ function fitting({ name, shape: wanted, dtype }, value, rows) {
   if (!same || size(shape) !== flat.length || (rows !== undefined && wanted[0] === null && shape[0] !== rows)) {
     const text = ["agents", ...inner.map((n) => n ?? "any")].join(", ");
     throw new Error(`'${name}' has ${flat.length} numbers; [${text}]${rows === undefined ? "" : ` for ${rows} agents`} is wanted`);
+  }
+  for (const number of ArrayBuffer.isView(flat) ? [] : flat) {
+    const kind = typeof number; // a string or an object would become a number that nobody meant
+    if (kind !== "number" && kind !== "boolean") throw new Error(`'${name}' holds ${kind === "object" ? "an" : "a"} ${kind}`);
   }
   return { data: arrayOf(dtype).from(flat), shape: [...shape], dtype };
 }
