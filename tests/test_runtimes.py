@@ -336,6 +336,7 @@ def test_the_lock_pins_everything_and_names_no_registry() -> None:
     assert package["dependencies"] == {
         "@tensorflow/tfjs": "4.22.0",
         "@tensorflow/tfjs-backend-wasm": "4.22.0",
+        "@tensorflow/tfjs-backend-webgpu": "4.22.0",
         "onnxruntime-web": "1.30.0",
         "playwright-core": "1.65.1",
     }

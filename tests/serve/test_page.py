@@ -16,7 +16,9 @@ from tests.serve.conftest import Bundle
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
 VERDICT = "document.querySelector('#verdict').textContent"
-STATES = "[...document.querySelectorAll('[data-backend]')].map((row) => [row.dataset.backend, row.dataset.state])"
+#: Without webgpu: whether it runs is the machine's matter.
+STATES = """[...document.querySelectorAll('[data-backend]')].map((row) => [row.dataset.backend, row.dataset.state])
+  .filter(([backend]) => backend !== "webgpu")"""
 STATUS = "({...document.querySelector('#status').dataset})"
 ACTIONS = "[...document.querySelectorAll('.answering .bars .value')].map((cell) => cell.textContent)"
 DECIDED = "document.querySelector('#timing').textContent.startsWith('Decided')"
@@ -180,7 +182,7 @@ def test_a_backend_that_fails_says_why(bundle: Bundle) -> None:
         )
     assert dict(seen.results[1]) == {"cpu": "agrees", "wasm": "did not run", "webgl": "agrees"}
     assert seen.results[2]
-    assert "1 of 3 did not run" in seen.results[3]
+    assert "of 4 did not run" in seen.results[3]
 
 
 @pytest.mark.parametrize("name", ["3DBall", "recurrent", "visual"])
