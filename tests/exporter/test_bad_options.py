@@ -255,7 +255,12 @@ def test_an_output_folder_without_rights_is_refused(hidden: bool, ball: Path, tm
         locked.mkdir(mode=0o000 if hidden else 0o555)
         copy = shutil.copyfile(ball, Path(top) / "Ball.bytes")
         out = locked / "out" if hidden else locked
-        is_refused(python("-c", AS_NOBODY, tmp_path / "warm", copy, "-o", out, "--verify", "none"), out, "denied", "-o")
+        is_refused(
+            python("-c", AS_NOBODY, tmp_path / "warm", copy, "-o", out, "--verify", "none"),
+            out,
+            "denied",
+            "another place",
+        )
         locked.chmod(0o755)
         assert files_in(locked) == set()
 

@@ -331,10 +331,21 @@ def test_without_bytes_a_reference_is_made_for_the_comparison(exporting: Exporti
     assert not list(result.folder.glob("*.bytes"))
 
 
-def test_noise_that_stays_in_the_graph_is_compared_by_its_shape(exporting: Exporting) -> None:
+def test_noise_that_stays_in_the_graph_is_compared_by_its_shape_and_distribution(exporting: Exporting) -> None:
     report = report_of(exporting("visual", compile=CompileOptions(noise="keep")))
-    kinds = {c.output: c.kind for c in report.comparisons if c.format == "onnx"}
-    assert kinds == {"action": "shape", "deterministic_action": "numbers", "value_estimate": "numbers"}
+    kinds = {(c.output, c.kind) for c in report.comparisons if c.format == "onnx"}
+    numbers = {("deterministic_action", "numbers"), ("value_estimate", "numbers")}
+    assert kinds == {("action", "shape"), ("action", "draws"), *numbers}
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, 3.0])
+def test_noise_that_stays_in_the_graph_and_goes_wrong_is_found(exporting: Exporting, spoilt: float) -> None:
+    def wrong(answer: Tensors) -> None:
+        answer["action"] = answer["action"] * np.float32(spoilt)
+
+    pool = ActingPool(spoiling("onnx", "onnxruntime", wrong))
+    report = report_of(exporting("visual", pool, compile=CompileOptions(noise="keep")))
+    assert {(c.output, c.runtime) for c in report.failures} == {("action", "onnxruntime")}
 
 
 def test_a_parameter_that_is_longer_than_the_batch_does_not_change_it(exporting: Exporting, tmp_path: Path) -> None:
