@@ -145,13 +145,15 @@ def inspect_model(
     outputs: Mapping[str, str | Role] | None = None,
     values: Mapping[str, float] | None = None,
     step: int | None = None,
+    sensors: Sequence[Sequence[int]] = (),
 ) -> Inspection:
     """What is in a source: its policies with their signatures. Raises ExportModelError.
 
-    ``step`` asks for a checkpoint of a run's folder; the default is what an export would take.
+    ``step`` asks for a checkpoint of a run's folder; the default is what an export would take. ``sensors`` are the
+    shapes that a ``.pt`` does not tell.
     """
     options = _compile_options("canonical", "lift", False, brain, inputs, outputs, values)
-    return inspect_source(source, options, ReadOptions(step))
+    return inspect_source(source, options, ReadOptions(step, tuple(tuple(s) for s in sensors)))
 
 
 def verify_bundle(

@@ -190,7 +190,7 @@ def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
 def _mapped(
     aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], interfaces: Sequence[Interface]
 ) -> dict[str, tuple[str, ...]]:
-    """The aliases, with what --map says in place of all others of a name. Raises UsageError."""
+    """The aliases, with what --map says before all others of a name. Raises UsageError."""
     ports = [p for i in interfaces for p in (*i.inputs, *i.outputs)]
     mapped = dict(aliases)
     for name, other in names.items():

@@ -17,7 +17,7 @@ from signatures.errors import ExportModelError, GraphError, SourceError, UsageEr
 from signatures.spec import Policy
 
 #: Kinds of source that have checkpoints of several steps, and those whose sensors have to be said.
-_STEPS = frozenset(("run_folder", "checkpoint", "raw_graph", "meta_graph", "bundle"))
+_STEPS = frozenset(("run_folder", "checkpoint", "raw_graph", "meta_graph"))
 _SENSORS = frozenset(("torch_checkpoint", "run_folder"))
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")

@@ -34,7 +34,7 @@ class Entrant:
     model: LoadedModel
     #: what the report calls it, where the format is not enough
     label: str = ""
-    #: outputs that it draws by itself, though the reference is fed the noise: their shape is all that can be compared
+    #: outputs that it draws by itself, though the reference is fed the noise: held to their shape and distribution
     drawn: frozenset[str] = frozenset()
     #: what the loader was given; None where there is nothing to look into when it fails
     path: Path | None = None

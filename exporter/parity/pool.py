@@ -26,14 +26,13 @@ def chosen_runtimes(wanted: str | Sequence[str], formats: Sequence[str]) -> tupl
 
     Raises UsageError on a name that is none, RuntimeUnavailableError when one that was asked for is not installed.
     """
-    known = {info.name: info for info in available_runtimes()}
+    infos = list(available_runtimes())
+    known = {info.name: info for info in infos}
     useful = [r for f in formats for r in RUNTIMES_OF[f]] + list(RUNTIMES_OF["source"])
     if wanted == "none":
-        return (), list(known.values())
+        return (), infos
     if wanted == "auto":
-        return tuple(n for n, info in known.items() if info.installed and n in useful and n not in _ON_REQUEST), list(
-            known.values()
-        )
+        return tuple(i.name for i in infos if i.installed and i.name in useful and i.name not in _ON_REQUEST), infos
     names = [n for n in known if n in INDEPENDENT or n == "numpy"] if wanted == "full" else _names(wanted)
     for name in names:
         if name not in known:
@@ -42,7 +41,7 @@ def chosen_runtimes(wanted: str | Sequence[str], formats: Sequence[str]) -> tupl
             raise UsageError(f"there is no runtime {name!r}", fix=f"{meant}the runtimes are {', '.join(known)}")
         if not known[name].installed:
             raise RuntimeUnavailableError(f"the runtime {name} is not installed", fix=known[name].how)
-    return tuple(dict.fromkeys(["numpy", *names])), list(known.values())
+    return tuple(dict.fromkeys(["numpy", *names])), infos
 
 
 def _names(wanted: str | Sequence[str]) -> list[str]:

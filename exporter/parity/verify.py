@@ -252,7 +252,7 @@ class _Verification:
         return found if found.shape == expected[name].shape else None
 
     def _plausible(self, name: str, got: np.ndarray, case: Case) -> Difference:
-        """A drawn output: shape and range only; its distribution is tested by ``_draws``."""
+        """A drawn output: shape, dtype and range; ``_draws`` and ``_densities`` test how it is distributed."""
         spec = self.signature.output(name)
         wanted = tuple(case.batch if n is None else n for n in spec.shape)
         if got.shape != wanted:
@@ -334,10 +334,7 @@ class _Verification:
             p_values = self._fits(entrant, action.name, row, expected[0])
             fits.append((min(p_values), p_values.index(min(p_values)), case, row))
         lowest, branch, case, row = min(fits, key=lambda f: f[0])
-        reason = (
-            "" if lowest >= FALSE_ALARM else f"the draws do not have the distribution they should (p = {lowest:.1e})"
-        )
-        difference = Difference(1 - lowest, 1 - lowest, lowest >= FALSE_ALARM, reason)
+        difference = _likely(lowest)
         bisection = self._bisect(entrant, action.name, difference, row, branch)
         self._add(entrant, action.name, "draws", difference, case.name, bisection=bisection)
 
@@ -375,13 +372,7 @@ class _Verification:
             tolerance = self._tolerance(name, entrant)
             columns = (s[name].reshape(len(s[name]), -1).T for s in samples)
             p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in zip(*columns, strict=True)]
-            lowest = min(p_values, default=1.0)
-            reason = (
-                ""
-                if lowest >= FALSE_ALARM
-                else f"the draws do not have the distribution they should (p = {lowest:.1e})"
-            )
-            self._add(entrant, name, "draws", Difference(1 - lowest, 1 - lowest, not reason, reason), case.name)
+            self._add(entrant, name, "draws", _likely(min(p_values, default=1.0)), case.name)
 
     def _rows(self, case: Case, count: int, run: int = 0) -> dict[str, np.ndarray]:
         """The first row of a case ``count`` times, with noise drawn for each."""
@@ -470,6 +461,14 @@ def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:
     """The outputs that depend on a sampler inside the graph."""
     samplers = {n.name for n in graph.nodes if n.op in SAMPLERS}
     return frozenset(name for name in names if graph.ancestors([name]) & samplers)
+
+
+def _likely(p_value: float) -> Difference:
+    """What a test of draws says: as a difference, the p-value's complement."""
+    if p_value >= FALSE_ALARM:
+        return Difference(1 - p_value, 1 - p_value, True)
+    reason = f"the draws do not have the distribution they should (p = {p_value:.1e})"
+    return Difference(1 - p_value, 1 - p_value, False, reason)
 
 
 def _rank(difference: Difference) -> tuple[bool, float]:

@@ -195,7 +195,7 @@ def logs(out: Path) -> Callable[[str, str], list[Any]]:
     def ran() -> dict[tuple[str, str], Any]:
         node, home = node_executable(), js_home()
         if node is None or not (home / "node_modules/@tensorflow/tfjs").is_dir():
-            pytest.skip("Node.js with @tensorflow/tfjs and onnxruntime-web is not here: make setup")
+            pytest.skip("Node.js with @tensorflow/tfjs and onnxruntime-web is not here: make install")
         files = {}
         for target in PAGES:
             for name in NAMES:
@@ -237,7 +237,7 @@ def test_what_a_page_is_told_gives_what_numpy_gives(
 def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> None:
     home = js_home()
     if not (home / "node_modules/@tensorflow/tfjs").is_dir():
-        pytest.skip("@tensorflow/tfjs is not here: make setup")
+        pytest.skip("@tensorflow/tfjs is not here: make install")
     (tmp_path / "node_modules").symlink_to((home / "node_modules").resolve())
     (tmp_path / "recurrent").symlink_to(out / "recurrent")
     page = code_of(out, "recurrent", target)

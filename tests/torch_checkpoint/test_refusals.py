@@ -11,6 +11,7 @@ import pytest
 
 from converters.recognise import recognise_path
 from converters.source import ReadOptions
+from exporter import inspect_model
 from exporter.sources import read_source
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, waves
@@ -182,6 +183,7 @@ def test_the_shapes_are_kept_for_another_look_at_the_source(tmp_path: Path) -> N
     shapes = ",".join("x".join(map(str, s)) for s in IMAGES["resnet_1_1"].sensors)
     inspected = export_model("inspect", source, "--sensors", shapes, "--json")
     assert inspected.status == 0, inspected.err
+    assert inspect_model(source, sensors=IMAGES["resnet_1_1"].sensors).policies
     exported = export_model(source, "-o", tmp_path / "out", "--sensors", shapes, "--verify", "none")
     assert exported.status == 0, exported.err
     (folder,) = (tmp_path / "out").iterdir()

@@ -318,6 +318,10 @@ function arrayOf(dtype) {
 /** Nested arrays, a flat typed array or { data, shape } as { data, shape, dtype } for one input. */
 function fitting({ name, shape: wanted, dtype }, value, rows) {
   const flat = (value?.data ?? (ArrayBuffer.isView(value) ? value : [value].flat(Infinity)));
+  for (const number of ArrayBuffer.isView(flat) ? [] : flat) {
+    const kind = typeof number; // a string or an object would become a number that nobody meant
+    if (kind !== "number" && kind !== "boolean") throw new Error(`'${name}' holds ${kind === "object" ? "an" : "a"} ${kind}`);
+  }
   if (wanted.length === 0) {
     if (flat.length !== 1) throw new Error(`'${name}' has ${flat.length} numbers; it is a single one`);
     return { data: arrayOf(dtype).from(flat), shape: [], dtype };
@@ -343,10 +347,6 @@ function fitting({ name, shape: wanted, dtype }, value, rows) {
   if (!same || size(shape) !== flat.length || (rows !== undefined && wanted[0] === null && shape[0] !== rows)) {
     const text = ["agents", ...inner.map((n) => n ?? "any")].join(", ");
     throw new Error(`'${name}' has ${flat.length} numbers; [${text}]${rows === undefined ? "" : ` for ${rows} agents`} is wanted`);
-  }
-  for (const number of ArrayBuffer.isView(flat) ? [] : flat) {
-    const kind = typeof number; // a string or an object would become a number that nobody meant
-    if (kind !== "number" && kind !== "boolean") throw new Error(`'${name}' holds ${kind === "object" ? "an" : "a"} ${kind}`);
   }
   return { data: arrayOf(dtype).from(flat), shape: [...shape], dtype };
 }
