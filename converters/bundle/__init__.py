@@ -1,0 +1,1 @@
+"""Bundles: the folder that one policy is written to, with its contract; opened, embedded, exchanged."""

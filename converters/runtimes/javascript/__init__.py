@@ -1,0 +1,1 @@
+"""TensorFlow.js and onnxruntime-web, in Node and in Chromium."""

@@ -1,0 +1,1 @@
+"""``compare``: artefacts that any tool made, held against a reference."""

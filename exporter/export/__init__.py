@@ -1,0 +1,1 @@
+"""The main job: sources in, verified bundles out."""
