@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-JS := converters/runner/js
+JS := converters/runtimes/javascript/js
 PYTEST := $(BIN)/python -m pytest
 
 .PHONY: install browser demo test lint types docs figures bench train clean help

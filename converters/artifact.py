@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from signatures.spec import Policy
+from converters.policy import Policy
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ READERS = MappingProxyType(
         "hdf5": "converters.saved_model.keras",
         "tfjs": "converters.tfjs.source",
         "torch_checkpoint": "converters.torch_checkpoint.source",
-        "bundle": "converters.bundle_source",
+        "bundle": "converters.bundle.source",
     }
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from signatures.graph import Graph, ref, split_ref
+from converters.graph.nodes import Graph, ref, split_ref
 
 
 def renamed(graph: Graph, names: Mapping[str, str]) -> Graph:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from signatures.graph import Graph
-from signatures.infer import SourceFacts
+from converters.graph.nodes import Graph
+from converters.understand.infer import SourceFacts
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,11 +14,11 @@ from exporter.version import __version__
 if TYPE_CHECKING:
     from exporter.acting.policy import load_policy
     from exporter.api import export_model, inspect_model, verify_bundle
-    from exporter.comparison import compare_artefacts
+    from exporter.compare.comparison import compare_artefacts
 
 __all__ = ["__version__", "compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"]
 
-_HOMES = {"load_policy": "exporter.acting.policy", "compare_artefacts": "exporter.comparison"}
+_HOMES = {"load_policy": "exporter.acting.policy", "compare_artefacts": "exporter.compare.comparison"}
 
 
 def __getattr__(name: str) -> Any:

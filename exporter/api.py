@@ -11,12 +11,12 @@ from converters.graph.options import CompileOptions
 from converters.graph.passes.noise import NoiseMode
 from converters.registry import TARGETS
 from converters.source import ReadOptions
-from exporter.inspection import Inspection, inspect_source
-from exporter.labels import Labels
-from exporter.parity.report import ParityReport
-from exporter.parity.subject import VerifyOptions
-from exporter.pipeline import ExportOptions, ExportResult, export, verify_folder
-from exporter.sources import Source, live_source
+from exporter.export.labels import Labels
+from exporter.export.pipeline import ExportOptions, ExportResult, export, verify_folder
+from exporter.export.sources import Source, live_source
+from exporter.inspect.inspection import Inspection, inspect_source
+from exporter.verify.report import ParityReport
+from exporter.verify.subject import VerifyOptions
 from signatures.errors import ParityError, UsageError
 from signatures.roles import Role, parse_role
 

@@ -12,7 +12,7 @@
     ├── SignatureError          2  inputs and outputs cannot be given their roles
     ├── BundleError             2  a bundle is missing, incomplete or has been changed
     ├── ParityError             1  two runtimes disagree
-    ├── RunFailedError          1  a runtime refused a model (converters/runner/process.py); verification reports it
+    ├── RunFailedError          1  a runtime refused a model (converters/runtimes/process.py); verification reports it
     └── RuntimeUnavailableError 3  a runtime that was asked for is not installed, or did not start
 """
 

@@ -1,4 +1,4 @@
-"""Tensor specs, the signature of a policy, and the policy itself."""
+"""Tensor specs, the signature of a policy, and how its source is run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from signatures.graph import Graph
 from signatures.labels import parsed
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Constant, Role
@@ -228,19 +227,3 @@ class SourceMap:
 def sources(specs: tuple[TensorSpec, ...], parts: Collection[str]) -> dict[str, str]:
     """Canonical name → the source's tensor, of those that stand for one tensor as it is."""
     return {s.name: s.source for s in specs if isinstance(s.source, str) and s.name not in parts}
-
-
-@dataclass(frozen=True, slots=True)
-class Policy:
-    """A graph with its signature: the hub between all readers and all writers.
-
-    ``feeds`` maps an input's canonical name to the Placeholder that takes it, ``fetches`` an output's canonical name
-    to the tensor that gives it. After the naming pass both map names to themselves.
-    """
-
-    name: str
-    graph: Graph
-    signature: PolicySignature
-    feeds: Mapping[str, str]
-    fetches: Mapping[str, str]
-    source: SourceMap = field(default_factory=SourceMap)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from exporter.cli import main
+from exporter.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
 

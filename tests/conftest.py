@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from exporter.parity.pool import RuntimePool
-from exporter.runtimes import available_runtimes
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import available_runtimes
 
 #: What the tests that compare all formats run them in.
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
@@ -29,7 +29,7 @@ def pool() -> Iterator[RuntimePool]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _what_is_written_fits_its_schema() -> Iterator[None]:
-    from exporter import bundle
+    from exporter.export import bundle
     from tests.reports.validation import check_parity, check_policy
 
     written = bundle.dumps

@@ -20,11 +20,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from exporter.parity.histogram import added, to_dict
-from exporter.parity.pool import RuntimePool
-from exporter.parity.report import Comparison, ParityReport
-from exporter.pipeline import ExportOptions, export
-from exporter.runtimes import RUNTIMES, available_runtimes
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import RUNTIMES, available_runtimes
+from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.histogram import added, to_dict
+from exporter.verify.report import Comparison, ParityReport
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases

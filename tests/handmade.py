@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from converters import schema
 from converters.frozen_graph.tensors import from_array
-from signatures.graph import TensorShape
+from converters.graph.nodes import TensorShape
 
 Array = npt.NDArray[Any]
 NodeDef = Any

@@ -10,9 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from exporter.runtimes import Runtime, RuntimeInfo, legacy, legacy_install
-from exporter.runtimes.legacy import API_LIBRARY, LIBRARIES, RELEASES, TF1_4, TF1_7, is_whole, library_folder
-from exporter.runtimes.legacy_install import install, weaken_python_symbols
+from converters.runtimes.registry import Runtime, RuntimeInfo
+from converters.runtimes.tensorflow1 import found as legacy
+from converters.runtimes.tensorflow1 import install as legacy_install
+from converters.runtimes.tensorflow1.found import (
+    API_LIBRARY,
+    LIBRARIES,
+    RELEASES,
+    TF1_4,
+    TF1_7,
+    is_whole,
+    library_folder,
+)
+from converters.runtimes.tensorflow1.install import install, weaken_python_symbols
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 

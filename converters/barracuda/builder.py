@@ -18,9 +18,9 @@ import numpy.typing as npt
 from converters.barracuda.format import Layer, four_axes
 from converters.barracuda.vocabulary import layer_label
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node
 from converters.graph.types import FLOAT32, INT32
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.graph import Graph, Node
 
 #: N, H, W, C; N is None where it is the batch.
 Shape = tuple[int | None, int, int, int]

@@ -17,9 +17,9 @@ from converters.barracuda.builder import MAX_ELEMENTS, Builder, Value, node_name
 from converters.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
 from converters.barracuda.layers import check_bypassed, translate
 from converters.barracuda.vocabulary import LayerType
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
-from signatures.graph import Graph, NameScope, Node, TensorShape
 from signatures.roles import ACTION_NAMES, OUTPUT_NAMES, Role
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from converters.graph.compile import CONTRACT_NODE
-from converters.graph.signature import derived_notes
+from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.registry import reader
 from converters.renaming import renamed
 from converters.source import ReadOptions, SourceModel
+from converters.understand.infer import SourceFacts
+from converters.understand.signature import derived_notes
 from signatures.digest import sha256_hex
 from signatures.errors import BundleError, DamagedFileError
-from signatures.graph import Graph, NameScope, Node, topological
-from signatures.infer import SourceFacts
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 

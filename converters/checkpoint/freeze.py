@@ -12,11 +12,11 @@ from typing import Protocol
 
 import numpy as np
 
-from converters.checkpoint.bundle import Extents, several
+from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
+from converters.understand.infer import find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
-from signatures.graph import Graph, NameScope, Node, TensorShape, node_of, topological
-from signatures.infer import find_brains
 from signatures.roles import CONSTANT_NAMES
 
 VARIABLES = frozenset(("VariableV2", "Variable", "VarHandleOp", "AutoReloadVariable"))

@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from converters.checkpoint.freeze import is_effect
+from converters.graph.nodes import Graph, Node, node_of, topological
 from converters.renaming import renamed
+from converters.understand.infer import find_brains
 from signatures.errors import ExportModelError
-from signatures.graph import Graph, Node, node_of, topological
-from signatures.infer import find_brains
 from signatures.roles import OUTPUT_NAMES, Constant, numbers
 
 _SAMPLED = "action/Multinomial"

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from converters.checkpoint import listing
-from converters.checkpoint.bundle import Checkpoint, of_objects, version_1
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.policy_nodes import policy_nodes
 from converters.checkpoint.table import MAGIC
+from converters.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
 from converters.checkpoint.training_graph import read_training_graph
 from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.understand.infer import SourceFacts
 from signatures.errors import ExportModelError, SourceError, UsageError
-from signatures.infer import SourceFacts
 
 _PARTS = re.compile(r"(?P<prefix>.+)\.(index|meta|data-\d{5}-of-\d{5})")
 

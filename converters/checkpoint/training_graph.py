@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.checkpoint.bundle import Extents
+from converters.checkpoint.tensor_bundle import Extents
 from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.tensors import to_array
+from converters.graph.nodes import Graph, node_of, split_ref
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.graph import Graph, node_of, split_ref
 
 #: Initial values that were written as one repeated value unfold when they are read, and nothing needs them.
 _ASSIGN = frozenset(("Assign", "AssignVariableOp"))

@@ -13,11 +13,11 @@ import numpy as np
 
 from converters import schema
 from converters.frozen_graph.tensors import from_array
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.base import REQUIRED, Attr
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import Types, infer_types
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.graph import Graph, Node, TensorShape
 
 #: GraphDef version written: that of TF 1.4. (Graphs frozen by TF 1.x carry none, which TensorFlow.js cannot read.)
 PRODUCER = 24

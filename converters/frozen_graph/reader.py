@@ -12,8 +12,8 @@ import numpy as np
 
 from converters import schema
 from converters.frozen_graph.tensors import Allowance, to_array
+from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.graph import Graph, Node, TensorShape, normal_ref, topological
 
 #: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).
 SCALAR_SHAPE_PRODUCER = 24

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.bundle_source import facts_of, recalled
+from converters.bundle.source import facts_of, recalled
 from converters.frozen_graph.reader import read_graph
 from converters.source import OriginalRun, ReadOptions, SourceModel
 

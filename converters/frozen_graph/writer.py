@@ -6,8 +6,8 @@ from converters import schema
 from converters.artifact import Artifact, WriteOptions
 from converters.frozen_graph.encode import encode, string_constant
 from converters.graph.compile import CONTRACT_NODE
-from signatures.graph import Graph
-from signatures.spec import Policy
+from converters.graph.nodes import Graph
+from converters.policy import Policy
 
 
 def with_contract(graph: Graph, contract: str) -> Graph:

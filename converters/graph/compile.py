@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
 from converters.graph.options import CompileOptions
-from converters.graph.passes.companions import LOG_PROBS, add_companions
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import batch_size_rank, complete_shapes, constant_value, set_values, settle_inputs
 from converters.graph.passes.memories import join_memories
@@ -18,17 +18,26 @@ from converters.graph.passes.naming import name_tensors
 from converters.graph.passes.noise import lift_noise, samplers, unseeded
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.simplify import collapse_views, drop_identities
-from converters.graph.passes.straighten import straighten
 from converters.graph.passes.transposes import cancel_transposes
+from converters.graph.passes.unroll import straighten
 from converters.graph.shapes import Types, infer_types
-from converters.graph.signature import Compiled, branch_sizes, build_signature
 from converters.graph.types import static_shape
+from converters.policy import Policy
+from converters.understand.derived_outputs import LOG_PROBS, add_companions
+from converters.understand.infer import (
+    ActionMeaning,
+    Brain,
+    Head,
+    SourceFacts,
+    action_meaning,
+    classify_inputs,
+    find_brains,
+)
+from converters.understand.signature import Compiled, branch_sizes, build_signature
 from signatures.errors import UsageError
-from signatures.graph import Graph, Node, node_of, split_ref, topological
-from signatures.infer import ActionMeaning, Brain, Head, SourceFacts, action_meaning, classify_inputs, find_brains
 from signatures.memories import SourcePart
 from signatures.roles import Constant, Role
-from signatures.spec import Policy, SourceMap, sources
+from signatures.spec import SourceMap, sources
 
 #: The name of the string constant in which our GraphDefs carry their contract.
 CONTRACT_NODE = "export_model_contract"

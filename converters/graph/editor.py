@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE
-from signatures.graph import Graph, NameScope, Node, ref, split_ref, topological
 
 
 class Editor:

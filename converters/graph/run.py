@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.nodes import Graph, Node, normal_ref, ref, split_ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
 from signatures.errors import GraphError
-from signatures.graph import Graph, Node, normal_ref, ref, split_ref
 
 #: Ops that round nothing, beside the structural ones.
 _EXACT = frozenset(

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of
 from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, product
 from signatures.errors import ExportModelError, GraphError
-from signatures.graph import Graph, Node, ref
 
 Types = dict[str, TensorType]
 

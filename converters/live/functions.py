@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from converters.frozen_graph.reader import read_graph
-from converters.runner.tensorflow_freeze import keras_call, keras_outputs, named_function, saved_function
+from converters.runtimes.tensorflow.freeze import keras_call, keras_outputs, named_function, saved_function
 from converters.saved_model.signature import ModelSignature, Tensor, expose
 from converters.source import OriginalRun, SourceModel
+from converters.understand.infer import SourceFacts
 from signatures.errors import SourceError, UsageError
-from signatures.infer import SourceFacts
 
 NAME = "policy"
 #: Names of functions that say nothing of a policy.

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.checkpoint.bundle import Extents, several
 from converters.checkpoint.freeze import VARIABLES, freeze, wanted_variables
 from converters.checkpoint.policy_nodes import policy_nodes
+from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph, training_graph
-from converters.runner.tensorflow_freeze import flattened
+from converters.runtimes.tensorflow.freeze import flattened
 from converters.source import OriginalRun, SourceModel
+from converters.understand.infer import SourceFacts
 from signatures.errors import NotAPolicyError, SourceError, UsageError
-from signatures.infer import SourceFacts
 
 NAME = "policy"
 _GRAPH, _VALUES = "graph.pb", "values.npz"

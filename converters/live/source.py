@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from converters.graph.nodes import Graph
 from converters.live.functions import read_function, read_keras
 from converters.live.session import read_session
 from converters.recognise import FileKind
 from converters.source import SourceModel
 from signatures.digest import sha256_hex
 from signatures.errors import UsageError
-from signatures.graph import Graph
 
 _KINDS = {
     "session": (FileKind("session", "a live session"), read_session),

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from converters.onnx.raising.node import STANDARD
+from converters.onnx.importer.node import STANDARD
 
 Dims = tuple[int | None, ...] | None
 

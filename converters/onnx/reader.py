@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import BATCH, Dim, TensorType
+from converters.onnx.importer.drafting import MAX_NODES
+from converters.onnx.importer.importer import Raiser, joined_errors
+from converters.onnx.importer.node import DTYPES, STANDARD
+from converters.onnx.importer.table import TABLE
 from converters.onnx.memories import OnnxMemory, separate_memories
 from converters.onnx.proto import array_of, load_external, tensors
-from converters.onnx.raising.drafting import MAX_NODES
-from converters.onnx.raising.node import DTYPES, STANDARD
-from converters.onnx.raising.raiser import Raiser, joined_errors
-from converters.onnx.raising.table import TABLE
 from converters.recognise import read_bytes
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
-from signatures.graph import Graph, TensorShape
 from signatures.memories import SeparateMemory
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.onnx.generation import understood
 from converters.onnx.reader import read_onnx
 from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.understand.onnx_trainers import understood
 
 
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:

@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from converters.artifact import Artifact, WriteOptions
+from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.table import op_of, unsupported
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
+from converters.policy import Policy
 from signatures.errors import GraphError, UsageError
-from signatures.graph import Graph, Node, ref
-from signatures.spec import Policy, TensorSpec
+from signatures.spec import TensorSpec
 
 #: Opset → the IR version of the same ONNX release (onnx/helper.py, OP_SET_ID_VERSION_MAP).
 IR_VERSIONS = {13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}

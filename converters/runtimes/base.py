@@ -24,7 +24,7 @@ class Runtime:
 
     ``formats`` are the formats of a bundle that it loads, ``source`` in addition where it reads originals by itself.
     ``find`` says whether it is here, without importing it: the import takes seconds, and this is only a question.
-    ``command`` gives the argument list of a child process that speaks the frames of converters/runner/wire.py; it
+    ``command`` gives the argument list of a child process that speaks the frames of converters/runtimes/wire.py; it
     raises RuntimeUnavailableError. ``install`` fetches it, None where pip or the system's packages do that.
     """
 

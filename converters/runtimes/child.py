@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, BinaryIO, NoReturn, Protocol
 
-from converters.runner.wire import Tensors, read_frame, write_frame
+from converters.runtimes.wire import Tensors, read_frame, write_frame
 
 
 class Model(Protocol):

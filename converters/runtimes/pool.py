@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 
 from converters.registry import TARGETS
-from converters.runner.process import RuntimeProcess
-from exporter.runtimes import RUNTIMES, RuntimeInfo, available_runtimes
+from converters.runtimes.process import RuntimeProcess
+from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError, UsageError
 
 FORMATS = ("source", *TARGETS)

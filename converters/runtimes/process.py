@@ -12,7 +12,7 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
-from converters.runner.wire import Tensors, read_frame, write_frame
+from converters.runtimes.wire import Tensors, read_frame, write_frame
 from signatures.errors import ExportModelError, RuntimeUnavailableError
 
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.

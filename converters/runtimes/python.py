@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 from functools import partial
-from pathlib import Path
 
-from exporter.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.command import child_command
 
 # One module, many distributions: these all provide ``tensorflow`` and ``onnxruntime``. First come, first taken.
 _DISTRIBUTIONS = {
@@ -33,13 +32,6 @@ _DISTRIBUTIONS = {
         "ort-nightly",
     ),
 }
-
-
-def child_command(module: str, *arguments: str) -> list[str]:
-    """How a module of this project is run as a program, by this very copy of the packages, installed or not."""
-    root = str(Path(__file__).resolve().parents[2])
-    start = f"import sys, runpy; sys.path.insert(0, {root!r}); "
-    return [sys.executable, "-c", f"{start}runpy.run_module({module!r}, run_name='__main__')", *arguments]
 
 
 def module_origin(name: str) -> str | None:
@@ -69,7 +61,7 @@ def _distribution_version(names: tuple[str, ...]) -> str | None:
 
 
 def _runtime(name: str, formats: tuple[str, ...], how: str, *, independent: bool = True) -> Runtime:
-    command = partial(child_command, f"converters.runner.{name}_child")
+    command = partial(child_command, f"converters.runtimes.{name}.child")
     return Runtime(name, formats, partial(_find, name, how), command, independent=independent)
 
 

@@ -1,16 +1,21 @@
 """The runtimes that artefacts are verified in: a file per family, and here the list of them.
 
-To add a runtime is to add a child process that speaks the frames of converters/runner/wire.py, and a line here. Nothing
+To add a runtime is to add a child process that speaks the frames of wire.py, and a line here. Nothing
 here imports a runtime: ``import tensorflow`` takes seconds, and the question is only whether it is there.
 """
 
 from __future__ import annotations
 
-from exporter.runtimes.base import Runtime, RuntimeInfo
-from exporter.runtimes.browser import ONNXRUNTIME_WEB_CHROMIUM, TFJS_CPU_CHROMIUM, TFJS_WASM_CHROMIUM, TFJS_WEBGL
-from exporter.runtimes.javascript import ONNXRUNTIME_WEB, TFJS_CPU, TFJS_WASM
-from exporter.runtimes.legacy import TF1_4, TF1_7
-from exporter.runtimes.python import NUMPY, ONNXRUNTIME, TENSORFLOW
+from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.javascript.browser import (
+    ONNXRUNTIME_WEB_CHROMIUM,
+    TFJS_CPU_CHROMIUM,
+    TFJS_WASM_CHROMIUM,
+    TFJS_WEBGL,
+)
+from converters.runtimes.javascript.node import ONNXRUNTIME_WEB, TFJS_CPU, TFJS_WASM
+from converters.runtimes.python import NUMPY, ONNXRUNTIME, TENSORFLOW
+from converters.runtimes.tensorflow1.found import TF1_4, TF1_7
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 

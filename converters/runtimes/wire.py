@@ -2,7 +2,7 @@
 
 A frame is a little-endian uint32, the length of a JSON header; the header; then the bytes of the tensors that
 ``header["tensors"]`` lists (``{"name", "dtype", "shape"}``), one after the other, little-endian, in C order.
-``converters/runner/js/frames.mjs`` speaks the same.
+``converters/runtimes/javascript/js/frames.mjs`` speaks the same.
 """
 
 from __future__ import annotations

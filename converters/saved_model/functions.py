@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from pathlib import Path
 
-from converters.runner.process import RunFailedError, RuntimeProcess
+from converters.runtimes.command import child_command
+from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import RuntimeUnavailableError, SourceError
 
-_ROOT = Path(__file__).resolve().parents[2]
-_CHILD = "converters.runner.freeze_child"
+_CHILD = "converters.runtimes.tensorflow.freeze_child"
 _WHAT = {"saved_model": "a SavedModel of TensorFlow 2", "keras": "a Keras model"}
 
 
@@ -30,10 +29,8 @@ def frozen_by_tensorflow(path: Path, form: str, signature: str | None = None) ->
             why="its functions are flattened by TensorFlow itself, and it is not installed",
             fix="pip install 'export-model[tensorflow]'; or freeze the model where it was made, and give the GraphDef",
         )
-    start = f"import sys, runpy; sys.path.insert(0, {str(_ROOT)!r}); "
-    command = [sys.executable, "-c", f"{start}runpy.run_module({_CHILD!r}, run_name='__main__')"]
     try:
-        with RuntimeProcess("tensorflow", command) as process:
+        with RuntimeProcess("tensorflow", child_command(_CHILD)) as process:
             answer = process.load(str(path), form=form, signature=signature).run({}, ["graph", "names"])
     except RunFailedError as error:
         raise SourceError(

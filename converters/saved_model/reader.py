@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from converters import schema
+from converters.graph.nodes import TensorShape, node_of
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.graph import TensorShape, node_of
 
 SERVING = "serving_default"
 _INIT = "__saved_model_"

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from converters.graph.compile import CONTRACT_NODE
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.renaming import renamed
+from converters.understand.infer import role_by_name
 from signatures.errors import DamagedFileError
-from signatures.graph import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
-from signatures.infer import role_by_name
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 

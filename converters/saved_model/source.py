@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.bundle_source import facts_of, recalled
-from converters.checkpoint.bundle import Checkpoint
+from converters.bundle.source import facts_of, recalled
 from converters.checkpoint.freeze import freeze
+from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import training_graph
 from converters.frozen_graph.reader import read_graph
 from converters.saved_model.functions import frozen_by_tensorflow
 from converters.saved_model.reader import Saved, read_saved_model
 from converters.saved_model.signature import expose
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from signatures.infer import SourceFacts
+from converters.understand.infer import SourceFacts
 
 FILE = "saved_model.pb"
 

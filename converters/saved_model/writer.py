@@ -15,8 +15,9 @@ from converters import schema
 from converters.artifact import Artifact, WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.frozen_graph.writer import with_contract
+from converters.policy import Policy
 from signatures.roles import Role
-from signatures.spec import Policy, TensorSpec
+from signatures.spec import TensorSpec
 
 PATH = "saved_model/saved_model.pb"
 SERVING, DETERMINISTIC = "serving_default", "deterministic"

@@ -17,7 +17,7 @@ from converters import schema
 from converters.checkpoint.crc32c import crc32c, masked
 from converters.frozen_graph.encode import PRODUCER
 from converters.frozen_graph.tensors import from_array
-from signatures.graph import Graph, TensorShape
+from converters.graph.nodes import Graph, TensorShape
 
 #: TensorBoard takes every file with "tfevents" in its name; the number is where a writer puts its time.
 FILE_NAME = "events.out.tfevents.0.export-model"

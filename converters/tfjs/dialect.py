@@ -16,10 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node
 from converters.graph.ops.convolution import window_padding
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import BOOL, INT32
-from signatures.graph import Graph, Node
 
 
 def for_tfjs(graph: Graph) -> Graph:

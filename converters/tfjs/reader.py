@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
-from signatures.graph import Graph, Node, TensorShape, normal_ref, topological
 
 MODEL = "model.json"
 _DTYPES = {

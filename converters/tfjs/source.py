@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.bundle_source import contract_of, facts_of, redrawn, retyped
+from converters.bundle.source import contract_of, facts_of, redrawn, retyped
 from converters.saved_model.signature import expose
 from converters.source import ReadOptions, SourceModel
 from converters.tfjs.reader import MODEL, read_model
 from converters.tfjs.unfuse import unfuse
-from signatures.infer import SourceFacts
+from converters.understand.infer import SourceFacts
 
 
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:

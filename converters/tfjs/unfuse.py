@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Graph, NameScope, Node, topological
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Graph, NameScope, Node, topological
 
 _PLAIN = {
     "_FusedMatMul": "MatMul",

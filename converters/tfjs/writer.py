@@ -23,12 +23,13 @@ import numpy as np
 from converters import schema
 from converters.artifact import Artifact, WriteOptions
 from converters.frozen_graph.encode import encode
+from converters.graph.nodes import Graph, Node
 from converters.graph.passes.fuse import fuse
 from converters.graph.types import FLOAT32, INT32
+from converters.policy import Policy
 from converters.tfjs.dialect import for_tfjs
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Graph, Node
-from signatures.spec import Policy, TensorSpec
+from signatures.spec import TensorSpec
 
 SHARD_BYTES = 4 << 20
 #: The module that acts with the model in a page, and its types; they lie beside it.

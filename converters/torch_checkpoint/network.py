@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape, topological
 from converters.graph.types import FLOAT32, INT32
-from converters.onnx.raising.drafting import Draft
+from converters.onnx.importer.drafting import Draft
 from converters.torch_checkpoint.state import State
-from signatures.graph import Graph, NameScope, Node, TensorShape, topological
 
 #: Added before a logarithm (``EPSILON`` in distributions.py).
 TINY = 1e-7

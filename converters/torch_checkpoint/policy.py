@@ -22,14 +22,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from converters.graph.nodes import Graph
 from converters.graph.types import INT64
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, find_sensors
 from converters.torch_checkpoint.state import LET_IT_EXPORT, State, unknown_part
-from signatures.eras import TORCH_VERSION_3
+from converters.understand.generations import TORCH_VERSION_3
+from converters.understand.infer import SourceFacts
 from signatures.errors import DamagedFileError, SourceError
-from signatures.graph import Graph
-from signatures.infer import SourceFacts
 
 _BODY = "network_body"
 #: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.

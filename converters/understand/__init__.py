@@ -1,1 +1,1 @@
-"""What a graph means: which brain, which inputs and outputs, which trainer and generation wrote it, what its numbers are for."""
+"""What a graph means: brains, inputs, outputs, memory, the trainer that wrote it, what its numbers are."""

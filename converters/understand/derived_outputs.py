@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph
 from converters.graph.passes.noise import without_noise
 from converters.graph.shapes import infer_types
 from converters.graph.types import INT32, INT64
-from signatures.graph import Graph
-from signatures.infer import ActionMeaning, Head
+from converters.understand.infer import ActionMeaning, Head
 from signatures.roles import Role
 
 LOG_PROBS = "action_log_probs"

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from signatures.graph import Graph, Node
-from signatures.infer import TRANSPARENT
+from converters.graph.nodes import Graph, Node
+from converters.understand.infer import TRANSPARENT
 
 BYTE = 255.0
 #: A divisor may be repeated for each colour.

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, split_ref
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
-from signatures.graph import Graph, Node, TensorShape, node_of, normal_ref, split_ref
 from signatures.memories import SeparateMemory
 from signatures.roles import (
     ACTION_NAMES,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from converters.graph.nodes import Graph, node_of, ref
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types, run_kernel
-from signatures.graph import Graph, node_of, ref
 
 
 def normaliser(graph: Graph, name: str) -> dict[str, object] | None:

@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.bundle_source import contract_of, redrawn
-from converters.bundle_source import facts_of as facts_of_contract
+from converters.bundle.source import contract_of, redrawn
+from converters.bundle.source import facts_of as facts_of_contract
+from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.onnx.reader import OnnxModel
 from converters.onnx.writer import CONTRACT_KEY
 from converters.renaming import renamed
-from signatures.eras import torch_generation
-from signatures.graph import Graph, NameScope, Node, topological
-from signatures.infer import SourceFacts
+from converters.understand.generations import torch_generation
+from converters.understand.infer import SourceFacts
 from signatures.roles import OUTPUT_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.

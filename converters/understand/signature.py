@@ -7,16 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from converters.graph.nodes import Graph, Node, TensorShape, node_of
 from converters.graph.options import CompileOptions
-from converters.graph.passes.colours import highest_colour
-from converters.graph.passes.companions import LOG_PROBS
-from converters.graph.passes.stats import memory_layout, normaliser
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
-from signatures.eras import generation
+from converters.understand.derived_outputs import LOG_PROBS
+from converters.understand.generations import generation
+from converters.understand.image_range import highest_colour
+from converters.understand.infer import ActionMeaning, Brain, Head, SourceFacts
+from converters.understand.normaliser import memory_layout, normaliser
 from signatures.errors import SignatureError
-from signatures.graph import Graph, Node, TensorShape, node_of
-from signatures.infer import ActionMeaning, Brain, Head, SourceFacts
 from signatures.labels import remaining
 from signatures.roles import OBSERVATIONS, Role, canonical_name, numbers
 from signatures.spec import Memory, PolicySignature, TensorSpec

@@ -218,7 +218,7 @@ def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0
     ``numpy`` (needs its ``.bytes`` and nothing else; slower); without it, the first that is there. Raises BundleError,
     RuntimeUnavailableError, UsageError.
     """
-    from exporter.bundle import read_policy_json, signature_of
+    from exporter.export.bundle import read_policy_json, signature_of
 
     folder = Path(bundle)
     content = read_policy_json(folder)
@@ -260,9 +260,9 @@ def _in_onnxruntime(file: Path) -> Run:
 def _in_numpy(file: Path) -> Run:
     from converters.frozen_graph.reader import read_graph
     from converters.graph.compile import CONTRACT_NODE
+    from converters.graph.nodes import Graph
     from converters.graph.passes.normalise import normalise
     from converters.graph.run import run_graph
-    from signatures.graph import Graph
 
     graph = read_graph(file.read_bytes())
     graph = normalise(Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)))

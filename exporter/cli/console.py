@@ -19,10 +19,10 @@ import click
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from exporter.parity.report import ParityReport
-    from exporter.parity.tolerances import ToleranceRule
-    from exporter.pipeline import ExportResult
+    from exporter.export.pipeline import ExportResult
     from exporter.reports.entry import Entry
+    from exporter.verify.report import ParityReport
+    from exporter.verify.tolerances import ToleranceRule
 
 _ERASE = "\r\x1b[2K"
 _COLOURS = {True: "green", False: "red", None: "yellow"}
@@ -103,7 +103,7 @@ class Console:
         """What ``--tolerances`` says. Raises UsageError."""
         if self.tolerances is None:
             return ()
-        from exporter.parity.tolerance_file import read_tolerances
+        from exporter.verify.tolerance_file import read_tolerances
 
         return read_tolerances(self.tolerances)
 
@@ -144,7 +144,7 @@ class Console:
         if result.report is not None:
             self._report(result.report)
             return
-        from exporter.tables import size_text, table
+        from exporter.cli.tables import size_text, table
 
         rows = [[kind, size_text(size)] for kind, size in result.sizes.items()]
         click.echo(table(("format", "size"), rows))
@@ -164,7 +164,7 @@ class Console:
                 click.echo(f"  note: {note}")
 
     def _report(self, report: ParityReport) -> None:
-        from exporter.summary import comparison_table, failure_lines, not_run_lines, parity_table, verdict
+        from exporter.cli.summary import comparison_table, failure_lines, not_run_lines, parity_table, verdict
 
         if not self.quiet:
             shown = comparison_table(report) if self.verbose else parity_table(report)

@@ -56,7 +56,7 @@ def show_version(ctx: click.Context, parameter: click.Parameter, wanted: bool) -
     """``--version``: this program's, and the runtimes that were found."""
     if not wanted or ctx.resilient_parsing:
         return
-    from exporter.runtimes import available_runtimes
+    from converters.runtimes.registry import available_runtimes
 
     click.echo(f"{_PROGRAM}, version {__version__}")
     here = [f"{i.name} {i.version or ''}".strip() for i in available_runtimes() if i.installed]

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from exporter.command_group import SourceGroup, completion_command, show_version
-from exporter.console import Console, reporting
+from exporter.cli.console import Console, reporting
+from exporter.cli.group import SourceGroup, completion_command, show_version
 from exporter.serve.command import serve_command
 from exporter.snippets.command import snippets_command
 from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
-    from exporter.parity.report import ParityReport
-    from exporter.parity.subject import VerifyOptions
-    from exporter.pipeline import ExportResult
+    from exporter.export.pipeline import ExportResult
     from exporter.reports.entry import Entry
+    from exporter.verify.report import ParityReport
+    from exporter.verify.subject import VerifyOptions
 
 _TARGETS = "bytes,saved_model,tfjs,onnx"
 
@@ -128,9 +128,9 @@ def _verify_options(
     golden: Path | None,
     sizes: Sequence[str],
 ) -> VerifyOptions:
-    from exporter.parity.budget import parse_budget
-    from exporter.parity.subject import VerifyOptions
-    from exporter.parity.tolerances import Tolerance
+    from exporter.verify.budget import parse_budget
+    from exporter.verify.subject import VerifyOptions
+    from exporter.verify.tolerances import Tolerance
 
     return VerifyOptions(seed, samples, steps, Tolerance(atol, rtol), console.rules(), golden, parse_budget(sizes))
 
@@ -215,7 +215,7 @@ def export_command(
 ) -> None:
     """Export policies (the command that is meant where none is named)."""
     from converters.source import ReadOptions
-    from exporter.pipeline import ExportOptions, export
+    from exporter.export.pipeline import ExportOptions, export
 
     console.prepare(verifies=runtimes != "none")
     options = ExportOptions(
@@ -281,14 +281,14 @@ def inspect_command(
 ) -> None:
     """Show what is in a file: generation, brains, inputs and what to feed, outputs, ops, targets."""
     from converters.source import ReadOptions
-    from exporter.inspection import inspect_source, inspection_text
+    from exporter.inspect.inspection import inspect_source, inspection_text
 
     found = inspect_source(
         source, _compile_options(brain, inputs, outputs, values), ReadOptions(step, _shapes(sensors))
     )
     written: list[Path] = []
     if logdir is not None or svg is not None:
-        from exporter.pictures import write_pictures
+        from exporter.inspect.pictures import write_pictures
 
         written = write_pictures(found, logdir, svg)
     if as_json:
@@ -321,7 +321,7 @@ def verify_command(
     **parity: Any,
 ) -> None:
     """Verify bundles again: hashes first, then every format in the runtimes."""
-    from exporter.pipeline import verify_folder
+    from exporter.export.pipeline import verify_folder
 
     console.prepare()
     options = _verify_options(console, **parity)
@@ -378,7 +378,7 @@ def compare_command(
     **parity: Any,
 ) -> None:
     """Hold artefacts that any tool made against a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
-    from exporter.comparison import compare_artefacts
+    from exporter.compare.comparison import compare_artefacts
     from exporter.reports.entry import Entry
 
     console.prepare()
@@ -408,8 +408,8 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     """Which runtimes are here, in which version, and how to install the others."""
     if ctx.invoked_subcommand is not None:
         return
-    from exporter.runtimes import available_runtimes
-    from exporter.tables import table
+    from converters.runtimes.registry import available_runtimes
+    from exporter.cli.tables import table
 
     found = available_runtimes()
     if as_json:
@@ -424,7 +424,7 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
 @click.argument("name")
 def install_command(name: str) -> None:
     """Install a runtime into the user's cache folder; "tfjs" and "tf1" stand for all whose names begin so."""
-    from exporter.runtimes import RUNTIMES
+    from converters.runtimes.registry import RUNTIMES
 
     chosen = [r for r in RUNTIMES if r.name == name]
     chosen = chosen or [r for r in RUNTIMES if r.name.startswith((f"{name}-", f"{name}."))]

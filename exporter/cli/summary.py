@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from exporter.parity.report import Comparison, ParityReport
-from exporter.parity.statistics import FALSE_ALARM
-from exporter.tables import size_text, table
+from exporter.cli.tables import size_text, table
+from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.statistics import FALSE_ALARM
 
 
 def parity_table(report: ParityReport) -> str:

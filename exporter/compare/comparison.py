@@ -19,22 +19,23 @@ import numpy as np
 from converters.artifact import WriteOptions
 from converters.frozen_graph.writer import write as write_frozen
 from converters.graph.options import CompileOptions
-from converters.interface import Interface, Port, interfaces_of
-from converters.runner.process import LoadedModel, RunFailedError
+from converters.policy import Policy
+from converters.ports import Interface, Port, interfaces_of
+from converters.runtimes.pool import RUNTIMES_OF, RuntimePool, chosen_runtimes
+from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun
-from exporter.bundle import POLICY, read_policy_json
-from exporter.parity.compare import compare
-from exporter.parity.entrants import Entrant, Failure, Feeds, unload
-from exporter.parity.pool import RUNTIMES_OF, RuntimePool, chosen_runtimes
-from exporter.parity.report import ParityReport
-from exporter.parity.subject import Subject, VerifyOptions
-from exporter.parity.tolerances import Tolerance
-from exporter.parity.verify import random_outputs, verify
-from exporter.sources import read_source
+from exporter.export.bundle import POLICY, read_policy_json
+from exporter.export.sources import read_source
+from exporter.verify.difference import compare
+from exporter.verify.participants import Entrant, Failure, Feeds, unload
+from exporter.verify.report import ParityReport
+from exporter.verify.subject import Subject, VerifyOptions
+from exporter.verify.tolerances import Tolerance
+from exporter.verify.verification import random_outputs, verify
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy, TensorSpec
+from signatures.spec import TensorSpec
 
 Progress = Callable[[str], None]
 

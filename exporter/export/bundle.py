@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from converters.artifact import Artifact
+from converters.policy import Policy
 from exporter.version import __version__
 from signatures.digest import sha256_hex
 from signatures.errors import BundleError, UsageError
-from signatures.spec import Policy, PolicySignature, SourceMap
+from signatures.spec import PolicySignature, SourceMap
 
 POLICY, PARITY = "policy.json", "parity.json"
 SCHEMA = 1

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from converters.policy import Policy
 from signatures.errors import UsageError
 from signatures.labels import checked
-from signatures.spec import Policy
 
 Labels = Path | str | Mapping[str, Any]
 _MOST_BYTES = 1 << 20

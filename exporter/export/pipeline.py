@@ -14,21 +14,21 @@ from converters.artifact import Artifact, WriteOptions
 from converters.frozen_graph.reader import read_graph
 from converters.frozen_graph.writer import write as write_frozen
 from converters.graph.compile import CONTRACT_NODE
+from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
+from converters.policy import Policy
 from converters.registry import TARGETS, writer
+from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from exporter import bundle
-from exporter.labels import Labels, labelled, read_labels
-from exporter.parity.inside import saved_graph
-from exporter.parity.pool import RuntimePool, chosen_runtimes
-from exporter.parity.report import ParityReport
-from exporter.parity.subject import Subject, VerifyOptions
-from exporter.parity.verify import verify
-from exporter.sources import Source, naming, read_source
+from exporter.export import bundle
+from exporter.export.labels import Labels, labelled, read_labels
+from exporter.export.sources import Source, naming, read_source
+from exporter.verify.inner_tensors import saved_graph
+from exporter.verify.report import ParityReport
+from exporter.verify.subject import Subject, VerifyOptions
+from exporter.verify.verification import verify
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
-from signatures.graph import Graph
-from signatures.spec import Policy
 
 Progress = Callable[[str], None]
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from converters.graph.compile import compile_graph
 from converters.graph.options import CompileOptions
+from converters.policy import Policy
 from converters.recognise import FileKind, not_readable, recognise_path
 from converters.registry import reader
 from converters.source import ReadOptions, SourceModel
 from signatures.digest import sha256_hex
 from signatures.errors import ExportModelError, GraphError, SourceError, UsageError
-from signatures.spec import Policy
 
 #: Kinds of source that have checkpoints of several steps, and those whose sensors have to be said.
 _STEPS = frozenset(("run_folder", "checkpoint", "raw_graph", "meta_graph"))

@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from converters.artifact import WriteOptions
+from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
+from converters.policy import Policy
 from converters.registry import TARGETS, writer
 from converters.source import ReadOptions
-from exporter.bundle import safe_name
-from exporter.sources import naming, read_source
-from exporter.tables import size_text, table
+from exporter.cli.tables import size_text, table
+from exporter.export.bundle import safe_name
+from exporter.export.sources import naming, read_source
 from signatures.errors import ExportModelError
-from signatures.graph import Graph
 from signatures.roles import Role
-from signatures.spec import Policy, TensorSpec
+from signatures.spec import TensorSpec
 
 _FEED = {
     Role.VECTOR: "the agent's vector observation, as the environment gives it{normalised}",

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exporter.bundle import distinct_names, safe_name, writing
+from exporter.export.bundle import distinct_names, safe_name, writing
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from exporter.inspection import Inspection
+    from exporter.inspect.inspection import Inspection
 
 
 def write_pictures(inspection: Inspection, logdir: Path | None = None, svg: Path | None = None) -> list[Path]:

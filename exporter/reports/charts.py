@@ -9,11 +9,11 @@ import itertools
 import math
 from collections.abc import Sequence
 
-from exporter.parity.histogram import BINS, FIRST, LAST
-from exporter.parity.report import Comparison
 from exporter.reports.layers import Block
 from exporter.reports.layout import layout
 from exporter.reports.markup import Markup, el
+from exporter.verify.histogram import BINS, FIRST, LAST
+from exporter.verify.report import Comparison
 
 _BAR, _STRIP, _ZERO_GAP = 17.0, 46.0, 18.0
 #: Lines have this many colours; a second round of them is dashed.

@@ -11,11 +11,11 @@ import numpy as np
 
 from converters.frozen_graph.reader import read_graph
 from converters.graph.compile import CONTRACT_NODE
-from exporter import bundle
-from exporter.parity.report import ParityReport
-from exporter.pipeline import ExportResult
+from converters.graph.nodes import Graph
+from exporter.export import bundle
+from exporter.export.pipeline import ExportResult
+from exporter.verify.report import ParityReport
 from signatures.errors import ExportModelError
-from signatures.graph import Graph
 from signatures.sampling import draw_cases, draw_rollout
 from signatures.spec import PolicySignature
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 
-from exporter.parity.pool import RUNTIMES_OF
-from exporter.parity.report import Comparison
+from converters.runtimes.pool import RUNTIMES_OF
+from exporter.cli.summary import explanation, verdict
 from exporter.reports.entry import Entry
 from exporter.reports.markup import printable
-from exporter.summary import explanation, verdict
+from exporter.verify.report import Comparison
 
 
 def junit_xml(entries: Sequence[Entry]) -> bytes:

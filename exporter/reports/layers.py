@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from signatures.graph import Graph, Node, node_of
+from converters.graph.nodes import Graph, Node, node_of
 
 _STARTS = frozenset(
     {"MatMul", "BatchMatMul", "BatchMatMulV2", "Conv2D", "Conv2DBackpropInput", "DepthwiseConv2dNative"}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
+from exporter.cli.summary import explanation, verdict
+from exporter.cli.tables import size_text
 from exporter.reports.entry import Entry
 from exporter.reports.markup import printable
 from exporter.reports.matrix import matrix
-from exporter.summary import explanation, verdict
-from exporter.tables import size_text
 
 _MARKS = {"passed": "✅", "self-consistent": "✅", "failed": "❌", "not verified": "⚠️"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from exporter.parity.report import Comparison, ParityReport
+from exporter.verify.report import Comparison, ParityReport
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from converters.policy import Policy
 from exporter.reports.charts import diagram_parts
 from exporter.reports.layers import Block, blocks_of
 from exporter.reports.markup import Markup, el
 from signatures.errors import UsageError
-from signatures.spec import Policy, TensorSpec
+from signatures.spec import TensorSpec
 
 _MARGIN, _HEAD = 24, 78
 #: More would be no picture.

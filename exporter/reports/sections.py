@@ -7,14 +7,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from exporter.parity.report import Comparison
+from exporter.cli.summary import allowed, explanation
+from exporter.cli.tables import size_text
 from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
 from exporter.reports.matrix import Cell, matrix
-from exporter.summary import allowed, explanation
-from exporter.tables import size_text
+from exporter.verify.report import Comparison
 from signatures.spec import TensorSpec
 
 _SHOWN_VALUES = 12

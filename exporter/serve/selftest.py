@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from exporter.parity.compare import floored, ties
-from exporter.parity.tolerances import Tolerance, tolerance_for
-from exporter.parity.verify import random_outputs
-from signatures.graph import Graph
+from converters.graph.nodes import Graph
+from exporter.verify.difference import floored, ties
+from exporter.verify.tolerances import Tolerance, tolerance_for
+from exporter.verify.verification import random_outputs
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
 from signatures.spec import PolicySignature

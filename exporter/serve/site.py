@@ -10,17 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from exporter import bundle
-from exporter.runtimes.javascript import INSTALL_TFJS, js_home, package_version
-from exporter.serve.golden import golden
+import converters.tfjs
+from converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
+from exporter.export import bundle
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
+from exporter.serve.selftest import golden
 from exporter.serve.server import TYPES
 from exporter.version import __version__
 from signatures.errors import BundleError, RuntimeUnavailableError
 from signatures.spec import PolicySignature
 
 PAGE = Path(__file__).resolve().parent / "page"
-POLICY_MODULE = Path(__file__).resolve().parents[2] / "converters" / "tfjs" / "js" / "policy.mjs"
+POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
 #: The file by which a folder is known as ours.
 SITE = "site.json"
 MADE_BY = "export-model serve"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.frozen_graph.reader import read_graph
-from exporter.bundle import check_hashes, read_policy_json, signature_of
+from exporter.export.bundle import check_hashes, read_policy_json, signature_of
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 

@@ -14,19 +14,19 @@ from pathlib import Path
 import numpy as np
 
 from converters.frozen_graph.reader import read_graph
-from converters.graph.ops.chance import SAMPLERS
+from converters.graph.nodes import Graph, Node, split_ref
+from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
-from converters.runner.process import RunFailedError
-from exporter.parity.compare import Difference, compare
-from exporter.parity.entrants import Entrant, Feeds
-from exporter.parity.inside import Inside, inside, onnx_sources, outputs_read, saved_graph
-from exporter.parity.pool import RuntimePool
-from exporter.parity.report import Bisection
-from exporter.parity.subject import Subject
-from exporter.parity.tolerances import Tolerance
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import RunFailedError
+from exporter.verify.difference import Difference, compare
+from exporter.verify.inner_tensors import Inside, inside, onnx_sources, outputs_read, saved_graph
+from exporter.verify.participants import Entrant, Feeds
+from exporter.verify.report import Bisection
+from exporter.verify.subject import Subject
+from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError
-from signatures.graph import Graph, Node, split_ref
 
 #: Bytes of expected values that one fetch may ask for: what a runtime holds and sends at a time.
 FETCH_BYTES = 64 << 20

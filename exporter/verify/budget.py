@@ -7,9 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from exporter.parity.report import Comparison, ParityReport
-from exporter.parity.tolerances import Tolerance
-from exporter.tables import size_text
+from exporter.cli.tables import size_text
+from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.tolerances import Tolerance
 from signatures.errors import UsageError
 
 #: All formats of the bundle together.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from exporter.parity.histogram import decades
-from exporter.parity.tolerances import Tolerance
+from exporter.verify.histogram import decades
+from exporter.verify.tolerances import Tolerance
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
 NARROWED = {("int64", "int32")}
@@ -26,7 +26,7 @@ class Difference:
     reason: str = ""
     #: What rounding explains at the element that differs most, where that was asked for.
     rounding: float = 0.0
-    #: Elements per decade of |a − b| (exporter/parity/histogram.py); empty where there are no numbers to compare.
+    #: Elements per decade of |a − b| (exporter/verify/histogram.py); empty where there are no numbers to compare.
     histogram: tuple[int, ...] = ()
     #: The smallest t with |a − b| ≤ t + t·|b| everywhere; None where no number would do.
     smallest_tolerance: float | None = None

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from exporter.parity.compare import Difference
+from exporter.verify.difference import Difference
 from signatures.errors import UsageError
 from signatures.roles import Role
 from signatures.sampling import Case

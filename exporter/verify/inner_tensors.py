@@ -21,12 +21,12 @@ import numpy as np
 
 from converters import schema
 from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import Graph, normal_ref, ref, split_ref
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View, loads
-from converters.runner.process import LoadedModel, RunFailedError
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.saved_model.reader import read_saved_model
-from exporter.parity.entrants import Entrant, Feeds, Run
-from exporter.parity.pool import RuntimePool
-from signatures.graph import Graph, normal_ref, ref, split_ref
+from exporter.verify.participants import Entrant, Feeds, Run
 
 
 @dataclass(frozen=True)

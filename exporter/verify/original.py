@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.runner.process import LoadedModel
+from converters.runtimes.process import LoadedModel
 from signatures.memories import divided, joined
 from signatures.roles import Role
 from signatures.spec import PolicySignature, SourceMap, TensorSpec

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.runner.process import LoadedModel, RunFailedError
-from exporter.parity.pool import RUNTIMES_OF, RuntimePool
-from exporter.parity.report import Comparison
-from exporter.parity.subject import Subject
+from converters.runtimes.pool import RUNTIMES_OF, RuntimePool
+from converters.runtimes.process import LoadedModel, RunFailedError
+from exporter.verify.report import Comparison
+from exporter.verify.subject import Subject
 
 #: The runtime that takes longest to start, by far.
 _SLOWEST = "tensorflow"

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from exporter.parity.histogram import to_dict
-from exporter.parity.tolerances import Tolerance
+from exporter.verify.histogram import to_dict
+from exporter.verify.tolerances import Tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Comparison:
     reason: str = ""
     drift: tuple[float, ...] = ()
     rounding: float = 0.0
-    #: Elements of all inputs per decade of ``|a − b|``, see exporter/parity/histogram.py.
+    #: Elements of all inputs per decade of ``|a − b|``, see exporter/verify/histogram.py.
     histogram: tuple[int, ...] = ()
     #: The smallest t that would pass as atol and rtol; None where no tolerance would, or none is needed.
     smallest_tolerance: float | None = None

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
-from converters.runner.process import LoadedModel, RunFailedError
-from exporter.parity.compare import row_steps
-from exporter.parity.entrants import Feeds
-from signatures.graph import Graph
+from converters.runtimes.process import LoadedModel, RunFailedError
+from exporter.verify.difference import row_steps
+from exporter.verify.participants import Feeds
 from signatures.sampling import Case
 
 FACTOR = 4

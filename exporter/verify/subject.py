@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from converters.graph.nodes import Graph
 from converters.source import OriginalRun
-from exporter.parity.tolerances import Tolerance, ToleranceRule
+from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
-from signatures.graph import Graph
 from signatures.spec import PolicySignature, SourceMap
 
 
@@ -42,7 +42,7 @@ class VerifyOptions:
     tolerance: Tolerance = field(default_factory=Tolerance)
     #: Other tolerances with their reasons (``--tolerances``); the last rule that covers a comparison decides.
     rules: Sequence[ToleranceRule] = ()
-    #: Recorded samples (``--golden``, see exporter/parity/golden.py).
+    #: Recorded samples (``--golden``, see exporter/verify/golden.py).
     golden: Path | None = None
     #: The most bytes of a format, or of ``total`` (``--max-size``).
     budget: Mapping[str, int] = field(default_factory=dict)

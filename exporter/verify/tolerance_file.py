@@ -20,9 +20,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from exporter.parity.pool import FORMATS
-from exporter.parity.tolerances import Tolerance, ToleranceRule
-from exporter.runtimes import RUNTIMES
+from converters.runtimes.pool import FORMATS
+from converters.runtimes.registry import RUNTIMES
+from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
 
 _KEYS = frozenset({"policy", "format", "runtime", "output", "atol", "rtol", "reason"})

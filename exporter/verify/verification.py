@@ -7,24 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.graph.ops.chance import SAMPLERS
+from converters.graph.nodes import Graph
+from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.run import run_graph
-from converters.runner.process import LoadedModel, RunFailedError
-from exporter.parity.bisect import Bisector
-from exporter.parity.budget import held_to
-from exporter.parity.compare import Difference, compare, floored, ties
-from exporter.parity.entrants import Entrant, Failure, Feeds, entrants, in_order, needed_runtimes, unload
-from exporter.parity.golden import Golden, read_golden
-from exporter.parity.histogram import added
-from exporter.parity.original import Original
-from exporter.parity.pool import INDEPENDENT, RuntimePool
-from exporter.parity.report import Bisection, Comparison, ParityReport
-from exporter.parity.rounding import Rounding
-from exporter.parity.statistics import FALSE_ALARM, fit, same_distribution
-from exporter.parity.subject import Subject, VerifyOptions
-from exporter.parity.tolerances import Tolerance, ruled, tolerance_for
-from exporter.runtimes import RuntimeInfo
-from signatures.graph import Graph
+from converters.runtimes.pool import INDEPENDENT, RuntimePool
+from converters.runtimes.process import LoadedModel, RunFailedError
+from converters.runtimes.registry import RuntimeInfo
+from exporter.verify.bisection import Bisector
+from exporter.verify.budget import held_to
+from exporter.verify.difference import Difference, compare, floored, ties
+from exporter.verify.golden import Golden, read_golden
+from exporter.verify.histogram import added
+from exporter.verify.original import Original
+from exporter.verify.participants import Entrant, Failure, Feeds, entrants, in_order, needed_runtimes, unload
+from exporter.verify.report import Bisection, Comparison, ParityReport
+from exporter.verify.rounding import Rounding
+from exporter.verify.statistics import FALSE_ALARM, fit, same_distribution
+from exporter.verify.subject import Subject, VerifyOptions
+from exporter.verify.tolerances import Tolerance, ruled, tolerance_for
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.pipeline import ExportOptions, export
+from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.acting.bundles import Bundles
 

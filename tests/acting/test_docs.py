@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.runtimes.javascript import js_home, node_executable
+from converters.runtimes.javascript.node import js_home, node_executable
 from tests.acting.test_snippets import resolved
 from tests.commands import ROOT
 

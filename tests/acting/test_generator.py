@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from exporter.acting.generator import MAX_SEED, Generator
-from exporter.parity.statistics import FALSE_ALARM, fit
+from exporter.verify.statistics import FALSE_ALARM, fit
 from signatures.errors import UsageError
 
 

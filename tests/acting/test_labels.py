@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from converters.graph.options import CompileOptions
 from exporter import export_model
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, UsageError
 from signatures.labels import parsed, remaining

@@ -10,7 +10,7 @@ import pytest
 
 from exporter import load_policy
 from exporter.acting.policy import LoadedPolicy
-from exporter.parity.statistics import FALSE_ALARM, fit
+from exporter.verify.statistics import FALSE_ALARM, fit
 from fixtures import path as fixture
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.roles import Role

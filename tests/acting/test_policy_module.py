@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.runtimes.javascript.node import js_home, node_executable
+from converters.runtimes.registry import available_runtimes
 from exporter import load_policy
 from exporter.acting.generator import Generator
 from exporter.acting.policy import Decision, LoadedPolicy
-from exporter.runtimes import available_runtimes
-from exporter.runtimes.javascript import js_home, node_executable
 from tests.acting.bundles import Bundles
 from tests.acting.test_load_policy import NAMES, observed
 

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.runtimes.javascript.node import js_home, node_executable
 from exporter import export_model, load_policy
 from exporter.acting.policy import LoadedPolicy
-from exporter.pipeline import ExportOptions, export
-from exporter.runtimes.javascript import js_home, node_executable
+from exporter.export.pipeline import ExportOptions, export
 from exporter.snippets.contract import Bundle, class_name, folded, identifier, read_bundle
 from exporter.snippets.registry import TARGETS, snippets
 from fixtures import path as fixture

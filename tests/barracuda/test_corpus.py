@@ -12,7 +12,7 @@ from converters.artifact import WriteOptions
 from converters.barracuda.format import parse
 from converters.graph.run import run_graph
 from converters.registry import TARGETS, writer
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError
 from signatures.roles import Role
 from tests.barracuda.conftest import SHARED, UNSLICED, params, public_files

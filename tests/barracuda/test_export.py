@@ -11,9 +11,9 @@ import pytest
 
 from converters.artifact import WriteOptions
 from converters.registry import writer
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportOptions, export
-from exporter.summary import failure_lines
+from converters.runtimes.pool import RuntimePool
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import BROKEN, UNSLICED, genuine_files, params, public_files
 from tests.barracuda.test_layers import expected_of, feeds_of, policy_of

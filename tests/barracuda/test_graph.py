@@ -11,14 +11,14 @@ from converters.barracuda.format import NnModel, Trailer, parse
 from converters.barracuda.graph import to_graph
 from converters.barracuda.source import read
 from converters.graph.compile import compile_graph
-from converters.graph.ops.chance import reseed
+from converters.graph.nodes import Graph, TensorShape
+from converters.graph.ops.samplers import reseed
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
+from converters.policy import Policy
 from converters.source import ReadOptions
 from signatures.errors import DamagedFileError, SignatureError
-from signatures.graph import Graph, TensorShape
 from signatures.roles import Role
-from signatures.spec import Policy
 from tests.barracuda.nn_files import Maker, write_nn
 from tests.barracuda.reference import evaluate
 

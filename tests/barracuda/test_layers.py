@@ -11,7 +11,7 @@ from converters.graph.compile import compile_graph
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import static_shape
-from signatures.spec import Policy
+from converters.policy import Policy
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.reference import evaluate

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from converters.runner.process import RuntimeProcess
-from exporter.parity.pool import RuntimePool
-from exporter.runtimes import available_runtimes
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import RuntimeProcess
+from converters.runtimes.registry import available_runtimes
 
 TFJS = ("tfjs-cpu@chromium", "tfjs-wasm@chromium", "tfjs-webgl")
 ONNX = ("onnxruntime-web@chromium",)

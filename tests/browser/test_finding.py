@@ -7,9 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from exporter.runtimes import browser
-from exporter.runtimes.base import RuntimeInfo
-from exporter.runtimes.browser import CHROMIUM_VARIABLE, TFJS_WASM_CHROMIUM, TFJS_WEBGL, chromium_executable
+from converters.runtimes.base import RuntimeInfo
+from converters.runtimes.javascript import browser
+from converters.runtimes.javascript.browser import (
+    CHROMIUM_VARIABLE,
+    TFJS_WASM_CHROMIUM,
+    TFJS_WEBGL,
+    chromium_executable,
+)
 from signatures.errors import RuntimeUnavailableError
 
 Program = Callable[[str], Path]

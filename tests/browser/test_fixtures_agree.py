@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.parity.pool import RuntimePool
-from exporter.parity.subject import VerifyOptions
-from exporter.pipeline import ExportOptions, export, verify_folder
-from exporter.runtimes import available_runtimes
-from exporter.summary import failure_lines
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import available_runtimes
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export, verify_folder
+from exporter.verify.subject import VerifyOptions
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.browser.conftest import BROWSERS, ONNX, TFJS
@@ -73,7 +73,7 @@ def spoil(folder: Path) -> None:
 def test_a_bundle_is_verified_again_in_a_browser_and_a_wrong_weight_is_found(
     tmp_path: Path, browsers: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("exporter.pipeline.RuntimePool", lambda: contextlib.nullcontext(browsers))
+    monkeypatch.setattr("exporter.export.pipeline.RuntimePool", lambda: contextlib.nullcontext(browsers))
     options = ExportOptions(tmp_path, ("bytes", "tfjs"), verify="none")
     (result,) = export([fixture("recurrent")], options)
     wanted = ["tfjs-wasm@chromium"]
@@ -83,7 +83,7 @@ def test_a_bundle_is_verified_again_in_a_browser_and_a_wrong_weight_is_found(
     assert any(len(c.drift) == PARITY.steps for c in report.comparisons if c.runtime in wanted)
 
     spoil(result.folder / "tfjs")
-    monkeypatch.setattr("exporter.bundle.check_hashes", lambda folder, content: None)
+    monkeypatch.setattr("exporter.export.bundle.check_hashes", lambda folder, content: None)
     report = verify_folder(result.folder, runtimes=wanted, options=PARITY)
     assert report.passed is False
     assert {c.runtime for c in report.comparisons if not c.passed} == set(wanted)

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.runner.process import RunFailedError, RuntimeProcess
-from exporter.runtimes.browser import TFJS_CPU_CHROMIUM
-from exporter.runtimes.javascript import JS_SOURCE, js_home, node_executable
+from converters.runtimes.javascript.browser import TFJS_CPU_CHROMIUM
+from converters.runtimes.javascript.node import JS_SOURCE, js_home, node_executable
+from converters.runtimes.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
 from tests.runner.graph_models import batch, twins, twins_by_numpy
 

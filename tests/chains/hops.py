@@ -11,14 +11,15 @@ import numpy as np
 
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from exporter.bundle import safe_name
-from exporter.parity.compare import compare, floored
-from exporter.parity.pool import RUNTIMES_OF, RuntimePool
-from exporter.parity.tolerances import Tolerance, tolerance_for
-from exporter.pipeline import ExportOptions, ExportResult, export
+from converters.policy import Policy
+from converters.runtimes.pool import RUNTIMES_OF, RuntimePool
+from exporter.export.bundle import safe_name
+from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.verify.difference import compare, floored
+from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy, PolicySignature
+from signatures.spec import PolicySignature
 from tests.chains.starts import Start
 
 #: What a hop gives to the next one: one format's artefact, or the bundle's folder.

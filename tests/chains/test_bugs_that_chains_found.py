@@ -9,7 +9,7 @@ import pytest
 
 from converters import schema
 from converters.graph.options import CompileOptions
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from signatures.roles import Role
 from tests.chains.hops import FORMS, Hop, exported, told, walk
 from tests.chains.starts import OWN

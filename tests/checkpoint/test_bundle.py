@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from converters import schema
-from converters.checkpoint.bundle import Checkpoint, slice_key
+from converters.checkpoint.tensor_bundle import Checkpoint, slice_key
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 from tests.checkpoint.writing import bundle, literal, table
 

@@ -10,8 +10,8 @@ import pytest
 
 from converters.recognise import recognise_path
 from converters.source import ReadOptions
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures import path as fixture
 from signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError
 from tests.checkpoint.test_source import OBSERVATION, answer, run_of

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from converters.graph.run import run_graph
+from converters.policy import Policy
 from converters.source import ReadOptions
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import Source, read_source
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import Source, read_source
 from signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError
-from signatures.spec import Policy
 from tests.checkpoint.writing import TrainingGraph, bundle, expected, policy
 
 OBSERVATION = np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3)

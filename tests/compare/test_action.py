@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.pipeline import ExportOptions, export
+from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 
 ROOT = Path(__file__).resolve().parents[2]

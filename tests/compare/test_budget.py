@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from exporter.parity.budget import held_to, parse_budget
-from exporter.parity.report import ParityReport
+from exporter.verify.budget import held_to, parse_budget
+from exporter.verify.report import ParityReport
 from signatures.errors import UsageError
 
 

@@ -12,10 +12,10 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from exporter.comparison import compare_artefacts
-from exporter.parity.pool import RuntimePool
-from exporter.parity.report import Comparison, ParityReport
-from exporter.pipeline import ExportOptions, export
+from converters.runtimes.pool import RuntimePool
+from exporter.compare.comparison import compare_artefacts
+from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.report import Comparison, ParityReport
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import export_model, is_refused

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exporter.parity.golden import read_golden
-from exporter.sources import read_source
+from exporter.export.sources import read_source
+from exporter.verify.golden import read_golden
 from fixtures import path as fixture
 from signatures.errors import UsageError
 from signatures.spec import PolicySignature

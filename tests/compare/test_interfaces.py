@@ -9,8 +9,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from converters.interface import Port, interfaces_of
-from exporter.pipeline import ExportOptions, export
+from converters.ports import Port, interfaces_of
+from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 

@@ -16,11 +16,11 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from exporter.parity.pool import RuntimePool
-from exporter.parity.report import ParityReport
-from exporter.parity.subject import VerifyOptions
-from exporter.pipeline import ExportOptions, export
-from exporter.summary import failure_lines
+from converters.runtimes.pool import RuntimePool
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.report import ParityReport
+from exporter.verify.subject import VerifyOptions
 from signatures.errors import SourceError
 
 GENUINE = Path(__file__).resolve().parents[3] / "shared" / "genuine"

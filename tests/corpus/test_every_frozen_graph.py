@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from exporter.inspection import inspect_source
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportOptions, export
-from exporter.summary import failure_lines
+from converters.runtimes.pool import RuntimePool
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.inspect.inspection import inspect_source
 from tests.conftest import NEEDED
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
 

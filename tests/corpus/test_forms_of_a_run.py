@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.graph.nodes import node_of
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from exporter.parity.compare import compare
-from exporter.parity.tolerances import Tolerance, tolerance_for
-from exporter.sources import read_source
+from converters.policy import Policy
+from exporter.export.sources import read_source
+from exporter.verify.difference import compare
+from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.errors import DamagedFileError, ExportModelError
-from signatures.graph import node_of
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy
 from tests.corpus.conftest import SHARED
 
 pytestmark = pytest.mark.corpus

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from converters.artifact import WriteOptions
+from converters.policy import Policy
 from converters.registry import TARGETS, writer
-from converters.runner.process import LoadedModel
-from exporter.parity.compare import compare
-from exporter.parity.pool import RUNTIMES_OF, RuntimePool
-from exporter.parity.tolerances import Tolerance, tolerance_for
-from exporter.sources import read_source
+from converters.runtimes.pool import RUNTIMES_OF, RuntimePool
+from converters.runtimes.process import LoadedModel
+from exporter.export.sources import read_source
+from exporter.verify.difference import compare
+from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.roles import Role
-from signatures.spec import Policy
 from tests.conftest import NEEDED
 from tests.corpus.conftest import genuine_cases
 

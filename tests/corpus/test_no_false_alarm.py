@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.parity.pool import RuntimePool
+from converters.runtimes.pool import RuntimePool
 from signatures.errors import SourceError
 from tests.corpus.false_alarms import GENUINE, alarms, genuine_files, verified
 

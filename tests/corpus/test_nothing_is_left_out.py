@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, ExportModelError
 from tests.barracuda.conftest import UNSLICED, public_files
 from tests.corpus.conftest import SHARED, frozen_corpus

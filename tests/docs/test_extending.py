@@ -22,7 +22,7 @@ def copied(folder: Path) -> None:
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=LEFT_OUT)
     shutil.copy(ROOT / "pyproject.toml", folder)
-    modules = "converters/runner/js/node_modules"
+    modules = "converters/runtimes/javascript/js/node_modules"
     if (ROOT / modules).is_dir():
         (folder / modules).symlink_to(ROOT / modules)
 

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 from converters.barracuda.vocabulary import Activation, LayerType
-from exporter.pipeline import ExportOptions, export
+from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.barracuda.nn_files import Maker, write_nn
 from tests.commands import ROOT
 from tests.docs.blocks import Block
 
 TRAINED = ROOT / "fixtures/trained/3DBall"
-MODULES = ROOT / "converters/runner/js/node_modules"
+MODULES = ROOT / "converters/runtimes/javascript/js/node_modules"
 
 
 def furnish(folder: Path) -> None:

@@ -6,11 +6,11 @@ import contextlib
 
 import pytest
 
-from exporter.parity.pool import RuntimePool
+from converters.runtimes.pool import RuntimePool
 
 
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
     """All real runtimes; every command that this test runs shares their processes."""
-    monkeypatch.setattr("exporter.pipeline.RuntimePool", lambda: contextlib.nullcontext(pool))
+    monkeypatch.setattr("exporter.export.pipeline.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool

@@ -13,13 +13,13 @@ import numpy.typing as npt
 import pytest
 
 from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import Graph
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
-from converters.runner.process import RunFailedError
-from exporter import pipeline
-from exporter.pipeline import ExportResult
-from exporter.runtimes import RuntimeInfo
-from signatures.graph import Graph
+from converters.runtimes.process import RunFailedError
+from converters.runtimes.registry import RuntimeInfo
+from exporter.export import pipeline
+from exporter.export.pipeline import ExportResult
 
 Array = npt.NDArray[Any]
 Tensors = dict[str, Array]

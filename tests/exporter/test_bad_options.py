@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from exporter import export_model as export_by_python
-from exporter.parity.subject import VerifyOptions
-from exporter.parity.tolerances import Tolerance
+from exporter.verify.subject import VerifyOptions
+from exporter.verify.tolerances import Tolerance
 from fixtures import path as fixture
 from signatures.errors import UsageError
 from tests.commands import export_model, files_in, is_refused, python
@@ -233,7 +233,7 @@ def test_two_sources_whose_names_fall_together_are_refused(ball: Path, tmp_path:
 
 AS_NOBODY = """
 import os, sys
-from exporter.cli import main
+from exporter.cli.main import main
 from fixtures import path
 from tests.commands import export_model
 warm, *arguments = sys.argv[1:]

@@ -12,23 +12,23 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import Graph, Node
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.onnx.tensor_map import TensorMap, View, loads
-from converters.runner.process import RunFailedError
-from exporter.parity import bisect
-from exporter.parity.bisect import _Search, plain
-from exporter.parity.compare import compare
-from exporter.parity.entrants import Feeds
-from exporter.parity.inside import Inside
-from exporter.parity.report import Bisection, Comparison
-from exporter.parity.tolerances import Tolerance
-from exporter.pipeline import ExportOptions, export
-from exporter.summary import would_pass
+from converters.policy import Policy
+from converters.runtimes.process import RunFailedError
+from exporter.cli.summary import would_pass
+from exporter.export.pipeline import ExportOptions, export
+from exporter.verify import bisection as bisect
+from exporter.verify.bisection import _Search, plain
+from exporter.verify.difference import compare
+from exporter.verify.inner_tensors import Inside
+from exporter.verify.participants import Feeds
+from exporter.verify.report import Bisection, Comparison
+from exporter.verify.tolerances import Tolerance
 from fixtures import path as fixture
-from signatures.graph import Graph, Node
 from signatures.sampling import draw_cases
-from signatures.spec import Policy
 
 
 @pytest.fixture(scope="module")

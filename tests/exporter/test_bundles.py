@@ -14,14 +14,14 @@ import pytest
 
 from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.compile import CONTRACT_NODE
+from converters.graph.nodes import Graph
 from converters.onnx.writer import CONTRACT_KEY
 from converters.schema import SavedModel, parse
-from exporter import bundle
+from exporter.export import bundle
 from exporter.version import __version__
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.errors import BundleError
-from signatures.graph import Graph
 from signatures.roles import Role
 from tests.commands import export_model, files_in, is_refused
 

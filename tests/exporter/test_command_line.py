@@ -16,12 +16,12 @@ import pytest
 
 import exporter
 from converters.registry import TARGETS
-from exporter import cli
-from exporter.cli import app
-from exporter.console import Console
-from exporter.runtimes import RUNTIMES, Runtime
-from exporter.runtimes.base import Progress
-from exporter.runtimes.javascript import install_packages
+from converters.runtimes.base import Progress
+from converters.runtimes.javascript.node import install_packages
+from converters.runtimes.registry import RUNTIMES, Runtime
+from exporter.cli.console import Console
+from exporter.cli.main import app
+from exporter.cli.main import main as cli
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
@@ -327,7 +327,7 @@ def test_installing_reports_its_steps(monkeypatch: pytest.MonkeyPatch, name: str
         progress("js")
 
     steps = {n: partial(lambda text, progress: progress(text), n) for n in ("tf1.4", "tf1.7")}
-    monkeypatch.setattr("exporter.runtimes.RUNTIMES", tuple(stand_in(r) for r in RUNTIMES))
+    monkeypatch.setattr("converters.runtimes.registry.RUNTIMES", tuple(stand_in(r) for r in RUNTIMES))
     ran = export_model("runtimes", "install", name)
     assert (ran.status, ran.out.splitlines(), ran.err) == (0, said, "")
 
@@ -380,7 +380,7 @@ def test_an_interrupted_run_says_stopped(tmp_path: Path, monkeypatch: pytest.Mon
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("exporter.sources.compile_graph", interrupted)
+    monkeypatch.setattr("exporter.export.sources.compile_graph", interrupted)
     ran = export_model(BALL, "-o", tmp_path / "out", *UNVERIFIED)
     assert (ran.status, ran.out) == (130, "")
     assert ran.err.strip() == "stopped"

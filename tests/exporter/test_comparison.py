@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.parity.compare import compare, floored, ties
-from exporter.parity.statistics import FALSE_ALARM, chi_square_survival, fit
-from exporter.parity.tolerances import ATOL, RTOL, Tolerance, tolerance_for
+from exporter.verify.difference import compare, floored, ties
+from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
+from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 

@@ -53,7 +53,7 @@ def name_of(path: Path) -> str:
 
 def test_the_modules_are_found() -> None:
     names = {name_of(m) for m in MODULES}
-    assert {"signatures/roles.py", "converters/registry.py", "exporter/cli.py"} <= names
+    assert {"signatures/roles.py", "converters/registry.py", "exporter/cli/main.py"} <= names
 
 
 @pytest.mark.parametrize("module", MODULES, ids=name_of)
@@ -79,7 +79,7 @@ def test_no_runtime_is_imported_with_a_module(module: Path) -> None:
 
 @pytest.mark.parametrize("module", MODULES, ids=name_of)
 def test_only_the_children_and_what_acts_import_a_runtime(module: Path) -> None:
-    if not any(module.is_relative_to(ROOT / room) for room in ("converters/runner", "exporter/acting")):
+    if not any(module.is_relative_to(ROOT / room) for room in ("converters/runtimes", "exporter/acting")):
         assert not set(imported(ast.parse(module.read_text(encoding="utf-8")))) & RUNTIMES
 
 
@@ -117,7 +117,7 @@ def test_an_export_loads_neither_openssl_nor_numpy_random(tmp_path: Path) -> Non
     """Each costs megabytes, and a cold export without verification needs none of them."""
     script = (
         "import sys\n"
-        "from exporter.cli import main\n"
+        "from exporter.cli.main import main\n"
         "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
         "print([m for m in ('_hashlib', 'numpy.random', 'tensorflow', 'onnxruntime') if m in sys.modules])"
     )

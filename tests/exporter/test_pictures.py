@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from converters import schema
 from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.tensorboard.events import FILE_NAME, event_file, graph_def
 from exporter import export_model as export
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from fixtures import path as fixture
-from signatures.graph import Graph, Node, TensorShape
 from tests.commands import ROOT, export_model, is_refused
 
 SHARED = ROOT.parent / "shared"

@@ -9,10 +9,10 @@ import pytest
 
 import exporter
 from exporter import export_model, inspect_model, verify_bundle
-from exporter.inspection import Inspection
-from exporter.parity.report import ParityReport
-from exporter.parity.subject import VerifyOptions
-from exporter.pipeline import ExportResult
+from exporter.export.pipeline import ExportResult
+from exporter.inspect.inspection import Inspection
+from exporter.verify.report import ParityReport
+from exporter.verify.subject import VerifyOptions
 from fixtures import path as fixture
 from signatures.errors import (
     BundleError,
@@ -143,8 +143,8 @@ def _wrong(kind: str, runtime: str, answer: Tensors) -> Tensors:
 @pytest.fixture
 def disagreeing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Played runtimes, one of which is wrong."""
-    monkeypatch.setattr("exporter.pipeline.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
-    monkeypatch.setattr("exporter.pipeline.RuntimePool", lambda: ActingPool(_wrong))
+    monkeypatch.setattr("exporter.export.pipeline.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+    monkeypatch.setattr("exporter.export.pipeline.RuntimePool", lambda: ActingPool(_wrong))
 
 
 @pytest.mark.usefixtures("disagreeing")

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from converters.artifact import Artifact, WriteOptions
+from converters.graph.nodes import Graph
+from converters.policy import Policy
 from converters.registry import WRITERS
-from exporter.parity.pool import RUNTIMES_OF
+from converters.runtimes.pool import RUNTIMES_OF
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.graph import Graph
-from signatures.spec import Policy
 from tests.commands import export_model
 from tests.conftest import NEEDED
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter import bundle
+from exporter.export import bundle
 from fixtures import path as fixture
 from signatures.errors import BundleError, UsageError
 from tests.commands import Ran, export_model, files_in, python
@@ -21,8 +21,8 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSI
 SUICIDE = """
 import os, shutil, signal, sys
 from pathlib import Path
-from exporter import bundle
-from exporter.cli import main
+from exporter.export import bundle
+from exporter.cli.main import main
 
 point, *arguments = sys.argv[1:]
 kind, _, number = point.partition(":")
@@ -181,7 +181,7 @@ def test_other_systems_do_not_try_to(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_libc_without_the_call_is_no_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("exporter.bundle.ctypes.CDLL", lambda *a, **k: object())
+    monkeypatch.setattr("exporter.export.bundle.ctypes.CDLL", lambda *a, **k: object())
     assert not bundle._exchange(tmp_path, tmp_path)
 
 

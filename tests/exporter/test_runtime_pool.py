@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.runner.process import RunFailedError
-from exporter.parity import pool as pools
-from exporter.parity.pool import RuntimePool, chosen_runtimes
-from exporter.runtimes import RUNTIMES, RuntimeInfo, javascript
+from converters.runtimes import pool as pools
+from converters.runtimes.javascript import node as javascript
+from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from converters.runtimes.process import RunFailedError
+from converters.runtimes.registry import RUNTIMES, RuntimeInfo
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import ROOT
@@ -115,7 +116,7 @@ def test_a_runtime_that_ends_at_once_is_unavailable() -> None:
 WAITS = """
 import pathlib, sys, time
 sys.path.insert(0, sys.argv[2])
-from converters.runner.child import claim_stdout, serve
+from converters.runtimes.child import claim_stdout, serve
 out = claim_stdout()
 while not pathlib.Path(sys.argv[1]).exists():
     time.sleep(0.01)

@@ -10,9 +10,9 @@ import pytest
 
 from converters import schema
 from converters.graph.run import run_graph
+from converters.runtimes.pool import RuntimePool
 from exporter.api import export_model as exported
 from exporter.api import inspect_model, verify_bundle
-from exporter.parity.pool import RuntimePool
 from signatures.errors import BundleError, UsageError
 from tests.checkpoint.writing import TrainingGraph, bundle, expected, policy
 from tests.commands import export_model, is_refused

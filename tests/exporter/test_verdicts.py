@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.parity.statistics import FALSE_ALARM, same_distribution
+from exporter.verify.statistics import FALSE_ALARM, same_distribution
 from fixtures import path as fixture
 from fixtures.trained import run_folder
 from tests.commands import export_model, is_refused

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from converters.graph.options import CompileOptions
-from exporter.parity.original import Original
-from exporter.parity.report import Comparison, ParityReport
-from exporter.parity.subject import VerifyOptions
-from exporter.parity.tolerances import Tolerance
-from exporter.pipeline import ExportResult
-from exporter.summary import failure_lines, not_run_lines, parity_table, verdict
+from exporter.cli.summary import failure_lines, not_run_lines, parity_table, verdict
+from exporter.export.pipeline import ExportResult
+from exporter.verify.original import Original
+from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.subject import VerifyOptions
+from exporter.verify.tolerances import Tolerance
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.roles import Role

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from converters import schema
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportOptions, export
+from converters.runtimes.pool import RuntimePool
+from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.handmade import dense, graph_bytes, node, placeholder
 
@@ -32,7 +32,7 @@ Bundle = Callable[[str], Planted]
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
     """All real runtimes; every command that this test runs shares their processes."""
-    monkeypatch.setattr("exporter.pipeline.RuntimePool", lambda: contextlib.nullcontext(pool))
+    monkeypatch.setattr("exporter.export.pipeline.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from converters.graph.run import run_graph
-from exporter.parity.bisect import plain
-from exporter.parity.compare import compare
-from exporter.parity.entrants import entrants
-from exporter.parity.inside import inside, outputs_read, saved_graph
-from exporter.parity.pool import RuntimePool
-from exporter.parity.subject import Subject
-from exporter.parity.tolerances import Tolerance
-from exporter.pipeline import verify_folder
-from exporter.runtimes import available_runtimes
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import available_runtimes
+from exporter.export.pipeline import verify_folder
+from exporter.verify.bisection import plain
+from exporter.verify.difference import compare
+from exporter.verify.inner_tensors import inside, outputs_read, saved_graph
+from exporter.verify.participants import entrants
+from exporter.verify.subject import Subject
+from exporter.verify.tolerances import Tolerance
 from signatures.sampling import draw_cases
 from tests.faults.conftest import Bundle
 
@@ -35,7 +35,7 @@ def subject_of(folder: object, monkeypatch: pytest.MonkeyPatch) -> Subject:
         caught.append(subject)
         raise CaughtError
 
-    monkeypatch.setattr("exporter.pipeline.verify", catch)
+    monkeypatch.setattr("exporter.export.pipeline.verify", catch)
     with pytest.raises(CaughtError):
         verify_folder(folder)  # type: ignore[arg-type]
     return caught[0]

@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from exporter.parity.pool import RUNTIMES_OF
-from exporter.parity.report import Comparison, ParityReport
-from exporter.parity.subject import VerifyOptions
-from exporter.pipeline import verify_folder
-from exporter.summary import failure_lines
+from converters.runtimes.pool import RUNTIMES_OF
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import verify_folder
+from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.subject import VerifyOptions
 from tests.commands import export_model, is_refused
 from tests.faults.artefacts import FORMATS, opened
 from tests.faults.conftest import Bundle, Planted

@@ -17,16 +17,17 @@ import pytest
 from converters import schema
 from converters.artifact import WriteOptions
 from converters.frozen_graph.encode import encode
+from converters.graph.nodes import Graph, Node
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType, static_shape
+from converters.policy import Policy
 from converters.registry import writer
-from converters.runner.process import LoadedModel
-from exporter.parity.pool import RuntimePool
-from exporter.runtimes import available_runtimes
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import LoadedModel
+from converters.runtimes.registry import available_runtimes
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Graph, Node
 from signatures.roles import Role
-from signatures.spec import Policy, PolicySignature, TensorSpec
+from signatures.spec import PolicySignature, TensorSpec
 
 Array = npt.NDArray[Any]
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE
-from signatures.graph import Graph, Node, TensorShape
 
 Array = npt.NDArray[Any]
 

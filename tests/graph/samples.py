@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from converters.graph.nodes import Graph, Node, TensorShape, ref
 from converters.graph.ops.table import TABLE
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
-from signatures.graph import Graph, Node, TensorShape, ref
 from tests.graph.making import defaults
 
 Array = npt.NDArray[Any]

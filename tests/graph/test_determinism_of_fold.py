@@ -15,8 +15,8 @@ import pytest
 
 from converters import schema
 from converters.frozen_graph.encode import encode
+from converters.graph.nodes import Graph
 from converters.graph.passes.fold import fold
-from signatures.graph import Graph
 from tests.graph.making import const, graph, node, ops
 
 ROOT = Path(__file__).resolve().parents[2]

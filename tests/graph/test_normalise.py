@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from converters.frozen_graph.reader import from_graph_def
+from converters.graph.nodes import Graph, Node, TensorShape, topological
 from converters.graph.ops.table import TABLE
 from converters.graph.passes.normalise import DECOMPOSED, as_placeholder, normalise
 from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.graph import Graph, Node, TensorShape, topological
 from tests import handmade
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.samples import INF, NAN, bools, f32, floats, ints

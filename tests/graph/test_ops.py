@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
-from converters.graph.ops.chance import reseed
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.ops.samplers import reseed
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from signatures.errors import ExportModelError
-from signatures.graph import Graph, Node, TensorShape
 from tests.graph.harness import Array, Bindings, Runtimes, difference, policy_of
 from tests.graph.samples import DRAWS, PROBABILITIES, SAMPLES, TFJS, Sample, random_slices
 

@@ -13,13 +13,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from converters.graph.nodes import Graph, Node
 from converters.graph.ops.convolution import window_padding
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH, INT32, Dim, Symbols, broadcast
 from signatures.errors import GraphError
-from signatures.graph import Graph, Node
 from tests.graph.harness import Array, Bindings
 from tests.graph.making import const, defaults, placeholder
 

@@ -18,21 +18,21 @@ from hypothesis import strategies as st
 
 from converters.frozen_graph.reader import read_graph
 from converters.graph.compile import compile_graph
-from converters.graph.passes.companions import LOG_PROBS, add_companions
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.passes.fold import fold
 from converters.graph.passes.fuse import fuse
 from converters.graph.passes.inputs import batch_size_rank, complete_shapes, set_values, settle_inputs
 from converters.graph.passes.naming import name_tensors
 from converters.graph.passes.noise import lift_noise, samplers, without_noise
 from converters.graph.passes.simplify import IDENTITIES, collapse_views, drop_identities
-from converters.graph.passes.stats import memory_layout, normaliser
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32, INT64
+from converters.understand.derived_outputs import LOG_PROBS, add_companions
+from converters.understand.infer import ActionMeaning, Head
+from converters.understand.normaliser import memory_layout, normaliser
 from fixtures import path
 from signatures.errors import GraphError, UnsupportedOpError, UsageError
-from signatures.graph import Graph, Node, TensorShape
-from signatures.infer import ActionMeaning, Head
 from signatures.roles import Role
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.making import const, graph, node, ops, placeholder

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from converters.frozen_graph.reader import read_graph
-from converters.graph.ops.chance import SAMPLERS
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
+from converters.graph.ops.samplers import SAMPLERS
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures import path as fixture
 
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from converters.frozen_graph.reader import from_graph_def, read_graph
+from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import CONTROL_FLOW
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import set_values
 from converters.graph.passes.normalise import normalise
-from converters.graph.passes.straighten import MAX_TURNS, straighten
+from converters.graph.passes.unroll import MAX_TURNS, straighten
 from converters.graph.run import run_graph
 from fixtures import path
 from fixtures.goldens import read_npz
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Graph, Node
 from tests import handmade
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.samples import f32, floats, ints

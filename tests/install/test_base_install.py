@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from converters.registry import TARGETS
-from exporter.pipeline import ExportOptions, export
+from exporter.export.pipeline import ExportOptions, export
 from exporter.version import __version__
 from fixtures import path
 
@@ -100,7 +100,7 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     scripts = {p.name for p in (ROOT / "converters" / "runner" / "js").glob("*.mjs")}
     assert "runner.mjs" in scripts
     for name in ("package.json", "package-lock.json", *scripts):
-        assert f"converters/runner/js/{name}" in names
+        assert f"converters/runtimes/javascript/js/{name}" in names
     strays = [n for n in names if "node_modules" in n or "__pycache__" in n or "/test" in n or n.endswith(".bytes")]
     assert not strays
     code = {str(p.relative_to(ROOT).as_posix()) for t in ("exporter", "converters", "signatures") for p in modules(t)}

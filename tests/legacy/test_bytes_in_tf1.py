@@ -1,6 +1,6 @@
 """Every ``.bytes`` that is written loads and runs in the runtimes of TensorFlow 1.4 and 1.7, and agrees.
 
-Agreement is judged by exporter.parity, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
+Agreement is judged by exporter.verify, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
 and draws. The reference is numpy.
 """
 
@@ -15,13 +15,13 @@ import pytest
 
 from converters.frozen_graph.reader import read_graph
 from converters.graph.options import CompileOptions
-from converters.runner.process import RunFailedError
-from exporter.parity.pool import RuntimePool
-from exporter.parity.report import Comparison
-from exporter.parity.subject import Subject
-from exporter.parity.verify import verify
-from exporter.pipeline import ExportOptions, ExportResult, export
-from exporter.runtimes.legacy import RELEASES
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import RunFailedError
+from converters.runtimes.tensorflow1.found import RELEASES
+from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.verify.report import Comparison
+from exporter.verify.subject import Subject
+from exporter.verify.verification import verify
 from fixtures import FIXTURES, path
 from fixtures.goldens import read_npz
 from tests.corpus.conftest import frozen_corpus, genuine_cases

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from fixtures import path as fixture
 from tests.commands import ROOT, python
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.policy import Policy
+from converters.runtimes.pool import RuntimePool
 from exporter import export_model
-from exporter.parity.pool import RuntimePool
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from signatures.errors import UsageError
-from signatures.spec import Policy
 from tests.commands import files_in, python
 from tests.live.conftest import Trained
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from exporter.parity.pool import RuntimePool
+from converters.runtimes.pool import RuntimePool
 from tests.onnx_reader.models import Bench
 
 

@@ -16,13 +16,13 @@ from onnx import helper, numpy_helper
 
 from converters import schema
 from converters.frozen_graph.encode import encode
+from converters.graph.nodes import Graph, Node
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.onnx.reader import OnnxModel, read_onnx
-from converters.runner.process import LoadedModel
-from exporter.parity.pool import RuntimePool
-from exporter.runtimes import available_runtimes
-from signatures.graph import Graph, Node
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import LoadedModel
+from converters.runtimes.registry import available_runtimes
 
 Array = npt.NDArray[Any]
 Dims = Sequence[int | str]

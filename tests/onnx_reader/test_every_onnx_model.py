@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from exporter.parity.tolerances import Tolerance
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
+from exporter.verify.tolerances import Tolerance
 from tests.conftest import NEEDED
 from tests.corpus.conftest import SHARED
 from tests.onnx_reader.models import Bench

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from converters.graph.types import BATCH, Symbols
-from converters.onnx.raising.fixed_rows import FixedRows
-from exporter.pipeline import ExportOptions, export
-from exporter.summary import failure_lines
+from converters.onnx.importer.fixed_batch import FixedRows
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
 from tests.onnx_reader.models import Bench, floats, model, node
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -60,7 +60,7 @@ def test_a_function_that_calls_itself_is_refused(tmp_path: Path) -> None:
 
 def test_an_op_that_onnx_defines_by_others_is_inlined(bench: Bench) -> None:
     """MeanVarianceNormalization has no entry of its own in the raising table."""
-    from converters.onnx.raising.table import TABLE
+    from converters.onnx.importer.table import TABLE
 
     assert ("", "MeanVarianceNormalization") not in TABLE
     message = model([node("MeanVarianceNormalization", ["x"], axes=[1])], {"x": (np.float32, ["batch", 4])}, opset=13)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
-from signatures.spec import Policy
+from converters.policy import Policy
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from tests.onnx_reader.mlagents import ACTIONS, HIDDEN, OBS, policy
 from tests.onnx_reader.models import Bench, floats, helper, node, save
 

@@ -11,11 +11,11 @@ import pytest
 from converters.artifact import WriteOptions
 from converters.frozen_graph.writer import write
 from converters.graph.run import run_graph
-from converters.runner.process import RuntimeProcess
-from exporter.parity.compare import compare, floored
-from exporter.parity.pool import RuntimePool
-from exporter.parity.tolerances import Tolerance
-from exporter.sources import read_source
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import RuntimeProcess
+from exporter.export.sources import read_source
+from exporter.verify.difference import compare, floored
+from exporter.verify.tolerances import Tolerance
 from fixtures.sb3 import FOLDER, POLICIES
 from signatures.roles import Role
 from signatures.sampling import draw_cases

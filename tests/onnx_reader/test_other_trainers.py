@@ -10,14 +10,14 @@ import pytest
 
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from converters.policy import Policy
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
 from fixtures.sb3 import FOLDER, POLICIES
 from signatures.errors import SignatureError, UsageError
 from signatures.roles import Role
-from signatures.spec import Policy
 from tests.onnx_reader.models import Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -13,15 +13,15 @@ from converters.artifact import WriteOptions
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.onnx.writer import CONTRACT_KEY, write
-from exporter.bundle import compact, contract
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from converters.policy import Policy
+from exporter.cli.summary import failure_lines
+from exporter.export.bundle import compact, contract
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures import FIXTURES, path
 from signatures.errors import DamagedFileError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy
 from tests.onnx_reader.mlagents import policy as mlagents
 from tests.onnx_reader.models import Bench, save
 

@@ -13,7 +13,7 @@ import pytest
 from onnx import TensorProto, numpy_helper
 
 from converters.onnx.reader import read_onnx
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.onnx_reader.models import Array, constant, declared, floats, helper, model, node, read, save
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.graph.ops.chance import reseed
+from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
 from converters.onnx import edit
-from exporter.parity.statistics import fit
+from exporter.verify.statistics import fit
 from tests.onnx_reader.models import Array, Bench, constant, floats, model, node, raised_graph, read
 
 X = floats(4, 3)

@@ -19,16 +19,17 @@ from hypothesis import strategies as st
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.onnx.memories import separate_memories
+from converters.policy import Policy
+from converters.runtimes.pool import RuntimePool
 from exporter.api import verify_bundle
-from exporter.parity import original
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportOptions, ExportResult, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.export.sources import read_source
+from exporter.verify import original
 from signatures.errors import SignatureError
 from signatures.memories import SourcePart, divided, joined
 from signatures.roles import Role
-from signatures.spec import Memory, Policy, SourceMap
+from signatures.spec import Memory, SourceMap
 from tests.onnx_reader.models import Array, Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

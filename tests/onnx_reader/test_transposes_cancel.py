@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.run import run_graph
-from signatures.graph import Graph, Node, TensorShape
 from tests.onnx_reader.models import Array, floats
 
 NHWC, NCHW = [0, 2, 3, 1], [0, 3, 1, 2]

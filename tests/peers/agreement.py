@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from exporter.parity.compare import compare, ties
-from exporter.parity.tolerances import Tolerance, tolerance_for
-from exporter.parity.verify import random_outputs
+from converters.policy import Policy
+from exporter.verify.difference import compare, ties
+from exporter.verify.tolerances import Tolerance, tolerance_for
+from exporter.verify.verification import random_outputs
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy
 
 Run = Callable[[Mapping[str, np.ndarray], Sequence[str]], Mapping[str, np.ndarray]]
 

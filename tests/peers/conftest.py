@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.pipeline import ExportOptions, ExportResult, export
+from exporter.export.pipeline import ExportOptions, ExportResult, export
 from fixtures import FIXTURES, path
 from tests.peers.environment import HOW, Peers, PeersUnavailableError, ensure_peers
 

@@ -86,8 +86,8 @@ def _place() -> Path:
     """A folder of its own for each content of the requirements and the shim, and each version of Python."""
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     digest = hashlib.sha256(REQUIREMENTS.read_bytes() + SHIM.read_bytes() + version.encode()).hexdigest()
-    # Imported here: exporter.runtimes is small, but the benchmark's own process should stay smaller still.
-    from exporter.runtimes.cache import cache_folder
+    # Imported here: converters.runtimes.registry is small, but the benchmark's own process should stay smaller still.
+    from converters.runtimes.cache import cache_folder
 
     return cache_folder() / f"peers-{digest[:12]}"
 

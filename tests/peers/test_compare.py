@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from converters.frozen_graph.encode import encode
-from exporter.comparison import compare_artefacts
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportResult
-from signatures.graph import Graph, Node, TensorShape
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.runtimes.pool import RuntimePool
+from exporter.compare.comparison import compare_artefacts
+from exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES
 from tests.peers.environment import Peers
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.runner.process import LoadedModel, RuntimeProcess
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportResult
-from exporter.runtimes import available_runtimes
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import LoadedModel, RuntimeProcess
+from converters.runtimes.registry import available_runtimes
+from exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, Run, disagreements
 from tests.peers.environment import Peers
 

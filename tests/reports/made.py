@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from exporter.parity.histogram import BINS
-from exporter.parity.report import Bisection, Comparison, ParityReport
-from exporter.parity.tolerances import Tolerance
 from exporter.reports.entry import Entry
+from exporter.verify.histogram import BINS
+from exporter.verify.report import Bisection, Comparison, ParityReport
+from exporter.verify.tolerances import Tolerance
 
 SPREAD = (5, 0, 0, 2, 9, *([0] * (BINS - 5)))
 RAN = {"version": "1.0", "status": "ran", "reason": None}

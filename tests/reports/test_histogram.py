@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.parity.compare import compare
-from exporter.parity.histogram import BINS, added, decades, to_dict
-from exporter.parity.tolerances import Tolerance
+from exporter.verify.difference import compare
+from exporter.verify.histogram import BINS, added, decades, to_dict
+from exporter.verify.tolerances import Tolerance
 
 
 def test_decades_by_hand() -> None:

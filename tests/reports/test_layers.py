@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from converters.graph.nodes import Graph, Node
 from converters.graph.options import CompileOptions
+from exporter.export.sources import read_source
 from exporter.reports.layers import Block, blocks_of
 from exporter.reports.layout import layout
-from exporter.sources import read_source
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.graph import Graph, Node
 
 
 def blocks(path: Path) -> list[list[Block]]:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter import cli, pipeline
-from exporter.console import Console, Progress
+from exporter.cli.console import Console, Progress
+from exporter.cli.main import main as cli
+from exporter.export import pipeline
 from fixtures import path as fixture
 from tests.commands import Ran, export_model, is_refused
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors

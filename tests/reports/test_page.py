@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from exporter.parity.subject import VerifyOptions
 from exporter.reports.entry import Entry, of_bundle, of_result
 from exporter.reports.page import page
 from exporter.reports.sections import shortened
+from exporter.verify.subject import VerifyOptions
 from fixtures import path as fixture
 from tests.exporter.rehearsal import ActingPool, export
 from tests.reports.made import FAILING, PASSING, UNVERIFIED, entry

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.parity.subject import VerifyOptions
-from exporter.parity.tolerance_file import read_tolerances
-from exporter.parity.tolerances import Tolerance, ToleranceRule, ruled
+from exporter.verify.subject import VerifyOptions
+from exporter.verify.tolerance_file import read_tolerances
+from exporter.verify.tolerances import Tolerance, ToleranceRule, ruled
 from fixtures import path as fixture
 from signatures.errors import UsageError
 from tests.commands import export_model, is_refused

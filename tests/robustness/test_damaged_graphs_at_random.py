@@ -22,9 +22,9 @@ from hypothesis import strategies as st
 from converters import schema
 from converters.graph.options import CompileOptions
 from converters.recognise import KINDS, recognise
-from exporter import bundle
-from exporter.inspection import inspect_source
-from exporter.pipeline import ExportOptions, export
+from exporter.export import bundle
+from exporter.export.pipeline import ExportOptions, export
+from exporter.inspect.inspection import inspect_source
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.errors import BundleError, ExportModelError

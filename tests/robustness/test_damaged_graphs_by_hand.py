@@ -13,8 +13,8 @@ import pytest
 
 from converters import schema
 from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import TensorShape
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
-from signatures.graph import TensorShape
 from tests.commands import export_model, files_in, is_refused
 from tests.handmade import (
     NodeDef,
@@ -444,7 +444,7 @@ def test_a_fault_of_a_pass_names_the_file_too(
     def failing(*_: object) -> None:
         raise fault
 
-    monkeypatch.setattr("exporter.sources.compile_graph", failing)
+    monkeypatch.setattr("exporter.export.sources.compile_graph", failing)
     message = refused(continuous_policy(), tmp_path, "cannot be understood", type(fault).__name__)
     assert "\n  why: " in message
 

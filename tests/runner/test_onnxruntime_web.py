@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from onnx import TensorProto, helper, numpy_helper
 
-from exporter.runtimes.javascript import JS_SOURCE
+from converters.runtimes.javascript.node import JS_SOURCE
 from tests.runner.pipe import HOME, NEEDS_NODE, Array, Runner, frame
 
 pytestmark = [

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.runtimes.javascript import JS_SOURCE
+from converters.runtimes.javascript.node import JS_SOURCE
 from tests.runner.graph_models import (
     B2,
     CHOICE_FEEDS,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from converters.graph.nodes import node_of
 from converters.graph.run import run_graph
-from signatures.graph import node_of
-from signatures.spec import Policy
+from converters.policy import Policy
 
 #: What the keys of the models' signatures are called in a policy.
 CANONICAL = {

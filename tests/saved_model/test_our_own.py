@@ -13,17 +13,17 @@ import pytest
 from converters import schema
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.run import run_graph
-from exporter.bundle import compact, contract
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportOptions, ExportResult, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from converters.policy import Policy
+from converters.runtimes.pool import RuntimePool
+from exporter.cli.summary import failure_lines
+from exporter.export.bundle import compact, contract
+from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.export.sources import read_source
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.errors import BundleError, DamagedFileError, ExportModelError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
-from signatures.spec import Policy
 from tests.corpus.conftest import frozen_corpus, genuine_cases
 
 FORMS = ("", "{name}.bytes", "saved_model", "saved_model/saved_model.pb", "tfjs", "tfjs/model.json")

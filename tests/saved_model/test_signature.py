@@ -9,15 +9,15 @@ import pytest
 
 from converters import schema
 from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.saved_model.reader import read_saved_model
 from converters.saved_model.signature import ModelSignature, Tensor, expose
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
-from signatures.graph import Graph, Node, TensorShape
 from signatures.roles import Role
 
 F32 = np.dtype(np.float32)

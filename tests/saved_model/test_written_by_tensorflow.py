@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.checkpoint.bundle import Checkpoint
-from exporter.parity.pool import RuntimePool
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from converters.checkpoint.tensor_bundle import Checkpoint
+from converters.runtimes.pool import RuntimePool
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from signatures.errors import NotAPolicyError, RuntimeUnavailableError, SourceError
 from tests.saved_model.models import assert_agrees, roles, sources
 

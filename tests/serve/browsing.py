@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from exporter.runtimes.browser import INSTALL_CHROMIUM, chromium_executable
-from exporter.runtimes.javascript import INSTALL_NODE, INSTALL_TFJS, js_home, node_executable, package_version
+from converters.runtimes.javascript.browser import INSTALL_CHROMIUM, chromium_executable
+from converters.runtimes.javascript.node import INSTALL_NODE, INSTALL_TFJS, js_home, node_executable, package_version
 from exporter.serve.server import SiteServer, listening
 
 SCRIPT = Path(__file__).with_name("visit.mjs")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.runtimes.javascript import INSTALL_NODE, node_executable
+from converters.runtimes.javascript.node import INSTALL_NODE, node_executable
 from exporter.serve.site import PAGE
 from fixtures.environments import ENVIRONMENTS
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.runtimes.javascript import node as javascript
 from exporter.acting.policy import load_policy
-from exporter.runtimes import javascript
 from exporter.serve.scenes import other_side
 from exporter.serve.server import TYPES
 from exporter.serve.site import PAGE, assemble, write_site

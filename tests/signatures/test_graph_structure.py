@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from converters.graph.nodes import Graph, NameScope, Node, node_of, normal_ref, ref, split_ref, topological
 from signatures.errors import GraphError
-from signatures.graph import Graph, NameScope, Node, node_of, normal_ref, ref, split_ref, topological
 from tests.signatures.nodes import constant, graph, op, placeholder
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.understand.infer import action_meaning, classify_inputs, find_brains, placeholder_rank, role_by_name
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
-from signatures.graph import Graph, Node, TensorShape
-from signatures.infer import action_meaning, classify_inputs, find_brains, placeholder_rank, role_by_name
 from signatures.roles import Role
 from tests.signatures.nodes import FLOAT, INT, Dims, constant, graph, op, placeholder
 

@@ -6,8 +6,8 @@ import hashlib
 
 import pytest
 
+from converters.understand.generations import generation, torch_generation
 from signatures.digest import sha256_hex
-from signatures.eras import generation, torch_generation
 from signatures.errors import (
     BundleError,
     ExportModelError,

@@ -14,15 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
 from converters.tfjs.reader import read_model
 from converters.tfjs.unfuse import unfuse
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UnsupportedOpError
-from signatures.graph import Graph, Node, TensorShape
 from signatures.sampling import draw_cases
 from tests.saved_model.models import assert_agrees, roles
 

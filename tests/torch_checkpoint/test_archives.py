@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.unpickle import Tensor
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from fixtures.torch_checkpoint import FOLDER
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from tests.commands import export_model

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from converters.graph.run import run_graph
+from converters.policy import Policy
 from converters.source import ReadOptions
-from exporter.pipeline import ExportOptions, export
-from exporter.sources import read_source
-from exporter.summary import failure_lines
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, Case
 from signatures.roles import Role
-from signatures.spec import Policy
 from tests.torch_checkpoint.pt_files import checkpoint, weights
 
 STORED = [c for c in CASES if c.stored]

@@ -12,7 +12,7 @@ import pytest
 from converters.recognise import recognise_path
 from converters.source import ReadOptions
 from exporter import inspect_model
-from exporter.sources import read_source
+from exporter.export.sources import read_source
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, waves
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError, UsageError

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.runtimes.pool import RuntimePool
 from exporter import export_model
-from exporter.parity.pool import RuntimePool
 from fixtures import trained
 from fixtures.environments import ENVIRONMENTS
 from fixtures.environments.tennis import BRAINS

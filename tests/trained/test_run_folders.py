@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from converters.frozen_graph.reader import read_graph
+from converters.runtimes.pool import RuntimePool
 from exporter import export_model, inspect_model
-from exporter.parity.pool import RuntimePool
 from fixtures import trained
 from fixtures.environments import ENVIRONMENTS
 from fixtures.evaluate import play

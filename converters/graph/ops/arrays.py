@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node, TensorShape
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -25,7 +26,6 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
-from signatures.graph import Node, TensorShape
 
 T = type_attr()
 #: Outputs that a Split or Unpack may have.

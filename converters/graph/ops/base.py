@@ -12,9 +12,9 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.graph import Node
 
 Kernel = Callable[..., Any]
 Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]

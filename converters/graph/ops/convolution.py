@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
@@ -19,7 +20,6 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.linear import activation, lower_activation
 from converters.graph.types import Dim, Symbols, TensorType
-from signatures.graph import Node
 
 T = type_attr()
 _TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
@@ -25,7 +26,6 @@ from converters.graph.ops.base import (
     type_attr,
 )
 from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
-from signatures.graph import Node
 
 T = type_attr()
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.ops.arrays import target_dims
 from converters.graph.ops.base import (
     Attr,
@@ -21,7 +22,6 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.types import INT32, Symbols, TensorType, broadcast, product
-from signatures.graph import Node
 
 T = type_attr()
 

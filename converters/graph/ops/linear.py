@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.ops import elementwise
 from converters.graph.ops.base import (
     Attr,
@@ -20,7 +21,6 @@ from converters.graph.ops.base import (
     type_attr,
 )
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
-from signatures.graph import Node
 
 T = type_attr()
 

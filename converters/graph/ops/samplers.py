@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, constant_input, type_attr
 from converters.graph.types import INT64, Dim, Symbols, TensorType
-from signatures.graph import Node
 
 #: Ops whose output is N(0, 1); the lift pass turns them into the input ``epsilon``.
 NORMAL_SAMPLERS = ("RandomStandardNormal",)

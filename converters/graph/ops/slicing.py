@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Node
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -20,7 +21,6 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.types import Dim, Symbols, TensorType
-from signatures.graph import Node
 
 T = type_attr()
 

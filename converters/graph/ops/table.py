@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from converters.graph.ops import arrays, chance, convolution, elementwise, filling, linear, slicing
+from converters.graph.nodes import Node
+from converters.graph.ops import arrays, convolution, elementwise, filling, linear, slicing
+from converters.graph.ops import samplers as chance
 from converters.graph.ops.base import OpDef
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Node
 
 #: While loops, conditionals and tensor arrays: the straighten pass removes them, so they have no entry.
 CONTROL_FLOW = frozenset(

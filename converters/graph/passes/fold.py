@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, ref
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
 from converters.graph.types import INT32, TensorType
-from signatures.graph import Graph, ref
 
 
 def fold(graph: Graph) -> Graph:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from converters.graph.editor import Editor
-from signatures.graph import Graph, Node, node_of
+from converters.graph.nodes import Graph, Node, node_of
 
 _FUSED = {"MatMul": "_FusedMatMul", "Conv2D": "_FusedConv2D"}
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, TensorShape, node_of
 from converters.graph.ops.convolution import window_padding
 from converters.graph.passes.normalise import as_placeholder
 from converters.graph.shapes import MAX_ELEMENTS
 from converters.graph.types import INT32
+from converters.understand.infer import placeholder_rank
 from signatures.errors import GraphError, UsageError
-from signatures.graph import Graph, Node, TensorShape, node_of
-from signatures.infer import placeholder_rank
 from signatures.roles import OBSERVATIONS, Role
 
 _LARGEST_IMAGE = 512

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, split_ref
 from converters.graph.options import CompileOptions
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
+from converters.understand.infer import SourceFacts
 from signatures.errors import SignatureError
-from signatures.graph import Graph, Node, TensorShape, node_of, normal_ref, split_ref
-from signatures.infer import SourceFacts
 from signatures.memories import SeparateMemory, SourcePart
 from signatures.roles import CANONICAL, Role
 

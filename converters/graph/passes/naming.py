@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from signatures.graph import Graph, NameScope, Node, node_of, ref, split_ref, topological
+from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, split_ref, topological
 
 
 def name_tensors(

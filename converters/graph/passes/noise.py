@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 
 from converters.graph.editor import Editor
-from converters.graph.ops.chance import NORMAL_SAMPLERS, SAMPLERS
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.ops.samplers import NORMAL_SAMPLERS, SAMPLERS
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Graph, Node, TensorShape
 
 NoiseMode = Literal["lift", "keep", "zero"]
 

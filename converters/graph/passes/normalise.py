@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, ref
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of, unsupported
 from converters.graph.types import BOOL, FLOAT32, INT64
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.graph import Graph, Node, TensorShape, normal_ref, ref
 
 #: Ops that later versions renamed; the meaning is the same for the inputs that policies give them.
 RENAMED = {

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node
 from converters.graph.ops.slicing import strided_steps
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import INT32
-from signatures.graph import Graph, Node
 
 IDENTITIES = frozenset(("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"))
 

@@ -14,10 +14,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, split_ref
 from converters.graph.ops.elementwise import OPS
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import INT32
-from signatures.graph import Graph, Node, split_ref
 
 #: Ops whose result at an index depends on their operands at that index only. TF 1's Select chooses rows.
 _ELEMENTWISE = frozenset(op.name for op in OPS) - {"Select"}

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
 from converters.graph.shapes import Types, infer_types, run_kernel
 from converters.graph.types import INT32
 from signatures.errors import UnsupportedOpError
-from signatures.graph import Graph, Node, ref, split_ref
 
 MAX_TURNS = 64
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from converters.graph.types import FLOAT32, INT64, Dim, product
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 #: Constants that a few bytes of the model make may not be larger.
 MAX_ELEMENTS = 1 << 22

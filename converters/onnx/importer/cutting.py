@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from converters.graph.types import BOOL, INT32, INT64, Dim
-from converters.onnx.raising.arrays import MAX_ELEMENTS
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.arrays import MAX_ELEMENTS
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 #: Beyond this an index means "to the end", in the 32-bit numbers that all targets have.
 _END = 2**31 - 1

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import NameScope, Node, node_of, ref
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE
 from converters.graph.shapes import Types, add_types
 from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast
-from converters.onnx.raising.node import Op
+from converters.onnx.importer.node import Op
 from signatures.errors import UnsupportedOpError
-from signatures.graph import NameScope, Node, node_of, ref
 
 #: Ops whose result depends on shapes, not on values.
 _SHAPE_OPS = frozenset(("Shape", "Size", "Rank"))

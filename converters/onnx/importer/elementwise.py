@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 #: Ops that mean the same under another name, and take the same inputs.
 _SAME = {

@@ -14,9 +14,9 @@ import numpy as np
 
 from converters.graph.ops.convolution import window_padding
 from converters.graph.types import FLOAT32
-from converters.onnx.raising.cutting import padded
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.cutting import padded
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 _TO_NHWC, _TO_NCHW = (0, 2, 3, 1), (0, 3, 1, 2)
 _IMAGE = 4

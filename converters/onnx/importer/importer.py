@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape, topological
 from converters.graph.types import FLOAT32, TensorType
+from converters.onnx.importer.drafting import Draft
+from converters.onnx.importer.fixed_batch import FixedRows
+from converters.onnx.importer.node import STANDARD, Op, Raise
 from converters.onnx.proto import array_of, attribute_of
-from converters.onnx.raising.drafting import Draft
-from converters.onnx.raising.fixed_rows import FixedRows
-from converters.onnx.raising.node import STANDARD, Op, Raise
 from signatures.errors import DamagedFileError, UnsupportedOpError
-from signatures.graph import Graph, NameScope, Node, TensorShape, topological
 
 
 def node_name(value: str) -> str:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from converters.graph.types import INT64, Dim, product
-from converters.onnx.raising.elementwise import is_bias
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.elementwise import is_bias
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 #: Product with a matrix behind further axes is written on two axes: TF 1.x multiplies batches of equal shape only.
 _MATRIX = 2

@@ -12,7 +12,7 @@ from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 from signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:
-    from converters.onnx.raising.raiser import Raiser
+    from converters.onnx.importer.importer import Raiser
 
 #: Domains that mean ONNX's own operators.
 STANDARD = ("", "ai.onnx")

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from converters.graph.types import FLOAT32, Dim
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 _DEFAULTS = {
     "LSTM": ("sigmoid", "tanh", "tanh"),

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from converters.graph.types import BATCH, FLOAT32, INT32
-from converters.onnx.raising.node import Op, Raise
-from converters.onnx.raising.raiser import Raiser
+from converters.onnx.importer.importer import Raiser
+from converters.onnx.importer.node import Op, Raise
 
 
 def _shape(op: Op, r: Raiser) -> str:

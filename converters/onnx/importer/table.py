@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from converters.onnx.raising import arrays, chance, cutting, elementwise, flow, images, linear, normalisation, recurrent
-from converters.onnx.raising.node import Raise
+from converters.onnx.importer import arrays, cutting, elementwise, flow, images, linear, normalisation, recurrent
+from converters.onnx.importer import samplers as chance
+from converters.onnx.importer.node import Raise
 
 
 def _table() -> Mapping[tuple[str, str], Raise]:

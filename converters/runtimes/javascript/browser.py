@@ -1,6 +1,6 @@
 """TensorFlow.js and onnxruntime-web in Chromium: where a user's page runs them.
 
-They need Node (which drives Chromium), the npm packages of ``converters/runner/js/package-lock.json`` and a Chromium
+They need Node (which drives Chromium), the npm packages that ``js/package-lock.json`` here pins, and a Chromium
 that is installed already: nothing here downloads a browser. WebGL draws with Chromium's own software renderer
 (SwiftShader) on every machine, so that what is verified does not depend on a graphics card.
 """
@@ -13,8 +13,8 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from exporter.runtimes.base import Runtime, RuntimeInfo
-from exporter.runtimes.javascript import (
+from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.javascript.node import (
     INSTALL_NODE,
     INSTALL_TFJS,
     JS_SOURCE,

@@ -1,6 +1,6 @@
 """TensorFlow.js and onnxruntime-web in Node: where Node and the npm packages lie, and how these are installed.
 
-The npm packages are pinned by ``converters/runner/js/package-lock.json``. A checkout has them beside that file
+The npm packages are pinned by ``js/package-lock.json`` here. A checkout has them beside that file
 (``npm ci --ignore-scripts`` there); a user has them in the cache folder, under a name that holds the lock's hash, so
 that a newer version of this program never runs the packages of an older one.
 """
@@ -14,13 +14,13 @@ import subprocess
 from functools import partial
 from pathlib import Path
 
-from exporter.runtimes.base import Progress, Runtime, RuntimeInfo
-from exporter.runtimes.cache import built_beside, cache_folder
-from exporter.runtimes.python import module_origin
+from converters.runtimes.base import Progress, Runtime, RuntimeInfo
+from converters.runtimes.cache import built_beside, cache_folder
+from converters.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 
-JS_SOURCE = Path(__file__).resolve().parents[2] / "converters" / "runner" / "js"
+JS_SOURCE = Path(__file__).resolve().parent / "js"
 """The folder with package.json, package-lock.json and runner.mjs; in a checkout and in site-packages alike."""
 
 JS_VARIABLE = "EXPORT_MODEL_JS"

@@ -1,6 +1,6 @@
 """The numpy reference in its own process: a frozen graph of ours, run by the kernels of the op table.
 
-``python -m converters.runner.numpy_child``
+``python -m converters.runtimes.numpy.child``
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from converters.frozen_graph.reader import read_graph
-from converters.graph.ops.chance import reseed
+from converters.graph.nodes import Graph
+from converters.graph.ops.samplers import reseed
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
-from converters.runner.child import claim_stdout, serve
-from converters.runner.wire import Tensors
+from converters.runtimes.child import claim_stdout, serve
+from converters.runtimes.wire import Tensors
 from signatures.errors import ExportModelError
-from signatures.graph import Graph
 
 
 class _Model:

@@ -1,4 +1,4 @@
-"""onnxruntime in its own process: ``python -m converters.runner.onnxruntime_child``.
+"""onnxruntime in its own process: ``python -m converters.runtimes.onnxruntime.child``.
 
 A model of ours is loaded as it lies there. A source is loaded with ``lift`` (the values of its samplers of normals,
 which become inputs); any of its inner values can then be fetched.
@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.runner.child import Model, claim_stdout, serve
-from converters.runner.wire import Tensors
+from converters.runtimes.child import Model, claim_stdout, serve
+from converters.runtimes.wire import Tensors
 
 
 def main() -> None:

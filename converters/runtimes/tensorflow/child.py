@@ -6,7 +6,7 @@ variables are restored from ``prefix``), ``values`` (a training graph, its varia
 tensors), ``function`` (a SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model``
 (a SavedModel called by ``signature``).
 
-``python -m converters.runner.tensorflow_child``
+``python -m converters.runtimes.tensorflow.child``
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.runner.child import Model, claim_stdout, serve
-from converters.runner.tensorflow_freeze import frozen_function
-from converters.runner.wire import Tensors
+from converters.runtimes.child import Model, claim_stdout, serve
+from converters.runtimes.tensorflow.freeze import frozen_function
+from converters.runtimes.wire import Tensors
 
 
 def main() -> None:

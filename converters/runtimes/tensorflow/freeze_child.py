@@ -1,4 +1,4 @@
-"""TensorFlow freezing what cannot be read without it: ``python -m converters.runner.freeze_child``.
+"""TensorFlow freezing what cannot be read without it: ``python -m converters.runtimes.tensorflow.freeze_child``.
 
 A model is loaded by ``path``, ``form`` and ``signature``; run, it gives its GraphDef's bytes as ``graph`` and a JSON
 object of its inputs' and outputs' tensors as ``names``, both as bytes.
@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.runner.child import claim_stdout, serve
-from converters.runner.tensorflow_freeze import FrozenFunction, frozen_function
-from converters.runner.wire import Tensors
+from converters.runtimes.child import claim_stdout, serve
+from converters.runtimes.tensorflow.freeze import FrozenFunction, frozen_function
+from converters.runtimes.wire import Tensors
 
 
 class _Frozen:

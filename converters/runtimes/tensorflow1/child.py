@@ -1,4 +1,4 @@
-"""An old TensorFlow in its own process: ``python -m converters.runner.tensorflow1_child NAME LIBRARY``.
+"""An old TensorFlow in its own process: ``python -m converters.runtimes.tensorflow1.child NAME LIBRARY``.
 
 NAME is the runtime's, LIBRARY the path of the shared object that has the C API. An assertion within TensorFlow ends
 this process, not its parent.
@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.runner.child import claim_stdout, serve
-from converters.runner.tensorflow1 import LegacyError, LegacySession, library_version, load_library
-from converters.runner.wire import Tensors
+from converters.runtimes.child import claim_stdout, serve
+from converters.runtimes.tensorflow1.library import LegacyError, LegacySession, library_version, load_library
+from converters.runtimes.wire import Tensors
 
 
 class _Model:
-    """A session as converters.runner.child wants it."""
+    """A session as converters.runtimes.child wants it."""
 
     def __init__(self, session: LegacySession) -> None:
         self.session = session

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from exporter.runtimes.base import Progress, Runtime, RuntimeInfo
-from exporter.runtimes.cache import cache_folder
-from exporter.runtimes.python import child_command
+from converters.runtimes.base import Progress, Runtime, RuntimeInfo
+from converters.runtimes.cache import cache_folder
+from converters.runtimes.command import child_command
 from signatures.errors import RuntimeUnavailableError
 
 API_LIBRARY = "_pywrap_tensorflow_internal.so"
@@ -84,11 +84,13 @@ def _command(release: Release) -> list[str]:
     folder = library_folder(release)
     if not is_whole(folder):
         raise RuntimeUnavailableError(f"the runtime {release.runtime} is not installed", fix=how(release))
-    return child_command("converters.runner.tensorflow1_child", release.runtime, str(folder / API_LIBRARY))
+    return child_command("converters.runtimes.tensorflow1.child", release.runtime, str(folder / API_LIBRARY))
 
 
 def _install(release: Release, progress: Progress) -> Path:
-    from exporter.runtimes.legacy_install import install  # what fetches and unpacks is imported where that is done
+    from converters.runtimes.tensorflow1.install import (
+        install,  # what fetches and unpacks is imported where that is done
+    )
 
     return install(release, progress)
 

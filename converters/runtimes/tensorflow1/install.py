@@ -1,4 +1,4 @@
-"""Fetching the C libraries of TensorFlow 1.4 and 1.7 from their wheels (exporter/runtimes/legacy.py says what for)."""
+"""Fetching the C libraries of TensorFlow 1.4 and 1.7 from their wheels (found.py says what for)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from exporter.runtimes.base import Progress
-from exporter.runtimes.cache import built_beside
-from exporter.runtimes.legacy import API_LIBRARY, LIBRARIES, Release, how, is_whole, library_folder, unsupported_reason
+from converters.runtimes.base import Progress
+from converters.runtimes.cache import built_beside
+from converters.runtimes.tensorflow1.found import (
+    API_LIBRARY,
+    LIBRARIES,
+    Release,
+    how,
+    is_whole,
+    library_folder,
+    unsupported_reason,
+)
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 

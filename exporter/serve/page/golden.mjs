@@ -102,7 +102,7 @@ function differing({ dtype, floored, ties = [] }, expected, answer, { atol, rtol
   return found;
 }
 
-/** Log-probabilities that say "never", all at one value; exporter/parity/compare.py says why. */
+/** Log-probabilities that say "never", all at one value; exporter/verify/difference.py says why. */
 function settled(values, branches) {
   const own = Float32Array.from(values);
   const width = branches.reduce((a, b) => a + b, 0);
