@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.graph.nodes import Graph
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 
 
 @dataclass(frozen=True, slots=True)

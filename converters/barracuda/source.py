@@ -7,7 +7,7 @@ from pathlib import Path
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import to_graph
 from converters.source import ReadOptions, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 from signatures.roles import ACTION_NAMES
 
 #: Suffixes that ML-Agents' converter gives to memories: the cell state and the hidden state of an LSTM; a GRU has h.

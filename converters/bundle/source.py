@@ -20,7 +20,7 @@ from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.registry import reader
 from converters.renaming import renamed
 from converters.source import ReadOptions, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 from converters.understand.signature import derived_notes
 from signatures.digest import sha256_hex
 from signatures.errors import BundleError, DamagedFileError

@@ -15,7 +15,7 @@ import numpy as np
 from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
-from converters.understand.infer import find_brains
+from converters.understand.brains import find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.roles import CONSTANT_NAMES
 

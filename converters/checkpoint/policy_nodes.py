@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from converters.checkpoint.freeze import is_effect
 from converters.graph.nodes import Graph, Node, node_of, topological
 from converters.renaming import renamed
-from converters.understand.infer import find_brains
+from converters.understand.brains import find_brains
 from signatures.errors import ExportModelError
 from signatures.roles import OUTPUT_NAMES, Constant, numbers
 

@@ -13,7 +13,7 @@ from converters.checkpoint.table import MAGIC
 from converters.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
 from converters.checkpoint.training_graph import read_training_graph
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 from signatures.errors import ExportModelError, SourceError, UsageError
 
 _PARTS = re.compile(r"(?P<prefix>.+)\.(index|meta|data-\d{5}-of-\d{5})")

@@ -23,16 +23,11 @@ from converters.graph.passes.unroll import straighten
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
 from converters.policy import Policy
+from converters.understand.action import ActionMeaning, action_meaning
+from converters.understand.brains import Brain, Head, find_brains
 from converters.understand.derived_outputs import LOG_PROBS, add_companions
-from converters.understand.infer import (
-    ActionMeaning,
-    Brain,
-    Head,
-    SourceFacts,
-    action_meaning,
-    classify_inputs,
-    find_brains,
-)
+from converters.understand.facts import SourceFacts
+from converters.understand.inputs import classify_inputs
 from converters.understand.signature import Compiled, branch_sizes, build_signature
 from signatures.errors import UsageError
 from signatures.memories import SourcePart

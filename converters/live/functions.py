@@ -15,7 +15,7 @@ from converters.frozen_graph.reader import read_graph
 from converters.runtimes.tensorflow.freeze import keras_call, keras_outputs, named_function, saved_function
 from converters.saved_model.signature import ModelSignature, Tensor, expose
 from converters.source import OriginalRun, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 from signatures.errors import SourceError, UsageError
 
 NAME = "policy"

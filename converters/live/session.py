@@ -19,7 +19,7 @@ from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph, training_graph
 from converters.runtimes.tensorflow.freeze import flattened
 from converters.source import OriginalRun, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 from signatures.errors import NotAPolicyError, SourceError, UsageError
 
 NAME = "policy"

@@ -8,7 +8,7 @@ from converters.frozen_graph.reader import read_graph
 from converters.saved_model.functions import frozen_by_tensorflow
 from converters.saved_model.signature import expose
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 
 
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:

@@ -17,7 +17,7 @@ import numpy as np
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.renaming import renamed
-from converters.understand.infer import role_by_name
+from converters.understand.inputs import role_by_name
 from signatures.errors import DamagedFileError
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 

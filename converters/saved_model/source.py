@@ -13,7 +13,7 @@ from converters.saved_model.functions import frozen_by_tensorflow
 from converters.saved_model.reader import Saved, read_saved_model
 from converters.saved_model.signature import expose
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 
 FILE = "saved_model.pb"
 

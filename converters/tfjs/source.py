@@ -9,7 +9,7 @@ from converters.saved_model.signature import expose
 from converters.source import ReadOptions, SourceModel
 from converters.tfjs.reader import MODEL, read_model
 from converters.tfjs.unfuse import unfuse
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 
 
 def read(path: Path, options: ReadOptions) -> list[SourceModel]:

@@ -27,8 +27,8 @@ from converters.graph.types import INT64
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, find_sensors
 from converters.torch_checkpoint.state import LET_IT_EXPORT, State, unknown_part
+from converters.understand.facts import SourceFacts
 from converters.understand.generations import TORCH_VERSION_3
-from converters.understand.infer import SourceFacts
 from signatures.errors import DamagedFileError, SourceError
 
 _BODY = "network_body"

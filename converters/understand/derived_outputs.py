@@ -16,7 +16,8 @@ from converters.graph.nodes import Graph
 from converters.graph.passes.noise import without_noise
 from converters.graph.shapes import infer_types
 from converters.graph.types import INT32, INT64
-from converters.understand.infer import ActionMeaning, Head
+from converters.understand.action import ActionMeaning
+from converters.understand.brains import Head
 from signatures.roles import Role
 
 LOG_PROBS = "action_log_probs"

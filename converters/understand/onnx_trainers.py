@@ -17,8 +17,8 @@ from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.onnx.reader import OnnxModel
 from converters.onnx.writer import CONTRACT_KEY
 from converters.renaming import renamed
+from converters.understand.facts import SourceFacts
 from converters.understand.generations import torch_generation
-from converters.understand.infer import SourceFacts
 from signatures.roles import OUTPUT_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.

@@ -11,11 +11,14 @@ from converters.graph.nodes import Graph, Node, TensorShape, node_of
 from converters.graph.options import CompileOptions
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
+from converters.understand.action import ActionMeaning
+from converters.understand.brains import Brain, Head
 from converters.understand.derived_outputs import LOG_PROBS
+from converters.understand.facts import SourceFacts
 from converters.understand.generations import generation
-from converters.understand.image_range import highest_colour
-from converters.understand.infer import ActionMeaning, Brain, Head, SourceFacts
-from converters.understand.normaliser import memory_layout, normaliser
+from converters.understand.images import highest_colour
+from converters.understand.memories import memory_layout
+from converters.understand.normaliser import normaliser
 from signatures.errors import SignatureError
 from signatures.labels import remaining
 from signatures.roles import OBSERVATIONS, Role, canonical_name, numbers

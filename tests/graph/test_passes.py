@@ -28,9 +28,11 @@ from converters.graph.passes.simplify import IDENTITIES, collapse_views, drop_id
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32, INT64
+from converters.understand.action import ActionMeaning
+from converters.understand.brains import Head
 from converters.understand.derived_outputs import LOG_PROBS, add_companions
-from converters.understand.infer import ActionMeaning, Head
-from converters.understand.normaliser import memory_layout, normaliser
+from converters.understand.memories import memory_layout
+from converters.understand.normaliser import normaliser
 from fixtures import path
 from signatures.errors import GraphError, UnsupportedOpError, UsageError
 from signatures.roles import Role

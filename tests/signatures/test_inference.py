@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.understand.infer import action_meaning, classify_inputs, find_brains, placeholder_rank, role_by_name
+from converters.understand.action import action_meaning
+from converters.understand.brains import find_brains
+from converters.understand.inputs import classify_inputs, placeholder_rank, role_by_name
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.roles import Role
 from tests.signatures.nodes import FLOAT, INT, Dims, constant, graph, op, placeholder

@@ -14,7 +14,7 @@ from converters.graph.ops.convolution import window_padding
 from converters.graph.passes.normalise import as_placeholder
 from converters.graph.shapes import MAX_ELEMENTS
 from converters.graph.types import INT32
-from converters.understand.infer import placeholder_rank
+from converters.understand.inputs import placeholder_rank
 from signatures.errors import GraphError, UsageError
 from signatures.roles import OBSERVATIONS, Role
 

@@ -13,7 +13,7 @@ from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref
 from converters.graph.options import CompileOptions
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
-from converters.understand.infer import SourceFacts
+from converters.understand.facts import SourceFacts
 from signatures.errors import SignatureError
 from signatures.memories import SeparateMemory, SourcePart
 from signatures.roles import CANONICAL, Role

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from converters.graph.nodes import Graph, Node
-from converters.understand.infer import TRANSPARENT
+from converters.understand.action import TRANSPARENT
 
 BYTE = 255.0
 #: A divisor may be repeated for each colour.

@@ -1,0 +1,83 @@
+"""What an action is: judged by its dtype and ancestors alone, never by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from converters.graph.nodes import Graph, Node
+from signatures.roles import Role
+
+_MAX_LEAVES = 1024
+#: Ops that pass a value on without changing its numbers.
+TRANSPARENT = frozenset(
+    ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics", "Reshape", "Squeeze", "ExpandDims")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ActionMeaning:
+    """What ``action`` is. ``draws`` are the samplers' logits per branch, ``sizes`` the branch sizes' tensors."""
+
+    role: Role
+    #: per branch: the tensor whose last axis is the branch (logits, log-probabilities or scores)
+    branches: tuple[str, ...] = ()
+    #: per branch: the sampler node, for sampled actions
+    samplers: tuple[str, ...] = ()
+
+
+def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: bool) -> ActionMeaning:
+    """Decide from dtype and ancestors whether an action is continuous, sampled, log-probabilities or an argmax.
+
+    ``graph`` must be free of loops (after the straighten pass).
+    """
+    leaves = _leaves(graph, reference)
+    producers = [graph.producer(leaf) for leaf in leaves]
+    if dtype.kind in "iu":
+        if all(p.op == "Multinomial" for p in producers):
+            return ActionMeaning(Role.SAMPLED, tuple(p.inputs[0] for p in producers), tuple(p.name for p in producers))
+        if all(p.op == "ArgMax" for p in producers):
+            return ActionMeaning(Role.DETERMINISTIC, tuple(p.inputs[0] for p in producers))
+        return ActionMeaning(Role.DETERMINISTIC)
+    if all(p.op in ("Log", "LogSoftmax") for p in producers):
+        return ActionMeaning(Role.LOG_PROBS, tuple(leaves))
+    if all(p.op == "Softmax" for p in producers):
+        return ActionMeaning(Role.PROBS, tuple(leaves))
+    if has_masks:
+        return ActionMeaning(Role.LOG_PROBS, tuple(leaves))
+    return ActionMeaning(Role.CONTINUOUS)
+
+
+def _leaves(graph: Graph, reference: str) -> list[str]:
+    """The tensors that are joined along the last axis to make ``reference``, in order.
+
+    A join of a join of itself doubles with every step; what is made of more than ``_MAX_LEAVES`` is no action with
+    branches, and stands for itself.
+    """
+    leaves: list[str] = []
+    stack = [reference]
+    while stack:
+        if len(leaves) + len(stack) > _MAX_LEAVES:
+            return [reference]
+        tensor = stack.pop()
+        parts = _parts(graph, graph.producer(tensor))
+        if parts:
+            stack.extend(reversed(parts))
+        else:
+            leaves.append(tensor)
+    return leaves
+
+
+def _parts(graph: Graph, node: Node) -> Sequence[str]:
+    """What a node passes on or joins along the last axis; empty where it computes."""
+    if node.op in TRANSPARENT or node.op == "Cast":
+        return node.inputs[:1]
+    if node.op == "ConcatV2":
+        axis = graph.constant(node.inputs[-1])
+        if axis is not None and int(axis) in (1, -1):
+            return node.inputs[:-1]
+    if node.op == "Pack" and node.attrs.get("axis", 0) in (1, -1):
+        return node.inputs
+    return ()

@@ -1,0 +1,43 @@
+"""What a reader knows of a source beside its graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from signatures.memories import SeparateMemory
+from signatures.roles import Constant, Role
+
+
+@dataclass(frozen=True)
+class SourceFacts:
+    """What a reader knows of a source beside its graph.
+
+    - ``roles``: placeholders whose role the format says (it goes before names and structure).
+    - ``family``, ``algorithm``: where the format tells; else (None) the graph is asked. An empty algorithm: none can be
+      told.
+    - ``image_layout``: NHWC, or NCHW for torch exports.
+    - ``memory_layout``: the memory's parts in order; empty: found from the graph.
+    - ``constants``: the ones that are no nodes of the graph.
+    - ``distributions``: placeholder → what it is fed, where the format says it.
+    - ``outputs``: the nodes that the format declares as outputs, with their roles where it says them; empty: it
+      declares none, and any node may be an output.
+    - ``rows``: the only number of rows that the source takes, or gets right; None: any.
+    - ``notes``: what the user should know of this source.
+    - ``labels``: names of observations (by placeholder) and actions, where the source carries them.
+    - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined.
+    """
+
+    roles: Mapping[str, Role] = field(default_factory=dict)
+    family: str | None = None
+    algorithm: str | None = None
+    image_layout: str = "NHWC"
+    memory_layout: tuple[str, ...] = ()
+    constants: Mapping[str, Constant] = field(default_factory=dict)
+    distributions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    outputs: Mapping[str, Role | None] = field(default_factory=dict)
+    rows: int | None = None
+    notes: tuple[str, ...] = ()
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    memories: tuple[SeparateMemory, ...] = ()

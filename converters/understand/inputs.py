@@ -1,0 +1,162 @@
+"""Roles of a policy's placeholders: by their names, by what the reader knows, by what reads them.
+
+What is not decided is a parameter, or an error that lists the candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from converters.graph.nodes import Graph, Node, TensorShape, node_of
+from converters.understand.action import TRANSPARENT
+from converters.understand.brains import Brain, close_names
+from signatures.errors import SignatureError, UsageError
+from signatures.roles import INPUT_PATTERNS, INPUT_ROLES, OBSERVATIONS, Role
+
+_PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
+
+
+def classify_inputs(
+    graph: Graph, brain: Brain, wanted: Mapping[str, Role] | None = None, known: Mapping[str, Role] | None = None
+) -> dict[str, Role]:
+    """Placeholder name → role, in graph order, for everything upstream of the brain's outputs.
+
+    ``wanted`` comes from ``--input``, ``known`` from the reader. A PlaceholderWithDefault that is neither named there
+    nor by ML-Agents is left out: its default is used. Raises SignatureError when no observation can be told.
+    """
+    upstream = graph.ancestors(brain.roots)
+    found = [n for n in graph.nodes if n.op in _PLACEHOLDERS and n.name in upstream]
+    inputs = {n.name for n in found}
+    others = {n.name for n in graph.nodes if n.op in _PLACEHOLDERS and not n.name.startswith(brain.scope)} - inputs
+    wanted = {name: role for name, role in (wanted or {}).items() if node_of(name) not in others}
+    roles: dict[str, Role] = {}
+    decided: set[str] = set()
+    for node in found:
+        base = node.name[len(brain.scope) :] if node.name.startswith(brain.scope) else node.name
+        override = next((wanted.pop(k) for k in (node.name, f"{node.name}:0", base) if k in wanted), None)
+        role = override or (known or {}).get(node.name) or role_by_name(base, node)
+        if role is None and node.op == "PlaceholderWithDefault":
+            continue
+        roles[node.name] = role or Role.PARAMETER
+        if override is not None or roles[node.name] is not Role.PARAMETER:
+            decided.add(node.name)
+        if override is not None and override not in INPUT_ROLES:
+            raise UsageError(
+                f"--input {node.name}={override}: that is not an input's role", fix=f"one of: {', '.join(INPUT_ROLES)}"
+            )
+    if wanted:
+        name = next(iter(wanted))
+        raise UsageError(
+            f"--input names {name!r}, which is no input of this policy",
+            why=close_names(name, [n.name for n in found]) or f"its inputs are {', '.join(n.name for n in found)}",
+            fix="export-model inspect FILE lists them",
+        )
+    _by_structure(graph, found, roles, decided)
+    if not any(r in OBSERVATIONS for r in roles.values()):
+        names = ", ".join(f"{n.name} {_shape_text(n)}" for n in found) or "none"
+        raise SignatureError(
+            "no policy found: none of the inputs can be told to be an observation",
+            why=f"inputs upstream of the outputs: {names}",
+            fix="say what they are: --input NAME=vector_observation, --input NAME=visual_observation, --set NAME=VALUE",
+        )
+    return roles
+
+
+def placeholder_rank(node: Node) -> int | None:
+    """Number of axes of a placeholder, None if the graph does not say."""
+    shape: TensorShape | None = node.attrs.get("shape")
+    return None if shape is None or shape.dims is None else len(shape.dims)
+
+
+def _shape_text(node: Node) -> str:
+    shape: TensorShape | None = node.attrs.get("shape")
+    dtype = node.attrs.get("dtype", "")
+    if shape is None or shape.dims is None:
+        return f"({dtype}, unknown shape)"
+    return f"({dtype} [{', '.join('?' if d is None else str(d) for d in shape.dims)}])"
+
+
+def role_by_name(base: str, node: Node) -> Role | None:
+    """The role that a placeholder's name says, if its rank and dtype do not contradict it."""
+    rank, dtype = placeholder_rank(node), node.attrs.get("dtype")
+    for pattern, role, ranks in INPUT_PATTERNS:
+        if not pattern.fullmatch(base) or (ranks is not None and rank is not None and rank not in ranks):
+            continue
+        integer = isinstance(dtype, np.dtype) and dtype.kind in "iu"
+        if role in (Role.SEQUENCE_LENGTH, Role.BATCH_SIZE, Role.PREV_ACTION):
+            if integer:
+                return role
+        elif role is Role.VECTOR or not integer:
+            return role
+    return None
+
+
+def _by_structure(graph: Graph, found: Sequence[Node], roles: dict[str, Role], decided: set[str]) -> None:
+    """Decide placeholders whose names say nothing, from what reads them."""
+    consumers = graph.consumers()
+    recurrent = Role.MEMORY_IN in roles.values()
+    unknown = [n for n in found if n.name in roles and n.name not in decided]
+    for node in unknown:
+        dtype = node.attrs.get("dtype")
+        integer = isinstance(dtype, np.dtype) and dtype.kind in "iu"
+        if placeholder_rank(node) == 4 and not integer:
+            roles[node.name] = Role.VISUAL
+        elif integer and placeholder_rank(node) in (1, 2) and _feeds_one_hot(node, consumers):
+            if recurrent and any(r in OBSERVATIONS for r in roles.values()):
+                roles[node.name] = Role.PREV_ACTION
+            elif not any(r in OBSERVATIONS for r in roles.values()):
+                roles[node.name] = Role.VECTOR
+        elif placeholder_rank(node) == 2 and not integer and _is_mask(graph, node, consumers):
+            roles[node.name] = Role.MASKS
+    if any(r in OBSERVATIONS for r in roles.values()):
+        return
+    floats = [
+        n
+        for n in unknown
+        if roles[n.name] is Role.PARAMETER
+        and placeholder_rank(n) in (2, None)
+        and getattr(n.attrs.get("dtype"), "kind", "") == "f"
+    ]
+    if len(floats) == 1:
+        roles[floats[0].name] = Role.VECTOR
+
+
+def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Iterable[str]) -> list[Node]:
+    """Nodes that read ``node``, looked for behind the ops in ``through``."""
+    passed, stack, met = frozenset(through), [node], []
+    seen: set[str] = set()
+    while stack:
+        for reader in consumers[stack.pop().name]:
+            if reader.name in seen:
+                continue
+            seen.add(reader.name)
+            met.append(reader)
+            if reader.op in passed:
+                stack.append(reader)
+    return met
+
+
+def _feeds_one_hot(node: Node, consumers: Mapping[str, list[Node]]) -> bool:
+    through = TRANSPARENT | {"Cast", "StridedSlice", "Slice", "Split", "Unpack", "Unstack"}
+    return any(r.op == "OneHot" for r in _reached(node, consumers, through))
+
+
+def _is_mask(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> bool:
+    """A float matrix that multiplies a softmax (perhaps plus a constant) is a mask."""
+    for reader in _reached(node, consumers, TRANSPARENT | {"StridedSlice", "Slice", "Split"}):
+        if reader.op == "Mul" and any(
+            "Softmax" in {graph[n].op for n in graph.ancestors([r]) if _near(graph, r, n)} for r in reader.inputs
+        ):
+            return True
+    return False
+
+
+def _near(graph: Graph, reference: str, name: str) -> bool:
+    """Whether ``name`` is the producer of ``reference`` or one Add before it."""
+    node = graph.producer(reference)
+    names = {node.name}
+    if node.op in ("Add", "AddV2"):
+        names |= {node_of(r) for r in node.inputs}
+    return name in names
