@@ -110,6 +110,18 @@ class _Builder:
                 value = reference
             self.bind(reference, value)
 
+    def give(self, output: str) -> None:
+        """Let an output be made: what is an input, a constant or another output as well is so by a node of its own.
+
+        The Inference Engine (2.4.0) does not import an Identity of an output that a Reshape makes: that is made again.
+        """
+        value = self.value(output)
+        if value == output:
+            return
+        maker = next((n for n in self.nodes if value in n.output), None)
+        inputs = list(maker.input) if maker is not None and maker.op_type == "Reshape" else [value]
+        self.nodes.append(self.onnx.helper.make_node("Reshape" if len(inputs) == 2 else "Identity", inputs, [output]))
+
     def _rename(self, start: int, old: str, new: str) -> None:
         for node in self.nodes[start:]:
             for names in (node.input, node.output):
@@ -174,8 +186,7 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
         if node.op != "Placeholder":
             builder.lower(node)
     for spec in policy.signature.outputs:
-        if builder.value(spec.name) != spec.name:  # an input or a constant that is an output as well
-            builder.nodes.append(onnx.helper.make_node("Identity", [builder.value(spec.name)], [spec.name]))
+        builder.give(spec.name)
     used = {name for node in builder.nodes for name in node.input}
     model = onnx.helper.make_model(
         onnx.helper.make_graph(

@@ -5,6 +5,7 @@ Most kernels are structural: they also work on symbolic shape vectors.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from converters.graph.ops.base import (
     OpDef,
     as_int64,
     constant_input,
+    inserted,
     not_constant,
     require_constant,
     same_as,
@@ -192,7 +194,9 @@ def _infer_squeeze(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
 def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
     shape = builder.type_of(node.inputs[0]).shape
     assert shape is not None
-    return squeezed(builder, builder.value(node.inputs[0]), _squeeze_axes(node, shape))
+    axes = _squeeze_axes(node, shape)
+    kept = [d for i, d in enumerate(shape) if i not in axes]
+    return squeezed(builder, builder.value(node.inputs[0]), axes, kept)
 
 
 def _expand_dims(node: Node, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -210,7 +214,8 @@ def _infer_expand_dims(node: Node, args: Sequence[TensorType], symbols: Symbols)
 
 def _lower_expand_dims(node: Node, builder: OnnxBuilder) -> Any:
     axis = int(constant_input(node, builder, 1, "an axis").reshape(()))
-    return unsqueezed(builder, builder.value(node.inputs[0]), [axis])
+    result = inserted(builder.type_of(node.inputs[0]).shape, axis)
+    return unsqueezed(builder, builder.value(node.inputs[0]), [axis], result)
 
 
 def _transpose(node: Node, x: np.ndarray, permutation: np.ndarray) -> np.ndarray:
@@ -291,7 +296,9 @@ def _infer_pack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> lis
 
 def _lower_pack(node: Node, builder: OnnxBuilder) -> Any:
     axis = node.attrs["axis"]
-    parts = [unsqueezed(builder, builder.value(r), [axis]) for r in node.inputs]
+    parts = [
+        unsqueezed(builder, builder.value(r), [axis], inserted(builder.type_of(r).shape, axis)) for r in node.inputs
+    ]
     return builder.emit("Concat", parts, axis=axis)
 
 
@@ -358,6 +365,7 @@ def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
 
 
 def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
+    """A Slice for each piece: Barracuda reads the sizes of a Split from its attribute alone, which opset 13 has not."""
     data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
     kind = builder.type_of(node.inputs[data_at])
     assert kind.shape is not None
@@ -368,9 +376,10 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     value = builder.value(node.inputs[data_at])
     if len(sizes) == 1:
         return (value,)
-    return builder.emit(
-        "Split", [value, builder.const(np.array(sizes, np.int64), "sizes")], outputs=len(sizes), axis=axis
-    )
+    bounds = [0, *itertools.accumulate(int(s) for s in sizes)]
+    starts = [builder.const(np.array([b], np.int64), "bound") for b in bounds]
+    on = builder.const(np.array([axis], np.int64), "axis")
+    return tuple(builder.emit("Slice", [value, begin, end, on]) for begin, end in itertools.pairwise(starts))
 
 
 _PASS = ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")

@@ -18,6 +18,8 @@ from signatures.errors import GraphError, UnsupportedOpError
 
 Kernel = Callable[..., Any]
 Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]
+#: A shape as far as it is known; a string is a free axis.
+Shape = Sequence[Dim] | None
 AttrKind = Literal["type", "int", "ints", "float", "bool", "str", "shape"]
 
 #: Marks an attribute that a GraphDef must carry.
@@ -190,29 +192,37 @@ def scalar(builder: OnnxBuilder, node: Node, number: float) -> str:
     return builder.const(np.array(number, builder.type_of(node.inputs[0]).dtype), "scalar")
 
 
-def squeezed(builder: OnnxBuilder, value: str, axes: Sequence[int]) -> str:
-    """ONNX Squeeze of constant ``axes`` (an input since opset 13)."""
-    if not axes:
-        return value
-    result: str = builder.emit("Squeeze", [value, builder.const(np.array(axes, np.int64), "axes")])
-    return result
+def squeezed(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
+    """``value`` without ``axes`` of length 1; ``result`` is the shape that comes of it."""
+    return value if not axes else reshaped(builder, value, result) or _with_axes(builder, "Squeeze", value, axes)
 
 
-def unsqueezed(builder: OnnxBuilder, value: str, axes: Sequence[int]) -> str:
-    """ONNX Unsqueeze at constant ``axes``."""
-    if not axes:
-        return value
-    result: str = builder.emit("Unsqueeze", [value, builder.const(np.array(axes, np.int64), "axes")])
-    return result
+def unsqueezed(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
+    """``value`` with ``axes`` of length 1 put in; ``result`` is the shape that comes of it."""
+    return value if not axes else reshaped(builder, value, result) or _with_axes(builder, "Unsqueeze", value, axes)
 
 
-def reduced(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[int], keepdims: bool) -> str:
-    """An ONNX reduction; its axes are an attribute before opset 18 (13 for ReduceSum) and an input from there on."""
-    if not axes:
-        return value
-    if builder.opset >= (13 if onnx_op == "ReduceSum" else 18):
-        axes_value = builder.const(np.array(axes, np.int64), "axes")
-        result: str = builder.emit(onnx_op, [value, axes_value], keepdims=int(keepdims))
-    else:
-        result = builder.emit(onnx_op, [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
-    return result
+def reshaped(builder: OnnxBuilder, value: str, result: Shape) -> str:
+    """A Reshape to ``result``, or nothing where that shape is not known well enough for one.
+
+    Barracuda reads it in every version. The axes of Squeeze and Unsqueeze are an input since opset 13, which it reads
+    from 2.3.1 on.
+    """
+    if not result or 0 in result or sum(isinstance(d, str) for d in result) > 1:
+        return ""
+    target = np.array([d if isinstance(d, int) else -1 for d in result], np.int64)
+    made: str = builder.emit("Reshape", [value, builder.const(target, "shape")])
+    return made
+
+
+def _with_axes(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[int]) -> str:
+    made: str = builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
+    return made
+
+
+def inserted(shape: Shape, axis: int) -> tuple[Dim, ...] | None:
+    """A shape with an axis of length 1 at ``axis``, which may be counted from the end of the result."""
+    if shape is None:
+        return None
+    at = axis + len(shape) + 1 if axis < 0 else axis
+    return (*shape[:at], 1, *shape[at:])

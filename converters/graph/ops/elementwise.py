@@ -24,6 +24,7 @@ from converters.graph.ops.base import (
     same_as,
     scalar,
     type_attr,
+    unsqueezed,
 )
 from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
 
@@ -142,6 +143,11 @@ def _lower_not_equal(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Not", [builder.emit("Equal", [builder.value(r) for r in node.inputs])])
 
 
+def _lower_greater_equal(node: Node, builder: OnnxBuilder) -> Any:
+    """The other way round: Barracuda has no GreaterOrEqual."""
+    return builder.emit("LessOrEqual", [builder.value(r) for r in reversed(node.inputs)])
+
+
 def _lower_leaky_relu(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("LeakyRelu", [builder.value(node.inputs[0])], alpha=float(node.attrs["alpha"]))
 
@@ -163,7 +169,17 @@ def _infer_cast(node: Node, args: Sequence[TensorType], symbols: Symbols) -> lis
 
 
 def _lower_cast(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Cast", [builder.value(node.inputs[0])], to=node.attrs["DstT"])
+    """Unity's importers keep the value of a float that is cast: fractions are taken off before a cast to an integer,
+    and a cast to bool is a comparison (Cast_01 to _03; Sentis and the Inference Engine keep it for bool too).
+    """
+    value, source = builder.value(node.inputs[0]), builder.type_of(node.inputs[0]).dtype
+    target = node.attrs["DstT"]
+    if target == BOOL and source != BOOL:
+        return builder.emit("Not", [builder.emit("Equal", [value, scalar(builder, node, 0.0)])])
+    if source.kind == "f" and target.kind in "iu":
+        whole = builder.emit("Floor", [builder.emit("Abs", [value])])
+        value = builder.emit("Mul", [builder.emit("Sign", [value]), whole])
+    return builder.emit("Cast", [value], to=target)
 
 
 def _infer_select(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
@@ -179,10 +195,9 @@ def _select(node: Node, condition: np.ndarray, a: np.ndarray, b: np.ndarray) -> 
 
 def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
     condition, a, b = (builder.value(r) for r in node.inputs)
-    rank, wide = builder.type_of(node.inputs[0]).rank, builder.type_of(node.inputs[1]).rank
-    if rank == 1 and wide is not None and wide > 1:
-        axes = builder.const(np.arange(1, wide, dtype=np.int64), "axes")
-        condition = builder.emit("Unsqueeze", [condition, axes])
+    shape, wide = builder.type_of(node.inputs[0]).shape, builder.type_of(node.inputs[1]).rank
+    if shape is not None and len(shape) == 1 and wide is not None and wide > 1:
+        condition = unsqueezed(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
     return builder.emit("Where", [condition, a, b])
 
 
@@ -295,7 +310,7 @@ LOGIC = (
     _comparison("Less", np.less, "Less"),
     _comparison("LessEqual", np.less_equal, "LessOrEqual"),
     _comparison("Greater", np.greater, "Greater"),
-    _comparison("GreaterEqual", np.greater_equal, "GreaterOrEqual"),
+    _comparison("GreaterEqual", np.greater_equal, _lower_greater_equal),
     _comparison("Equal", np.equal, "Equal"),
     _comparison("NotEqual", np.not_equal, _lower_not_equal),
     OpDef("LogicalAnd", broadcast_of(BOOL, count=2), _plain(np.logical_and), direct("And")),

@@ -16,6 +16,7 @@ from converters.graph.ops.base import (
     OpDef,
     as_int64,
     constant_input,
+    inserted,
     not_constant,
     require_constant,
     type_attr,
@@ -113,8 +114,11 @@ def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
     axis = int(node.attrs["axis"])
     axis = kind.rank if axis < 0 else axis
     classes = np.arange(depth, dtype=kind.dtype).reshape([depth if i == axis else 1 for i in range(kind.rank + 1)])
-    index = unsqueezed(builder, builder.value(node.inputs[0]), [axis])
+    index = unsqueezed(builder, builder.value(node.inputs[0]), [axis], inserted(kind.shape, axis))
     hot = builder.emit("Equal", [index, builder.const(classes, "classes")])
+    on, off = (builder.type_of(r).constant for r in node.inputs[2:])
+    if on is not None and off is not None and on.size == off.size == 1 and (on.item(), off.item()) == (1, 0):
+        return builder.emit("Cast", [hot], to=on.dtype)
     return builder.emit("Where", [hot, builder.value(node.inputs[2]), builder.value(node.inputs[3])])
 
 

@@ -14,12 +14,12 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     constant_input,
-    reduced,
     require_constant,
     same_as,
     shape_error,
     type_attr,
 )
+from converters.graph.ops.reducing import reduced
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
 
 T = type_attr()
@@ -112,12 +112,16 @@ def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) ->
 
 
 def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
-    value = builder.emit(
-        "Gemm",
-        [builder.value(r) for r in node.inputs],
-        transA=int(bool(node.attrs.get("transpose_a"))),
-        transB=int(bool(node.attrs.get("transpose_b"))),
-    )
+    """Gemm where the matrix is a constant: with a computed one Barracuda drops the bias (Gemm_10, Gemm_11)."""
+    if builder.type_of(node.inputs[1]).constant is None:
+        value = builder.emit("Add", [_lower_matmul(node, builder), builder.value(node.inputs[2])])
+    else:
+        value = builder.emit(
+            "Gemm",
+            [builder.value(r) for r in node.inputs],
+            transA=int(bool(node.attrs.get("transpose_a"))),
+            transB=int(bool(node.attrs.get("transpose_b"))),
+        )
     for name in node.attrs["fused_ops"][1:]:
         value = lower_activation(name, value, builder)
     return value
@@ -163,8 +167,8 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
         keep = bool(node.attrs["keep_dims"])
         if kind.dtype == BOOL:  # ONNX does not reduce booleans
             value = builder.emit("Cast", [value], to=INT32)
-            return builder.emit("Cast", [reduced(builder, onnx_op, value, axes, keep)], to=BOOL)
-        return reduced(builder, onnx_op, value, axes, keep)
+            return builder.emit("Cast", [reduced(builder, onnx_op, value, kind, axes, keep)], to=BOOL)
+        return reduced(builder, onnx_op, value, kind, axes, keep)
 
     return lower
 

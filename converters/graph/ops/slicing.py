@@ -15,6 +15,7 @@ from converters.graph.ops.base import (
     constant_input,
     not_constant,
     require_constant,
+    reshaped,
     shape_error,
     squeezed,
     type_attr,
@@ -48,14 +49,15 @@ def _infer_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
 
 
 def _lower_slice(node: Node, builder: OnnxBuilder) -> Any:
-    rank = builder.type_of(node.inputs[0]).rank
-    begin = constant_input(node, builder, 1, "the beginning of a slice").astype(np.int64)
-    size = constant_input(node, builder, 2, "the size of a slice").astype(np.int64)
-    ends = np.where(size == -1, np.int64(2**31 - 1), begin + size)
-    axes = builder.const(np.arange(rank or 0, dtype=np.int64), "axes")
-    return builder.emit(
-        "Slice", [builder.value(node.inputs[0]), builder.const(begin, "starts"), builder.const(ends, "ends"), axes]
-    )
+    shape = builder.type_of(node.inputs[0]).shape
+    begin = constant_input(node, builder, 1, "the beginning of a slice").tolist()
+    size = constant_input(node, builder, 2, "the size of a slice").tolist()
+    cuts: list[_Cut] = []
+    for axis, (first, count) in enumerate(zip(begin, size, strict=True)):
+        length = _LIMIT if shape is None else shape[axis]
+        last = length if isinstance(length, int) else _LIMIT
+        cuts.append((axis, first, last if count == -1 else first + count, 1, length))
+    return _cut(builder, builder.value(node.inputs[0]), cuts)
 
 
 #: One entry of a strided slice: ("slice", begin, end, stride) | ("take", index) | ("new",)
@@ -142,38 +144,68 @@ def _lower_strided_slice(node: Node, builder: OnnxBuilder) -> Any:
     if operands is None or kind.shape is None:
         raise not_constant(node, "the bounds of a slice")
     steps = strided_steps(node, len(kind.shape), *operands)
-    limit = 2**31 - 1
-    starts, ends, axes, strides = [], [], [], []
+    cuts: list[_Cut] = []
     drop, insert = [], []
-    axis = 0
-    for step in steps:
-        if step[0] == "new":
-            continue
-        if step[0] == "take":
-            bounds = (step[1], step[1] + 1 if step[1] != -1 else limit, 1)
-            drop.append(axis)
-        else:
-            first = step[1] if step[1] is not None else (0 if step[3] > 0 else limit)
-            bounds = (first, step[2] if step[2] is not None else (limit if step[3] > 0 else -limit), step[3])
-            length = kind.shape[axis]
-            if isinstance(length, int) and not range(*slice(*step[1:]).indices(length)):
-                bounds = (0, 0, 1)  # backwards from before the start: ONNX would begin at element 0
-        if bounds != (0, limit, 1):
-            starts.append(bounds[0])
-            ends.append(bounds[1])
-            strides.append(bounds[2])
-            axes.append(axis)
-        axis += 1
-    position = 0
+    axis = position = 0
     for step in steps:
         if step[0] == "new":
             insert.append(position)
-        position += step[0] != "take"
-    value = builder.value(node.inputs[0])
-    if axes:
-        operand = [builder.const(np.array(v, np.int64), "slice") for v in (starts, ends, axes, strides)]
-        value = builder.emit("Slice", [value, *operand])
-    return unsqueezed(builder, squeezed(builder, value, drop), insert)
+            position += 1
+            continue
+        length = kind.shape[axis]
+        if step[0] == "take":
+            first = step[1] % length if isinstance(length, int) else step[1]
+            cuts.append((axis, first, first + 1 if first != -1 else _LIMIT, 1, length))
+            drop.append(axis)
+        else:
+            cuts.append((axis, *_bounds(step, length), length))
+            position += 1
+        axis += 1
+    value = _cut(builder, builder.value(node.inputs[0]), cuts)
+    if not (drop or insert):
+        return value
+    result = builder.type_of(node.name).shape
+    return reshaped(builder, value, result) or unsqueezed(builder, squeezed(builder, value, drop, None), insert, None)
+
+
+#: An end that is behind the last element of any axis.
+_LIMIT = 2**31 - 1
+#: (axis, first, end, stride, length of the axis)
+_Cut = tuple[int, int, int, int, Dim]
+
+
+def _bounds(step: SliceStep, length: Dim) -> tuple[int, int, int]:
+    """(first, end, stride) of a step as ONNX takes them."""
+    _, first, last, stride = step
+    if not isinstance(length, int):
+        return (
+            first if first is not None else (0 if stride > 0 else _LIMIT),
+            last if last is not None else (_LIMIT if stride > 0 else -_LIMIT),
+            stride,
+        )
+    taken = range(*slice(first, last, stride).indices(length))
+    if not taken:
+        return 0, 0, 1  # backwards from before the start: ONNX would begin at element 0
+    return taken.start, taken.stop, stride
+
+
+def _cut(builder: OnnxBuilder, value: str, cuts: Sequence[_Cut]) -> str:
+    """One Slice for all axes that are not taken whole. An axis taken backwards is a Gather: Barracuda does not step
+    back (Slice_13), and 1.1 misreads an end that is no index (Slice_10), so none is written where a length is known.
+    """
+    partial = []
+    for axis, first, end, stride, length in cuts:
+        if stride < 0 and isinstance(length, int):
+            indices = builder.const(np.arange(first, end, stride, dtype=np.int64), "indices")
+            value = builder.emit("Gather", [value, indices], axis=axis)
+        elif (first, end, stride) != (0, length if isinstance(length, int) else _LIMIT, 1):
+            partial.append((first, end, axis, stride))
+    if not partial:
+        return value
+    starts, ends, axes, strides = zip(*partial, strict=True)
+    operands = [starts, ends, axes] if set(strides) == {1} else [starts, ends, axes, strides]
+    result: str = builder.emit("Slice", [value, *(builder.const(np.array(o, np.int64), "slice") for o in operands)])
+    return result
 
 
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
