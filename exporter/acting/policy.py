@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from exporter.acting.generator import Generator
+from exporter.acting.generator import Generator, likeliest
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -18,6 +18,8 @@ from signatures.spec import PolicySignature, TensorSpec
 Array = np.ndarray
 Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
 RUNTIMES = ("onnxruntime", "numpy")
+#: What ``decide`` may be given besides observations, and the inputs that take it.
+_TAKEN = {"masks": Role.MASKS, "memory": Role.MEMORY_IN, "previous": Role.PREV_ACTION}
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Decision:
 
     ``continuous`` is float32 [agents, size], ``discrete`` int64 [agents, branches], None where the policy has no such
     actions; ``memory`` float32 [agents, size] is what to pass in at the next step, None where it has none. ``outputs``
-    are the policy's other outputs by name.
+    are all outputs by name; an output that is the action itself is the action that was taken, not another draw.
     """
 
     continuous: Array | None = None
@@ -53,8 +55,8 @@ class LoadedPolicy:
         self._generator = Generator(seed)
         heads = 2 if signature.action_space == "hybrid" else 1
         self._heads = signature.outputs[:heads]
-        plain = [s for s in signature.outputs[heads:] if s.role is Role.DETERMINISTIC]
-        self._plain = {head.name: spec for spec, head in zip(plain, self._heads, strict=False)}
+        plain = {s.dtype == "float32": s for s in signature.outputs[heads:] if s.role is Role.DETERMINISTIC}
+        self._plain = {h.name: plain[c] for h in self._heads if (c := _is_continuous(h)) in plain}
         self._scores = next((s for s in signature.outputs if s.role is Role.LOG_PROBS), None)
 
     def seed(self, seed: int) -> None:
@@ -79,22 +81,24 @@ class LoadedPolicy:
         """Actions for the agents whose observations are given.
 
         ``observations`` is one array where the policy has one observation, else a mapping by name; each has the agents
-        as its first axis, or no such axis for a single one (answers have it all the same). ``masks`` [agents, ΣB]: 1
-        allows an action, 0 forbids it; all are allowed without it. ``memory`` is that of the last Decision, zero at the
-        start of an episode. ``previous`` are the discrete actions of the last step, for a policy that asks for them.
-        ``parameters`` are the source's own placeholders. ``deterministic`` takes the likeliest action and the mean.
-        ``seed`` starts the draws anew before this decision. Raises UsageError where something is missing or of the
-        wrong shape.
+        as its first axis, or no such axis for a single one (answers have it all the same). Images of dtype uint8 are
+        brought to the range that the policy takes; others are taken as they are. ``masks`` [agents, ΣB]: 1 allows an
+        action, 0 forbids it; all are allowed without it. ``memory`` is that of the last Decision, zero at the start of
+        an episode. ``previous`` are the discrete actions of the last step [agents, branches], for a policy that asks
+        for them. ``parameters`` are the source's own placeholders. ``deterministic`` takes the likeliest action and the
+        mean. ``seed`` starts the draws anew before this decision. Raises UsageError where something is missing, is of
+        the wrong shape or is not taken, where masks forbid all actions of a branch, and where nothing can be drawn.
         """
         if seed is not None:
             self.seed(seed)
         given = self._named(observations)
         special = {Role.MASKS: masks, Role.MEMORY_IN: memory, Role.PREV_ACTION: previous}
+        self._check_taken({"masks": masks, "memory": memory, "previous": previous})
         feeds: dict[str, Array] = {}
         rows: int | None = None
         for spec in sorted(self.signature.inputs, key=lambda s: s.role not in OBSERVATIONS):
             if spec.role in OBSERVATIONS:
-                array = self._fitting(spec, given.pop(spec.name), rows)
+                array = self._fitting(spec, self._scaled(spec, given.pop(spec.name)), rows)
                 rows = len(array)
             elif spec.role is Role.NOISE:
                 continue
@@ -107,6 +111,8 @@ class LoadedPolicy:
                 shape = tuple((rows or 1) if i == 0 else n or 1 for i, n in enumerate(spec.shape))
                 fill = 1 if spec.role is Role.MASKS else 0
                 array = np.full(shape, fill, spec.dtype) if value is None else self._fitting(spec, value, rows)
+                if spec.role is Role.MASKS and value is not None:
+                    self._check_masks(array)
             feeds[spec.name] = array
         count = rows or 1
         for spec in self.signature.noise:
@@ -128,6 +134,35 @@ class LoadedPolicy:
                 raise UsageError(f"there is no observation {name!r}", fix=f"there are {', '.join(names)}")
         return dict(observations)
 
+    def _check_taken(self, given: Mapping[str, npt.ArrayLike | None]) -> None:
+        for word, value in given.items():
+            if value is not None and not self.takes(_TAKEN[word]):
+                raise UsageError(f"the policy takes no {word}", why="it has no such input", fix=f"leave {word}= out")
+
+    def takes(self, role: Role) -> bool:
+        """Whether an input has this role."""
+        return any(s.role is role for s in self.signature.inputs)
+
+    def _check_masks(self, masks: Array) -> None:
+        start = 0
+        for branch, size in enumerate(self.signature.branches):
+            forbidden = np.flatnonzero(~(masks[:, start : start + size] > 0).any(axis=1))
+            if len(forbidden):
+                raise UsageError(
+                    f"masks forbid every action of branch {branch} to agent {forbidden[0]}",
+                    why="what the policy then does is an accident of the trainer's version",
+                    fix="allow an action of every branch",
+                )
+            start += size
+
+    def _scaled(self, spec: TensorSpec, value: npt.ArrayLike) -> npt.ArrayLike:
+        """Bytes of an image as the numbers that the policy takes; what is no image or no bytes, as it is."""
+        wanted = self.signature.preprocess.get(spec.name, {}).get("range")
+        if spec.role is not Role.VISUAL or wanted is None or getattr(value, "dtype", None) != np.uint8:
+            return value
+        low, high = wanted
+        return np.asarray(value, np.float32) * np.float32((high - low) / 255) + np.float32(low)
+
     def _fitting(self, spec: TensorSpec, value: npt.ArrayLike, rows: int | None) -> Array:
         try:
             array = np.asarray(value, spec.dtype)
@@ -137,6 +172,8 @@ class LoadedPolicy:
             ) from error
         if array.ndim == len(spec.shape) - 1:
             array = array[None]
+        if spec.role is Role.PREV_ACTION and len(spec.shape) == 1 and array.ndim == 2 and array.shape[1] == 1:
+            array = array[:, 0]  # ML-Agents 0.3 and 0.4 feed it without an axis for the one branch
         same = array.ndim == len(spec.shape) and all(
             n in (None, m) for n, m in zip(spec.shape[1:], array.shape[1:], strict=True)
         )
@@ -150,15 +187,18 @@ class LoadedPolicy:
 
     def _decision(self, outputs: dict[str, Array], deterministic: bool) -> Decision:
         continuous = discrete = None
+        taken: dict[str, Array] = {}
         for head in self._heads:
-            if head.role is Role.CONTINUOUS or (head.role is Role.DETERMINISTIC and head.dtype == "float32"):
+            if _is_continuous(head):
                 plain = self._plain.get(head.name) if deterministic else None
-                continuous = outputs[(plain or head).name]
+                taken[head.name] = continuous = outputs[(plain or head).name]
             else:
                 discrete = self._discrete(head, outputs, deterministic)
+                if head.role is Role.SAMPLED:
+                    taken[head.name] = discrete
         memory = self.signature.memory
         kept = None if memory is None or memory.output is None else outputs[memory.output]
-        return Decision(continuous, discrete, kept, outputs)
+        return Decision(continuous, discrete, kept, {**outputs, **taken})
 
     def _discrete(self, head: TensorSpec, outputs: Mapping[str, Array], deterministic: bool) -> Array:
         if head.role is Role.DETERMINISTIC:
@@ -167,17 +207,13 @@ class LoadedPolicy:
             return outputs[self._plain[head.name].name]
         if head.role is Role.PROBS:
             with np.errstate(divide="ignore"):
-                scores = np.log(outputs[head.name])
+                scores = np.log(outputs[head.name].astype(np.float64))
         elif self._scores is None:  # its sampler is all there is
             return outputs[head.name]
         else:
             scores = outputs[self._scores.name]
         branches = self.signature.branches or (scores.shape[1],)
-        parts = np.split(scores, np.cumsum(branches)[:-1], axis=1)
-        if deterministic:
-            return np.stack([np.argmax(p, axis=1) for p in parts], axis=1).astype(np.int64)
-        rows = [[self._generator.choice(p[row]) for p in parts] for row in range(len(scores))]
-        return np.array(rows, np.int64)
+        return likeliest(scores, branches) if deterministic else self._generator.choices(scores, branches)
 
 
 class Agent:
@@ -187,9 +223,17 @@ class Agent:
         self.policy, self.deterministic = policy, deterministic
         self._last: Decision | None = None
 
-    def reset(self) -> None:
-        """An episode begins."""
-        self._last = None
+    def reset(self, agents: Sequence[int] | int | None = None) -> None:
+        """An episode begins: for all, or for the agents with these numbers (their rows). Raises UsageError."""
+        last = self._last
+        if agents is None or last is None:
+            self._last = None
+            return
+        rows = np.atleast_1d(np.asarray(agents, np.int64))
+        count = next((len(a) for a in (last.continuous, last.discrete) if a is not None), 0)
+        if ((rows < 0) | (rows >= count)).any():
+            raise UsageError(f"there is no agent {agents}", fix=f"they are numbered 0 to {count - 1}")
+        self._last = replace(last, memory=_cleared(last.memory, rows), discrete=_cleared(last.discrete, rows))
 
     def decide(
         self,
@@ -197,18 +241,32 @@ class Agent:
         *,
         masks: npt.ArrayLike | None = None,
         parameters: Mapping[str, npt.ArrayLike] | None = None,
+        deterministic: bool | None = None,
     ) -> Decision:
-        """As LoadedPolicy.decide, with the memory of the last step."""
+        """As LoadedPolicy.decide, with the memory of the last step; ``deterministic`` for this step only."""
         last = self._last
         self._last = self.policy.decide(
             observations,
             masks=masks,
-            memory=None if last is None else last.memory,
-            previous=None if last is None else last.discrete,
+            memory=None if last is None or not self.policy.takes(Role.MEMORY_IN) else last.memory,
+            previous=None if last is None or not self.policy.takes(Role.PREV_ACTION) else last.discrete,
             parameters=parameters,
-            deterministic=self.deterministic,
+            deterministic=self.deterministic if deterministic is None else deterministic,
         )
         return self._last
+
+
+def _is_continuous(head: TensorSpec) -> bool:
+    return head.role is Role.CONTINUOUS or (head.role is Role.DETERMINISTIC and head.dtype == "float32")
+
+
+def _cleared(array: Array | None, rows: Array) -> Array | None:
+    """A copy with these rows zero, as an episode begins."""
+    if array is None:
+        return None
+    copy = array.copy()
+    copy[rows] = 0
+    return copy
 
 
 def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0) -> LoadedPolicy:

@@ -38,12 +38,18 @@ for (const { how = "decide", observations, options = {}, steps } of requests) {
     if (how === "agent") {
       const agent = policy.agent(options);
       const actions = [];
-      for (const step of steps) actions.push(plain(await agent.decide(step.observations, step.options)));
+      for (const step of steps) {
+        if (step.reset) agent.reset(step.reset);
+        actions.push(plain(await agent.decide(step.observations, step.options)));
+      }
       answers.push(actions);
     } else if (how === "generator") {
       const g = new Generator(options.seed);
       answers.push([...Array.from({ length: 5 }, () => g.uniform()), ...Array.from({ length: 5 }, () => g.normal())]);
     } else {
+      for (const [name, value] of Object.entries(observations)) {
+        if (value?.bytes) observations[name] = Uint8Array.from(value.bytes);
+      }
       answers.push(plain(await policy.decide(observations, options)));
     }
   } catch (error) {

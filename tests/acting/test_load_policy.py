@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from exporter import load_policy
+from exporter import export_model, load_policy
 from exporter.acting.policy import LoadedPolicy
 from exporter.verify.statistics import FALSE_ALARM, fit
 from fixtures import path as fixture
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
+from signatures.spec import PolicySignature, TensorSpec
 from tests.acting.bundles import Bundles
 
 NAMES = ("continuous", "discrete", "sampled", "recurrent", "visual")
@@ -169,3 +171,135 @@ def test_what_cannot_be_run_here_is_said(bundles: Bundles, tmp_path: Path, monke
         load_policy(folder, runtime="numpy")
     with pytest.raises(BundleError, match="nothing that can be run here"):
         load_policy(folder)
+
+
+def stub(inputs: list[TensorSpec], outputs: list[TensorSpec], answers: dict[str, np.ndarray], **more: object) -> Stub:
+    """A policy of this interface that answers what it is told, and keeps what it was fed."""
+    fed: list[dict[str, np.ndarray]] = []
+
+    def run(feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        fed.append(dict(feeds))
+        return answers
+
+    signature = PolicySignature(tuple(inputs), tuple(outputs), "test", **more)  # type: ignore[arg-type]
+    return Stub(LoadedPolicy("stub", signature, run, "numpy"), fed)
+
+
+@dataclass
+class Stub:
+    policy: LoadedPolicy
+    fed: list[dict[str, np.ndarray]]
+
+
+STATE = TensorSpec("state", Role.VECTOR, "float32", (None, 2))
+
+
+def test_the_second_step_of_old_discrete_policies_feeds_the_previous_action() -> None:
+    """ML-Agents 0.3 and 0.4 take prev_action as [agents], not [agents, branches]."""
+    inputs = [STATE, TensorSpec("prev_action", Role.PREV_ACTION, "int32", (None,))]
+    outputs = [TensorSpec("action", Role.SAMPLED, "int64", (None, 1))]
+    made = stub(inputs, outputs, {"action": np.array([[1], [2]])}, action_space="discrete", branches=(3,))
+    agent = made.policy.agent()
+    for _ in range(2):
+        agent.decide(np.zeros((2, 2)))
+    np.testing.assert_array_equal(made.fed[0]["prev_action"], [0, 0])
+    np.testing.assert_array_equal(made.fed[1]["prev_action"], [1, 2])
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize("case", ["0.3.0-ppo-discrete-recurrent", "ua0.4.0-ppo-discrete-recurrent"])
+def test_genuine_recurrent_policies_of_0_3_act_on(case: str, tmp_path: Path) -> None:
+    (source,) = genuine(case)
+    (result,) = export_model(source, tmp_path, to="bytes,onnx", verify="none")
+    policy = load_policy(result.folder)
+    agent = policy.agent()
+    for step in range(3):
+        decision = agent.decide(observed(policy, rows=2, seed=step))
+    assert decision.memory is not None
+    assert decision.memory.any()
+
+
+def genuine(case: str) -> list[Path]:
+    folder = Path(__file__).resolve().parents[3] / "shared" / "genuine" / case
+    if not folder.is_dir():
+        pytest.skip("../shared is not here: graphs of the original trainers")
+    return sorted(folder.glob("*.bytes")) or sorted(folder.glob("frozen*.pb"))
+
+
+@pytest.mark.parametrize(("range_", "expected"), [([0, 1], 1.0), ([0, 255], 255.0)])
+def test_bytes_of_an_image_are_brought_to_the_range_that_the_policy_takes(range_: list[int], expected: float) -> None:
+    camera = TensorSpec("observation_0", Role.VISUAL, "float32", (None, 1, 1, 3))
+    outputs = [TensorSpec("action", Role.CONTINUOUS, "float32", (None, 1))]
+    answers = {"action": np.zeros((1, 1), np.float32)}
+    how = {"observation_0": {"layout": "NHWC", "range": range_}}
+    made = stub([camera], outputs, answers, action_space="continuous", preprocess=how)
+    made.policy.decide(np.full((1, 1, 1, 3), 255, np.uint8))
+    made.policy.decide(np.full((1, 1, 1, 3), 0.5, np.float32))
+    np.testing.assert_allclose(made.fed[0]["observation_0"], expected)
+    np.testing.assert_allclose(made.fed[1]["observation_0"], 0.5)
+
+
+def test_outputs_hold_the_action_that_was_taken(bundles: Bundles) -> None:
+    """A graph that draws has drawn another one: it must not be shown as what the agent does."""
+    policy = load_policy(bundles("sampled"), seed=11)
+    decision = policy.decide(observed(policy, rows=64))
+    np.testing.assert_array_equal(decision.outputs["action"], decision.discrete)
+    continuous = load_policy(bundles("continuous"))
+    decision = continuous.decide(observed(continuous), deterministic=True)
+    np.testing.assert_array_equal(decision.outputs["action"], decision.continuous)
+
+
+@pytest.mark.parametrize("missing", ["deterministic_continuous_actions", "deterministic_discrete_actions"])
+def test_a_hybrid_with_one_companion_missing_pairs_the_other_rightly(missing: str) -> None:
+    outputs = [
+        TensorSpec("continuous_actions", Role.CONTINUOUS, "float32", (None, 1)),
+        TensorSpec("discrete_actions", Role.SAMPLED, "int64", (None, 1)),
+        TensorSpec("deterministic_continuous_actions", Role.DETERMINISTIC, "float32", (None, 1)),
+        TensorSpec("deterministic_discrete_actions", Role.DETERMINISTIC, "int64", (None, 1)),
+    ]
+    values = {s.name: np.full((1, 1), i, s.dtype) for i, s in enumerate(outputs)}
+    kept = [s for s in outputs if s.name != missing]
+    made = stub([STATE], kept, values, action_space="hybrid", branches=(4,))
+    decision = made.policy.decide(np.zeros((1, 2)), deterministic=True)
+    assert decision.continuous is not None
+    assert decision.discrete is not None
+    assert decision.continuous.dtype == np.float32
+    assert decision.continuous.item() == (0 if "continuous" in missing else 2)
+    assert decision.discrete.item() == (1 if "discrete" in missing else 3)
+
+
+def test_masks_that_forbid_everything_and_arguments_for_nothing_are_refused(bundles: Bundles) -> None:
+    policy = load_policy(bundles("discrete"))
+    masks = np.ones((2, sum(policy.signature.branches)))
+    masks[1, : policy.signature.branches[0]] = 0
+    with pytest.raises(UsageError, match="every action of branch 0 to agent 1"):
+        policy.decide(observed(policy, rows=2), masks=masks)
+    plain = load_policy(bundles("continuous"))
+    for word in ("masks", "memory", "previous"):
+        with pytest.raises(UsageError, match=f"takes no {word}"):
+            plain.decide(np.zeros(8), **{word: np.ones((1, 2))})
+
+
+def test_one_of_several_agents_begins_anew(bundles: Bundles) -> None:
+    policy = load_policy(bundles("recurrent"))
+    agent = policy.agent(deterministic=True)
+    before = agent.decide(observed(policy, rows=3))
+    agent.reset([1])
+    after = agent.decide(observed(policy, rows=3, seed=1))
+    assert before.memory is not None
+    assert before.discrete is not None
+    memory, previous = before.memory.copy(), before.discrete.copy()
+    memory[1], previous[1] = 0, 0
+    expected = policy.decide(observed(policy, rows=3, seed=1), memory=memory, previous=previous, deterministic=True)
+    np.testing.assert_array_equal(after.memory, expected.memory)
+    assert before.memory[1].any()  # a decision that was given away is not changed
+    with pytest.raises(UsageError, match="no agent 3"):
+        agent.reset(3)
+
+
+def test_a_single_step_may_be_without_chance(bundles: Bundles) -> None:
+    policy = load_policy(bundles("continuous"), seed=2)
+    agent = policy.agent()
+    best = policy.decide(np.zeros(8), deterministic=True)
+    np.testing.assert_array_equal(agent.decide(np.zeros(8), deterministic=True).action, best.action)
+    assert not np.array_equal(agent.decide(np.zeros(8)).action, best.action)

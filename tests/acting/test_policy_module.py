@@ -15,6 +15,7 @@ from converters.runtimes.registry import available_runtimes
 from exporter import load_policy
 from exporter.acting.generator import Generator
 from exporter.acting.policy import Decision, LoadedPolicy
+from signatures.roles import Role
 from tests.acting.bundles import Bundles
 from tests.acting.test_load_policy import NAMES, observed
 
@@ -88,9 +89,42 @@ def test_an_agent_threads_its_memory(kind: str, bundles: Bundles) -> None:
 def test_the_generator_draws_the_same(seed: int, bundles: Bundles) -> None:
     (answer,) = drive(bundles("continuous"), "tfjs", [{"how": "generator", "options": {"seed": seed}}])
     generator = Generator(seed)
-    uniform, normal = [generator.uniform() for _ in range(5)], [generator.normal() for _ in range(5)]
-    assert answer[:5] == uniform
-    np.testing.assert_allclose(answer[5:], normal, rtol=1e-14)
+    np.testing.assert_array_equal(answer[:5], generator.uniform((5,)))
+    np.testing.assert_allclose(answer[5:], generator.normals((5,)), rtol=1e-7)
+
+
+def test_one_of_several_agents_begins_anew(bundles: Bundles) -> None:
+    folder = bundles("recurrent")
+    policy = load_policy(folder)
+    episodes = [observed(policy, rows=3, seed=step) for step in range(3)]
+    steps = [{"observations": listed(o), "reset": [1] if i == 2 else None} for i, o in enumerate(episodes)]
+    (answers,) = drive(folder, "tfjs", [{"how": "agent", "options": {"deterministic": True}, "steps": steps}])
+    agent = policy.agent(deterministic=True)
+    for index, (observations, answer) in enumerate(zip(episodes, answers, strict=True)):
+        if index == 2:
+            agent.reset([1])
+        agrees(answer, agent.decide(observations))
+
+
+def test_bytes_of_an_image_are_scaled(bundles: Bundles) -> None:
+    policy = load_policy(bundles("visual"))
+    observations: dict[str, Any] = observed(policy, rows=1)
+    name = next(s.name for s in policy.signature.observations if s.role is Role.VISUAL)
+    observations[name] = np.random.default_rng(4).integers(0, 256, observations[name].shape, np.uint8)
+    given = {**listed(observations), name: {"bytes": observations[name].ravel().tolist()}}
+    (answer,) = drive(bundles("visual"), "tfjs", [{"observations": given, "options": {"deterministic": True}}])
+    agrees(answer, policy.decide(observations, deterministic=True))
+
+
+def test_masks_that_forbid_everything_and_masks_for_nothing(bundles: Bundles) -> None:
+    policy = load_policy(bundles("discrete"))
+    masks = np.ones((1, sum(policy.signature.branches)))
+    masks[0, : policy.signature.branches[0]] = 0
+    request = {"observations": listed(observed(policy, rows=1)), "options": {"masks": masks.tolist()}}
+    (answer,) = drive(bundles("discrete"), "tfjs", [request])
+    assert "forbid every action of branch 0 to agent 0" in answer["error"]
+    (answer,) = drive(bundles("continuous"), "tfjs", [{"observations": [0.0] * 8, "options": {"masks": [1, 1]}}])
+    assert "takes no masks" in answer["error"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,10 +1,10 @@
 /** Types of policy.mjs. */
 
 /** Numbers for one input: nested arrays, a flat typed array in C order, or data with a shape. */
-export type Numbers = number | readonly Numbers[] | Float32Array | Int32Array | Uint8Array | Tensor;
+export type Numbers = number | readonly Numbers[] | Float32Array | Int32Array | Uint8Array | Uint8ClampedArray | Tensor;
 
 export interface Tensor {
-  readonly data: Float32Array | Int32Array | Uint8Array;
+  readonly data: Float32Array | Int32Array | Uint8Array | Uint8ClampedArray;
   readonly shape: readonly number[];
 }
 
@@ -23,6 +23,8 @@ export interface Contract {
   readonly inputs: readonly TensorSpec[];
   readonly outputs: readonly TensorSpec[];
   readonly branches: readonly number[];
+  /** Of images: their layout, and the range that bytes are brought to. */
+  readonly preprocess?: Readonly<Record<string, { readonly layout: string; readonly range: readonly [number, number] }>>;
   /** Names for people, where the export was given some (`--labels`). */
   readonly labels?: {
     readonly observations?: Readonly<Record<string, readonly string[]>>;
@@ -33,7 +35,7 @@ export interface Contract {
 }
 
 export interface DecideOptions {
-  /** [agents, ΣB]: 1 allows an action, 0 forbids it; all are allowed without it. */
+  /** [agents, ΣB]: 1 allows an action, 0 forbids it; all are allowed without it. Each branch needs one. */
   masks?: Numbers;
   /** The memory of the last decision; zero, as at the start of an episode, without it. */
   memory?: Numbers | null;
@@ -54,7 +56,7 @@ export interface Decision {
   discrete: number[][] | null;
   /** To be passed in at the next step; null where the policy has no memory. */
   memory: Tensor | null;
-  /** All outputs by name. */
+  /** All outputs by name; one that is the action itself is the action that was taken, not another draw. */
   outputs: Record<string, Tensor>;
 }
 
@@ -77,6 +79,8 @@ export declare class Policy {
   /** Actions for the agents whose observations are given; an Error says what is missing or of the wrong size. */
   decide(observations: Observations, options?: DecideOptions): Promise<Decision>;
   agent(options?: { deterministic?: boolean }): Agent;
+  /** Whether an input has this role ("masks", "memory_in", "prev_action" …). */
+  takes(role: string): boolean;
   seed(seed: number): void;
   dispose(): void;
 }
@@ -84,8 +88,12 @@ export declare class Policy {
 export declare class Agent {
   readonly policy: Policy;
   readonly deterministic: boolean;
-  reset(): void;
-  decide(observations: Observations, options?: Pick<DecideOptions, "masks" | "parameters">): Promise<Decision>;
+  /** An episode begins: for all, or for the agents with these numbers. */
+  reset(agents?: number | readonly number[]): void;
+  decide(
+    observations: Observations,
+    options?: Pick<DecideOptions, "masks" | "parameters" | "deterministic">,
+  ): Promise<Decision>;
 }
 
 /** `source`: the URL of model.json or a loader with `load()` (TensorFlow.js); the URL or bytes of the .onnx. */

@@ -19,38 +19,30 @@ const MAX_SEED = Number.MAX_SAFE_INTEGER;
 
 const NOTHING_LEFT = "a branch whose actions are all forbidden by its masks, or an observation that is NaN";
 
+/** What `decide` may be given besides observations, by the role of the input that takes it. */
+const TAKEN = { masks: "masks", memory_in: "memory", prev_action: "previous" };
+
 const OBSERVATIONS = new Set(["vector_observation", "visual_observation", "variable_length_observation"]);
 
-/** sfc32 (PractRand's Small Fast Counting generator); the same as exporter/acting/generator.py. */
+/** Philox-2x32 with ten rounds (Salmon et al., SC11); the same draws as exporter/acting/generator.py makes. */
 export class Generator {
-  #a;
-  #b;
-  #c;
-  #counter = 1;
+  #key;
+  #upper;
+  #drawn = 0;
 
   constructor(seed) {
     if (!Number.isSafeInteger(seed) || seed < 0) {
       throw new RangeError(`the seed is ${seed}; give a whole number from 0 to ${MAX_SEED}`);
     }
-    const low = mixed(seed >>> 0);
-    const high = mixed((Math.floor(seed / 2 ** 32) ^ 0x9e3779b9) >>> 0);
-    [this.#a, this.#b, this.#c] = [low, high, (low ^ high) >>> 0];
-    for (let i = 0; i < 12; i++) this.#word();
-  }
-
-  #word() {
-    const result = (this.#a + this.#b + this.#counter) >>> 0;
-    this.#counter = (this.#counter + 1) >>> 0;
-    this.#a = (this.#b ^ (this.#b >>> 9)) >>> 0;
-    this.#b = (this.#c + (this.#c << 3)) >>> 0;
-    this.#c = (((this.#c << 21) | (this.#c >>> 11)) + result) >>> 0;
-    return result;
+    this.#key = seed >>> 0;
+    this.#upper = Math.floor(seed / 2 ** 32);
   }
 
   /** In [0, 1), with all 53 bits. */
   uniform() {
-    const high = this.#word() >>> 5;
-    return (high * 67108864 + (this.#word() >>> 6)) / 9007199254740992;
+    const number = this.#drawn++;
+    const [high, low] = philox(number >>> 0, ((Math.floor(number / 2 ** 32) << 21) | this.#upper) >>> 0, this.#key);
+    return ((high >>> 5) * 67108864 + (low >>> 6)) / 9007199254740992;
   }
 
   /** N(0, 1), by Box and Muller. */
@@ -63,7 +55,7 @@ export class Generator {
   choice(logProbs) {
     const best = Math.max(...logProbs);
     if (!(best > -Infinity)) throw new Error(`nothing can be drawn from the log-probabilities ${logProbs}: ${NOTHING_LEFT}`);
-    const weights = Array.from(logProbs, (v) => (v > -Infinity ? Math.exp(v - best) : 0));
+    const weights = Array.from(logProbs, (v) => Math.exp(v - best));
     let left = this.uniform() * weights.reduce((sum, w) => sum + w, 0);
     for (const [index, weight] of weights.entries()) {
       left -= weight;
@@ -73,10 +65,21 @@ export class Generator {
   }
 }
 
-function mixed(word) {
-  word = Math.imul(word ^ (word >>> 16), 0x21f0aaad);
-  word = Math.imul(word ^ (word >>> 15), 0x735a2d97);
-  return (word ^ (word >>> 15)) >>> 0;
+/** Two words of 32 bits for a counter of two. */
+function philox(first, second, key) {
+  for (let turn = 0; turn < 10; turn++) {
+    const word = (key + Math.imul(turn, 0x9e3779b9)) >>> 0;
+    [first, second] = [(upperHalf(first, 0xd256d193) ^ word ^ second) >>> 0, Math.imul(first, 0xd256d193) >>> 0];
+  }
+  return [first, second];
+}
+
+/** The upper 32 bits of a product of 64, in parts that a number holds exactly. */
+function upperHalf(a, b) {
+  const [aHigh, aLow, bHigh, bLow] = [a >>> 16, a & 0xffff, b >>> 16, b & 0xffff];
+  const middle = aHigh * bLow + Math.floor((aLow * bLow) / 65536);
+  const rest = aLow * bHigh + (middle % 65536);
+  return aHigh * bHigh + Math.floor(middle / 65536) + Math.floor(rest / 65536);
 }
 
 // ---- loading --------------------------------------------------------------------------------------------------------
@@ -163,7 +166,8 @@ export class Policy {
     const count = contract.action_space === "hybrid" ? 2 : 1;
     this.#heads = contract.outputs.slice(0, count);
     const plain = contract.outputs.slice(count).filter(({ role }) => role === "deterministic");
-    this.#plain = new Map(plain.slice(0, count).map((spec, i) => [this.#heads[i].name, spec]));
+    const companion = (head) => plain.find(({ dtype }) => (dtype === "float32") === isContinuous(head));
+    this.#plain = new Map(this.#heads.map((head) => [head.name, companion(head)]).filter(([, spec]) => spec));
     this.#scores = contract.outputs.find(({ role }) => role === "log_probs");
   }
 
@@ -179,6 +183,11 @@ export class Policy {
   /** Start the draws anew. */
   seed(seed) {
     this.#generator = new Generator(seed);
+  }
+
+  /** Whether an input has this role. */
+  takes(role) {
+    return this.contract.inputs.some((spec) => spec.role === role);
   }
 
   /** A group of agents whose memory and previous actions are kept for them. */
@@ -197,12 +206,15 @@ export class Policy {
     if (seed !== undefined) this.seed(seed);
     const given = this.#named(observations);
     const special = { masks, memory_in: memory, prev_action: previous };
+    for (const [role, value] of Object.entries(special)) {
+      if (value != null && !this.takes(role)) throw new Error(`the policy takes no ${TAKEN[role]}: it has no such input`);
+    }
     const feeds = {};
     let rows;
     const inputs = [...this.observations, ...this.contract.inputs.filter(({ role }) => !OBSERVATIONS.has(role))];
     for (const spec of inputs) {
       if (OBSERVATIONS.has(spec.role)) {
-        feeds[spec.name] = fitting(spec, given[spec.name], rows);
+        feeds[spec.name] = fitting(spec, this.#scaled(spec, given[spec.name]), rows);
         rows ??= feeds[spec.name].shape[0];
       } else if (spec.role === "noise") {
         const shape = spec.shape.map((n) => n ?? rows ?? 1);
@@ -219,6 +231,7 @@ export class Policy {
         feeds[spec.name] = { data, shape, dtype: spec.dtype };
       } else {
         feeds[spec.name] = fitting(spec, special[spec.role], rows);
+        if (spec.role === "masks") this.#checkMasks(feeds[spec.name]);
       }
     }
     const outputs = await this.#run(feeds, this.contract.outputs.map(({ name }) => name));
@@ -241,19 +254,44 @@ export class Policy {
     return observations;
   }
 
+  /** Bytes of an image as the numbers that the policy takes; what is no image or no bytes, as it is. */
+  #scaled({ name, role }, value) {
+    const data = value?.data ?? value;
+    const range = this.contract.preprocess?.[name]?.range;
+    const bytes = data instanceof Uint8Array || data instanceof Uint8ClampedArray;
+    if (role !== "visual_observation" || range === undefined || !bytes) return value;
+    const scaled = Float32Array.from(data, (v) => v * Math.fround((range[1] - range[0]) / 255) + range[0]);
+    return value.data === undefined ? scaled : { data: scaled, shape: value.shape };
+  }
+
+  #checkMasks({ data, shape: [rows, width] }) {
+    for (let agent = 0; agent < rows; agent++) {
+      let start = agent * width;
+      for (const [branch, count] of this.contract.branches.entries()) {
+        if (!data.slice(start, (start += count)).some((allowed) => allowed > 0)) {
+          throw new Error(`masks forbid every action of branch ${branch} to agent ${agent}: allow one`);
+        }
+      }
+    }
+  }
+
   #decision(outputs, deterministic) {
     let continuous = null;
     let discrete = null;
+    const taken = {};
     for (const head of this.#heads) {
-      if (head.role === "continuous" || (head.role === "deterministic" && head.dtype === "float32")) {
+      if (isContinuous(head)) {
         const plain = deterministic ? this.#plain.get(head.name) : undefined;
-        continuous = rowsOf(outputs[(plain ?? head).name]);
+        taken[head.name] = outputs[(plain ?? head).name];
+        continuous = rowsOf(taken[head.name]);
       } else {
         discrete = this.#discrete(head, outputs, deterministic);
+        const shape = [discrete.length, discrete[0]?.length ?? 0];
+        if (head.role === "sampled") taken[head.name] = { data: Int32Array.from(discrete.flat()), shape };
       }
     }
     const kept = this.contract.memory?.output;
-    return { continuous, discrete, memory: kept == null ? null : outputs[kept], outputs };
+    return { continuous, discrete, memory: kept == null ? null : outputs[kept], outputs: { ...outputs, ...taken } };
   }
 
   #discrete(head, outputs, deterministic) {
@@ -286,19 +324,34 @@ export class Agent {
     this.deterministic = deterministic;
   }
 
-  /** An episode begins. */
-  reset() {
-    this.#last = null;
+  /** An episode begins: for all, or for the agents with these numbers. */
+  reset(agents) {
+    const last = this.#last;
+    if (agents === undefined || last === null) {
+      this.#last = null;
+      return;
+    }
+    const [memory, discrete] = [last.memory, last.discrete?.map((row) => [...row]) ?? null];
+    const count = (last.continuous ?? last.discrete).length;
+    const data = memory && memory.data.slice();
+    for (const agent of [agents].flat()) {
+      if (!Number.isInteger(agent) || agent < 0 || agent >= count) {
+        throw new RangeError(`there is no agent ${agent}; they are numbered 0 to ${count - 1}`);
+      }
+      data?.fill(0, agent * memory.shape[1], (agent + 1) * memory.shape[1]);
+      discrete?.[agent].fill(0);
+    }
+    this.#last = { ...last, discrete, memory: memory && { data, shape: memory.shape } };
   }
 
-  async decide(observations, { masks, parameters } = {}) {
+  async decide(observations, { masks, parameters, deterministic = this.deterministic } = {}) {
     const last = this.#last;
     this.#last = await this.policy.decide(observations, {
       masks,
       parameters,
-      memory: last?.memory,
-      previous: last?.discrete,
-      deterministic: this.deterministic,
+      memory: this.policy.takes("memory_in") ? last?.memory : undefined,
+      previous: this.policy.takes("prev_action") ? last?.discrete : undefined,
+      deterministic,
     });
     return this.#last;
   }
@@ -306,6 +359,7 @@ export class Agent {
 
 // ---- arrays ---------------------------------------------------------------------------------------------------------
 
+const isContinuous = ({ role, dtype }) => role === "continuous" || (role === "deterministic" && dtype === "float32");
 const size = (shape) => shape.reduce((product, n) => product * n, 1);
 const isArray = (value) => Array.isArray(value) || ArrayBuffer.isView(value) || value?.data !== undefined;
 
