@@ -2,22 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from converters import schema
+from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph
 from converters.understand.facts import SourceFacts
+from signatures.spec import SourceMap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OriginalRun:
-    """How the source itself is run, for comparison: a runtime, and what its child process is told to load."""
+    """How the source itself is run, for comparison: a runtime, and what its child process is told to load.
+
+    ``definition`` is the GraphDef that TensorFlow runs, as the file has it, variables apart, which are constants. It
+    is None where the child reads the file itself, within the reader's own rules (ONNX).
+    """
 
     runtime: str
     path: Path
     options: Mapping[str, Any] = field(default_factory=dict)
+    definition: Any = field(default=None, repr=False, compare=False)
+
+    def narrowed(self, source_map: SourceMap) -> OriginalRun:
+        """The same with no more of the definition than a policy asks for.
+
+        Raises UnsupportedOpError where an op that does more than compute hangs on it, GraphError where it is not whole.
+        """
+        if self.definition is None:
+            return self
+        return replace(self, definition=subgraph(self.definition, source_map.fetched(), source_map.fed()))
+
+    @contextmanager
+    def loadable(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """The path and the options that the child is told; what was written for it is gone afterwards."""
+        if self.definition is None:
+            yield str(self.path), self.options
+            return
+        with tempfile.TemporaryDirectory(prefix="export-model-") as folder:
+            file = Path(folder, "source.pb")
+            file.write_bytes(schema.serialise(self.definition))
+            yield str(file), {"kind": "graph"}
 
 
 @dataclass(frozen=True)

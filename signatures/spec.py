@@ -195,6 +195,15 @@ class SourceMap:
     rows: int | None = None
     parts: Mapping[str, tuple[SourcePart, ...]] = field(default_factory=dict)
 
+    def fetched(self) -> list[str]:
+        """Every tensor of the source that it may be asked for."""
+        parts = [p.tensor for given in self.parts.values() for p in given]
+        return list(dict.fromkeys([*self.fetches.values(), *parts, *(b for b in self.branches if b is not None)]))
+
+    def fed(self) -> list[str]:
+        """Every tensor of the source that may be fed."""
+        return list(dict.fromkeys([*self.feeds.values(), *self.fixed, *self.batch_sizes, *self.noise]))
+
     def to_dict(self) -> dict[str, Any]:
         """What policy.json keeps of it: feeds and fetches are the ``source`` of its inputs and outputs."""
         return {

@@ -6,8 +6,8 @@ slots of an optimizer make up most of a checkpoint, and nothing that a policy co
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -46,7 +46,15 @@ def is_effect(node: Node) -> bool:
     return node.op.startswith(_EFFECTS)
 
 
-def freeze(training: TrainingGraph, checkpoint: Values | None, roots: Sequence[str] | None = None) -> Graph:
+@dataclass(frozen=True)
+class Frozen:
+    """A graph with its variables' values, and these by the variables' nodes."""
+
+    graph: Graph
+    values: Mapping[str, np.ndarray]
+
+
+def freeze(training: TrainingGraph, checkpoint: Values | None, roots: Sequence[str] | None = None) -> Frozen:
     """The graph with its variables' values.
 
     Raises NotAPolicyError or DamagedFileError when a variable that the policy needs has no value, or one that does not
@@ -70,7 +78,7 @@ def freeze(training: TrainingGraph, checkpoint: Values | None, roots: Sequence[s
         if names:
             keys = [missing[n] for n in names]
             raise _without_values(keys) if checkpoint is None else checkpoint.missing(keys)
-    return frozen
+    return Frozen(frozen, values)
 
 
 def _roots(graph: Graph) -> list[str]:

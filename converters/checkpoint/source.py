@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from converters.checkpoint import listing
+from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.policy_nodes import policy_nodes
 from converters.checkpoint.table import MAGIC
@@ -63,17 +64,19 @@ def read_checkpoint(
             fix=f"put the run's raw_graph_def.pb, or {prefix.name}.meta, beside it",
         )
     try:
-        frozen, found = policy_nodes(freeze(read_training_graph(path), checkpoint))
+        training = read_training_graph(path)
+        frozen = freeze(training, checkpoint)
+        policy, found = policy_nodes(frozen.graph)
     except ExportModelError as error:
         if error.where is None:
             raise error.at(path.name) from error.__cause__
         raise
     return SourceModel(
-        frozen,
+        policy,
         (path, *checkpoint.files),
         SourceFacts(notes=(*found, *notes)),
         name,
-        OriginalRun("tensorflow", path, {"kind": "checkpoint", "prefix": str(prefix)}),
+        OriginalRun("tensorflow", path, definition=with_values(training.definition, frozen.values)),
     )
 
 
@@ -138,6 +141,7 @@ def _prefix(path: Path) -> Path | None:
 
 def _graph_alone(path: Path, name: str) -> SourceModel:
     """A graph that has variables, but not where the policy needs any."""
-    frozen, notes = policy_nodes(freeze(read_training_graph(path), None))
-    original = OriginalRun("tensorflow", path, {"kind": "graph"})
-    return SourceModel(frozen, (path,), SourceFacts(notes=notes), name, original)
+    training = read_training_graph(path)
+    graph, notes = policy_nodes(freeze(training, None).graph)
+    original = OriginalRun("tensorflow", path, definition=training.definition)
+    return SourceModel(graph, (path,), SourceFacts(notes=notes), name, original)

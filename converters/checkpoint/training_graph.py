@@ -41,6 +41,8 @@ class TrainingGraph:
 
     graph: Graph
     saved: Mapping[str, Saved] = field(default_factory=dict)
+    #: the GraphDef as it was read; None where there is none (a live session)
+    definition: Any = field(default=None, repr=False, compare=False)
 
 
 def read_training_graph(path: Path) -> TrainingGraph:
@@ -63,7 +65,7 @@ def training_graph(graph_def: Any) -> TrainingGraph:
     rest = SimpleNamespace(
         node=_without_initial_values(graph_def), library=graph_def.library, versions=graph_def.versions
     )
-    return TrainingGraph(from_graph_def(rest), saved)
+    return TrainingGraph(from_graph_def(rest), saved, graph_def)
 
 
 def _inputs(proto: Any) -> list[str]:

@@ -63,7 +63,7 @@ def read_session(tensorflow: Any, session: Any, folder: Path) -> SourceModel:
     values = _values(tensorflow, session, wanted_variables(graph))
     # By the nodes' own names: what a saver in the graph calls them does not matter here.
     places = {n.name: Saved(n.name) for n in graph.nodes if n.op in VARIABLES}
-    frozen, notes = policy_nodes(freeze(TrainingGraph(graph, places), SessionValues(values)))
+    frozen, notes = policy_nodes(freeze(TrainingGraph(graph, places), SessionValues(values)).graph)
     (folder / _GRAPH).write_bytes(data)
     np.savez(folder / _VALUES, *values.values())
     options = {"kind": "values", "archive": str(folder / _VALUES), "names": list(values)}

@@ -11,12 +11,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.renaming import renamed
+from converters.schema import dtype_number
 from converters.understand.inputs import role_by_name
 from signatures.errors import DamagedFileError
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
@@ -97,6 +99,20 @@ def _with_placeholders(graph: Graph, signature: ModelSignature) -> Graph:
             )
         nodes.append(node)
     return Graph(tuple(nodes))
+
+
+def fed_by_signature(graph_def: Any, signature: ModelSignature) -> Any:
+    """The same of a GraphDef message, in place: what parses examples, say, is left out before anything is run."""
+    given = {node_of(t.name): t for t in signature.inputs.values() if split_ref(t.name)[1] == 0}
+    for node in graph_def.node:
+        tensor = given.get(node.name)
+        if tensor is None or node.op in ("Placeholder", "PlaceholderWithDefault") or tensor.dtype is None:
+            continue
+        node.op = "Placeholder"
+        del node.input[:]
+        node.attr.clear()
+        node.attr["dtype"].type = dtype_number(tensor.dtype)
+    return graph_def
 
 
 def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:

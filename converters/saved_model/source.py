@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from converters.bundle.source import facts_of, recalled
+from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import training_graph
 from converters.frozen_graph.reader import read_graph
 from converters.saved_model.functions import frozen_by_tensorflow
 from converters.saved_model.reader import Saved, read_saved_model
-from converters.saved_model.signature import expose
+from converters.saved_model.signature import expose, fed_by_signature
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 
@@ -30,13 +31,14 @@ def read(path: Path, options: ReadOptions) -> list[SourceModel]:
     checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
     training = training_graph(saved.graph_def)
     frozen = freeze(training, checkpoint, saved.signature.roots or None)
-    graph, contract = recalled(frozen)
+    graph, contract = recalled(frozen.graph)
     facts = facts_of(graph, contract)
     if contract is None:
-        graph, roles = expose(frozen, saved.signature)
+        graph, roles = expose(frozen.graph, saved.signature)
         facts = SourceFacts(roles=roles, notes=_notes(saved))
     files = (file, *(() if checkpoint is None else checkpoint.files))
-    original = OriginalRun("tensorflow", folder, {"kind": "variables", "tags": list(saved.tags)})
+    definition = fed_by_signature(with_values(training.definition, frozen.values), saved.signature)
+    original = OriginalRun("tensorflow", folder, definition=definition)
     return [SourceModel(graph, files, facts, None if contract is None else contract.name, original)]
 
 

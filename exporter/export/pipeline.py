@@ -29,6 +29,7 @@ from exporter.verify.report import ParityReport
 from exporter.verify.subject import Subject, VerifyOptions
 from exporter.verify.verification import verify
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
+from signatures.spec import SourceMap
 
 Progress = Callable[[str], None]
 
@@ -207,9 +208,9 @@ def verify_folder(
             where=str(folder),
             fix="export the policy again with bytes among --to",
         )
-    original = None if source is None else _original_of(source, content, step)
-    embedding = _checked_graph(folder, graph_file, content)
     signature, source_map = bundle.signature_of(content)
+    original = None if source is None else _original_of(source, content, step, source_map)
+    embedding = _checked_graph(folder, graph_file, content)
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
     graph = _whole_graph(embedding, names, artefacts)
     policy = Policy(
@@ -289,7 +290,9 @@ def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
     return sizes
 
 
-def _original_of(source: Path, content: Mapping[str, Any], step: int | None) -> OriginalRun | None:
+def _original_of(
+    source: Path, content: Mapping[str, Any], step: int | None, source_map: SourceMap
+) -> OriginalRun | None:
     """How to run the source of a bundle; raises BundleError where ``source`` is another file.
 
     A run's folder is read at ``step``, by default at the one that the export asked for.
@@ -306,4 +309,6 @@ def _original_of(source: Path, content: Mapping[str, Any], step: int | None) -> 
             fix="give the file it was exported from (a checkpoint of a run's folder: its --step), or export it again",
         )
     named = [m for m in found.models if m.name == content["source"].get("model")]
-    return (named or list(found.models))[0].original
+    original = (named or list(found.models))[0].original
+    with naming(source):
+        return None if original is None else original.narrowed(source_map)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from converters.graph.compile import compile_graph
@@ -71,11 +71,19 @@ class Source:
         for model in self.models:
             with naming(self.path):
                 policies = compile_graph(model.graph, self.stem(model), options, model.facts)
-            yield from ((model, policy) for policy in policies)
+                found = [(narrowed(model, policy), policy) for policy in policies]
+            yield from found
 
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
         """All policies in it."""
         return [policy for _, policy in self.compiled(options)]
+
+
+def narrowed(model: SourceModel, policy: Policy) -> SourceModel:
+    """The model with no more of its original than a policy asks for. Raises UnsupportedOpError, GraphError."""
+    if model.original is None:
+        return model
+    return replace(model, original=model.original.narrowed(policy.source))
 
 
 @contextmanager

@@ -21,11 +21,13 @@ import numpy as np
 
 from converters import schema
 from converters.frozen_graph.reader import read_graph
+from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph, normal_ref, ref, split_ref
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View, loads
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.saved_model.reader import read_saved_model
+from converters.source import OriginalRun
 from exporter.verify.participants import Entrant, Feeds, Run
 
 
@@ -84,7 +86,10 @@ def _saved_model(folder: Path, key: str, pool: RuntimePool) -> Iterator[Inside]:
     message = schema.parse(schema.SavedModel, (folder / "saved_model.pb").read_bytes(), "SavedModel")
     meta = message.meta_graphs[0]
     fed = {name: normal_ref(info.name) for name, info in meta.signature_def[key].inputs.items()}
-    model = pool.process("tensorflow").load(str(folder), kind="variables", tags=list(meta.meta_info_def.tags))
+    outputs = [info.name for info in meta.signature_def[key].outputs.values()]
+    inside = OriginalRun("tensorflow", folder, definition=subgraph(meta.graph_def, outputs, fed.values()))
+    with inside.loadable() as (path, options):
+        model = pool.process("tensorflow").load(path, **options)
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         return model.run({fed[n]: a for n, a in feeds.items() if n in fed}, fetch)

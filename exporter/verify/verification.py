@@ -116,7 +116,8 @@ class _Verification:
         source = self.subject.source
         if source is not None and source.runtime in self.runtimes:
             try:
-                model = self.pool.process(source.runtime).load(str(source.path), **source.options)
+                with source.loadable() as (path, options):
+                    model = self.pool.process(source.runtime).load(path, **options)
             except RunFailedError as error:
                 self._failure("source", source.runtime, error)
             else:

@@ -83,12 +83,16 @@ def test_the_hash_is_of_all_its_files(tmp_path: Path) -> None:
     assert read_source(tmp_path / "model-30.cptk").sha256 != before
 
 
-def test_the_original_is_restored_from_the_checkpoint(tmp_path: Path) -> None:
+def test_the_original_has_the_checkpoints_values_in_place_of_its_variables(tmp_path: Path) -> None:
     run_of(tmp_path)
-    (model,) = read_source(tmp_path / "model-10.cptk").models
+    source = read_source(tmp_path / "model-10.cptk")
+    ((model, policy),) = source.compiled()
     assert model.original is not None
     assert model.original.path == tmp_path / "raw_graph_def.pb"
-    assert model.original.options == {"kind": "checkpoint", "prefix": str(tmp_path / "model-10.cptk")}
+    ops = {n.name: n.op for n in model.original.definition.node}
+    assert "Const" in ops.values()
+    assert not {"VariableV2", "Assign", "RestoreV2", "SaveV2"} & set(ops.values())
+    assert policy.source.fetches["action"].removesuffix(":0") in ops
 
 
 def test_the_savers_names_and_slices_are_followed(tmp_path: Path) -> None:

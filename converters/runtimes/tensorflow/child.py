@@ -1,10 +1,9 @@
 """TensorFlow in its own process: graphs in a Session, SavedModels through a signature.
 
-What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``checkpoint`` (a training graph whose
-variables are restored from ``prefix``), ``values`` (a training graph, its variables' values in the numpy archive
-``archive``, in the order of ``names``), ``variables`` (a SavedModel of TensorFlow 1 in a Session, by the names of its
-tensors), ``function`` (a SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model``
-(a SavedModel called by ``signature``).
+What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``values`` (the training graph of a session of
+the user's, its variables' values in the numpy archive ``archive``, in the order of ``names``), ``function`` (a
+SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model`` (a SavedModel called by
+``signature``).
 
 ``python -m converters.runtimes.tensorflow.child``
 """
@@ -12,7 +11,7 @@ tensors), ``function`` (a SavedModel of TensorFlow 2 or a Keras model, as Tensor
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,50 +56,19 @@ def main() -> None:
     def frozen(path: str) -> InSession:
         return InSession(imported(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())))
 
-    def restored(path: str, prefix: str) -> InSession:
-        """A training graph with a checkpoint's values: by its own saver, as the trainers did it, or one by one."""
-        data = Path(path).read_bytes()
-        if path.endswith(".meta"):
-            graph = imported(tf.compat.v1.MetaGraphDef.FromString(data).graph_def)
-        else:
-            graph = imported(tf.compat.v1.GraphDef.FromString(data))
-        model = InSession(graph)
-        operations = {o.name for o in graph.get_operations()}
-        if {"save/restore_all", "save/Const"} <= operations:
-            model.session.run("save/restore_all", {"save/Const:0": prefix})
-            return model
-        reader = tf.train.load_checkpoint(prefix)
-        assign(model, reader.has_tensor, reader.get_tensor)
-        return model
-
     def given(path: str, archive: str, names: Sequence[str]) -> InSession:
         """A training graph with values that were read from a session; variables are told by their nodes' names."""
         model = frozen(path)
         with np.load(archive, allow_pickle=False) as kept:
             values = {name: kept[f"arr_{i}"] for i, name in enumerate(names)}
-        assign(model, values.__contains__, values.__getitem__, shared=False)
-        return model
-
-    def assign(model: InSession, has: Callable[[str], bool], get: Callable[[str], Any], *, shared: bool = True) -> None:
-        """Every variable that there is a value for, by the name that it is shared under, or its node's."""
         graph = model.session.graph
         with graph.as_default():
             for operation in graph.get_operations():
-                key = operation.name
-                if shared and operation.type == "VarHandleOp":
-                    key = operation.get_attr("shared_name").decode() or key
-                if not has(key):
-                    continue
-                if operation.type == "VarHandleOp":
-                    model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=get(key)))
-                elif operation.type in ("VariableV2", "Variable"):
-                    model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=get(key)).op)
-
-    def with_variables(path: str, tags: Sequence[str]) -> InSession:
-        """A SavedModel of TensorFlow 1."""
-        model = InSession(tf.Graph())
-        with model.session.graph.as_default():
-            tf.compat.v1.saved_model.load(model.session, list(tags), path)
+                value = values.get(operation.name)
+                if value is not None and operation.type == "VarHandleOp":
+                    model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=value))
+                elif value is not None and operation.type in ("VariableV2", "Variable"):
+                    model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=value).op)
         return model
 
     class Saved:
@@ -118,12 +86,8 @@ def main() -> None:
         kind, path = header["kind"], header["path"]
         if kind == "saved_model":
             return Saved(path, header.get("signature", "serving_default"))
-        if kind == "checkpoint":
-            return restored(path, header["prefix"])
         if kind == "values":
             return given(path, header["archive"], header["names"])
-        if kind == "variables":
-            return with_variables(path, header["tags"])
         if kind == "function":
             return InSession(imported(frozen_function(path, header["form"], header.get("signature")).graph_def))
         return frozen(path)
