@@ -9,12 +9,17 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 
 #: What the tests that compare all formats run them in.
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
+
+#: No time limit per example: on a busy machine it says nothing of the code. Each test has pytest's own.
+settings.register_profile("busy", deadline=None)
+settings.load_profile("busy")
 
 
 @pytest.fixture(scope="session")

@@ -17,8 +17,7 @@ from converters.runtimes.tensorflow1.found import (
     API_LIBRARY,
     LIBRARIES,
     RELEASES,
-    TF1_4,
-    TF1_7,
+    RUNTIMES,
     is_whole,
     library_folder,
 )
@@ -101,7 +100,7 @@ def known(tmp_path: Path) -> legacy.Release:
 # ---- whether they are here -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("runtime", "release"), list(zip((TF1_4, TF1_7), RELEASES, strict=True)))
+@pytest.mark.parametrize(("runtime", "release"), list(zip(RUNTIMES, RELEASES, strict=True)))
 def test_what_lies_in_the_cache_is_installed(cache: Path, runtime: Runtime, release: legacy.Release) -> None:
     how = f"export-model runtimes install {release.runtime}"
     assert runtime.find() == RuntimeInfo(release.runtime, False, None, how)
@@ -133,7 +132,7 @@ def test_another_machine_is_told_so(
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr("platform.machine", lambda: machine)
     monkeypatch.setattr("os.confstr", lambda name: libc, raising=False)
-    assert TF1_4.find() == RuntimeInfo("tf1.4", False, None, NOT_HERE)
+    assert RUNTIMES[0].find() == RuntimeInfo("tf1.4", False, None, NOT_HERE)
     with pytest.raises(RuntimeUnavailableError, match="does not run here") as caught:
         install(RELEASE, quiet)
     assert caught.value.why == NOT_HERE

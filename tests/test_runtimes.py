@@ -11,11 +11,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from converters.runtimes import python as packages
 from converters.runtimes.cache import cache_folder, sweep
 from converters.runtimes.javascript import node as runtimes
 from converters.runtimes.javascript.node import install_packages, js_home, node_executable
@@ -299,7 +299,7 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
         assert process.poll() is None
         time.sleep(0.02)
     process.kill()
-    process.wait()
+    process.wait(30)
     os.kill(int(pid_file.read_text()), signal.SIGKILL)
 
     folder = user / "export-model"
@@ -373,7 +373,7 @@ def test_numpy_is_always_there() -> None:
 def test_a_python_runtime_is_found_under_any_of_its_distributions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    for index, distribution in enumerate(packages._DISTRIBUTIONS[name]):
+    for index, distribution in enumerate(import_module(f"converters.runtimes.{name}").DISTRIBUTIONS):
         site = tmp_path / distribution
         metadata = site / f"{distribution.replace('-', '_')}-1.{index}.dist-info"
         metadata.mkdir(parents=True)

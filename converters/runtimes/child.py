@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, BinaryIO, NoReturn, Protocol
 
@@ -26,10 +28,26 @@ Loader = Callable[[Mapping[str, Any]], Model]
 
 
 def claim_stdout() -> BinaryIO:
-    """A stream to the real stdout; file descriptor 1 becomes stderr, so that no library can write between frames."""
+    """A stream to the real stdout; file descriptor 1 becomes stderr, so that no library can write between frames.
+
+    The first call of a child: from here on it ends when its parent does.
+    """
+    _end_with_parent()
     stream = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return stream
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed closes stdin, which is noticed between requests only: this looks during one, too."""
+    parent = os.getppid()
+
+    def look() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=look, daemon=True).start()
 
 
 def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception], ...], out: BinaryIO) -> NoReturn:

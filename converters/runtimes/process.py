@@ -12,7 +12,7 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
-from converters.runtimes.wire import Tensors, read_frame, write_frame
+from converters.runtimes.wire import FramingError, Tensors, read_frame, write_frame
 from signatures.errors import ExportModelError, RuntimeUnavailableError
 
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
@@ -107,18 +107,19 @@ class RuntimeProcess:
         process = self._process
         assert process is not None
         watchdog = threading.Timer(TIMEOUT, process.kill)
-        watchdog.start()
+        watchdog.daemon = True  # one that an interrupt leaves behind must not keep this process for TIMEOUT
         try:
+            watchdog.start()
             if send is not None:
                 send(to)
             answer, results = read_frame(back)
-        except (EOFError, BrokenPipeError, OSError) as error:
-            status = process.poll() if process.poll() is not None else process.wait(5)
+        except (OSError, EOFError, FramingError) as error:
+            status = _ended(process)
             said = self._last_errors()
             self.close()
             raise RunFailedError(
                 f"{self.name} ended while it was working (status {status})",
-                why=said or "it printed nothing",
+                why=said or (str(error) if isinstance(error, FramingError) else "it printed nothing"),
                 fix="a native runtime aborts on some malformed graphs; the model is not safe to use there",
             ) from error
         finally:
@@ -152,11 +153,7 @@ class RuntimeProcess:
                 process.terminate()  # not kill: one that has started a browser ends that first
             if process.stdout is not None:
                 process.stdout.close()
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            _ended(process, 10)
         if self._errors is not None:
             self._errors.close()
             self._errors = None
@@ -168,6 +165,15 @@ class RuntimeProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
+    """The status of a process that should be ending; one that lives on after ``patience`` seconds is killed."""
+    try:
+        return process.wait(patience)
+    except subprocess.TimeoutExpired:  # it closed its stdout, or speaks no frames any more
+        process.kill()
+        return process.wait()
 
 
 class LoadedModel:

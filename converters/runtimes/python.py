@@ -1,37 +1,32 @@
-"""Runtimes that are Python packages: numpy, TensorFlow and ONNX Runtime, in a child process of this interpreter."""
+"""Runtimes that are Python packages, in a child process of this interpreter: is one here, how is its child started."""
 
 from __future__ import annotations
 
 import importlib.util
+import sys
 from functools import partial
+from pathlib import Path
 
+import converters
 from converters.runtimes.base import Runtime, RuntimeInfo
-from converters.runtimes.command import child_command
 
-# One module, many distributions: these all provide ``tensorflow`` and ``onnxruntime``. First come, first taken.
-_DISTRIBUTIONS = {
-    "numpy": ("numpy",),
-    "tensorflow": (
-        "tensorflow",
-        "tensorflow-cpu",
-        "tensorflow-gpu",
-        "tensorflow-intel",
-        "tensorflow-macos",
-        "tensorflow-rocm",
-        "tensorflow-cpu-aws",
-        "intel-tensorflow",
-        "tf-nightly",
-        "tf-nightly-cpu",
-    ),
-    "onnxruntime": (
-        "onnxruntime",
-        "onnxruntime-gpu",
-        "onnxruntime-directml",
-        "onnxruntime-openvino",
-        "onnxruntime-qnn",
-        "ort-nightly",
-    ),
-}
+
+def package_runtime(
+    name: str, formats: tuple[str, ...], how: str, distributions: tuple[str, ...], *, independent: bool = True
+) -> Runtime:
+    """The runtime of the package ``name``, whose child is the module ``child`` of the folder of that name here.
+
+    Several of the ``distributions`` may provide the package: the first that is installed tells the version.
+    """
+    command = partial(child_command, f"converters.runtimes.{name}.child")
+    return Runtime(name, formats, partial(_find, name, how, distributions), command, independent=independent)
+
+
+def child_command(module: str, *arguments: str) -> list[str]:
+    """The command that runs ``module`` from this very copy of the packages, installed or not."""
+    root = str(Path(converters.__file__).resolve().parent.parent)
+    start = f"import sys, runpy; sys.path.insert(0, {root!r}); "
+    return [sys.executable, "-c", f"{start}runpy.run_module({module!r}, run_name='__main__')", *arguments]
 
 
 def module_origin(name: str) -> str | None:
@@ -43,28 +38,17 @@ def module_origin(name: str) -> str | None:
     return None if spec is None else spec.origin
 
 
-def _find(module: str, how: str) -> RuntimeInfo:
-    if module_origin(module) is None:
-        return RuntimeInfo(module, False, None, how)
-    return RuntimeInfo(module, True, _distribution_version(_DISTRIBUTIONS[module]), how)
+def _find(name: str, how: str, distributions: tuple[str, ...]) -> RuntimeInfo:
+    here = module_origin(name) is not None
+    return RuntimeInfo(name, here, _version(distributions) if here else None, how)
 
 
-def _distribution_version(names: tuple[str, ...]) -> str | None:
+def _version(distributions: tuple[str, ...]) -> str | None:
     import importlib.metadata  # here: an export without verification needs neither it nor what it imports
 
-    for name in names:
+    for name in distributions:
         try:
             return importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
     return None
-
-
-def _runtime(name: str, formats: tuple[str, ...], how: str, *, independent: bool = True) -> Runtime:
-    command = partial(child_command, f"converters.runtimes.{name}.child")
-    return Runtime(name, formats, partial(_find, name, how), command, independent=independent)
-
-
-NUMPY = _runtime("numpy", ("bytes",), "pip install export-model", independent=False)
-TENSORFLOW = _runtime("tensorflow", ("source", "bytes", "saved_model"), "pip install 'export-model[tensorflow]'")
-ONNXRUNTIME = _runtime("onnxruntime", ("source", "onnx"), "pip install 'export-model[onnxruntime]'")

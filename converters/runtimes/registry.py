@@ -1,28 +1,20 @@
-"""The runtimes that artefacts are verified in: a file per family, and here the list of them.
+"""The runtimes that artefacts are verified in: a folder per family, and here the list of them.
 
-To add a runtime is to add a child process that speaks the frames of wire.py, and a line here. Nothing
-here imports a runtime: ``import tensorflow`` takes seconds, and the question is only whether it is there.
+To add a runtime is to add a folder with a child process that speaks the frames of wire.py and a ``RUNTIMES`` that says
+whether it is here, how its child is started and how it is installed; and its name here. Nothing here imports a runtime:
+``import tensorflow`` takes seconds, and the question is only whether it is there.
 """
 
 from __future__ import annotations
 
+from converters.runtimes import javascript, numpy, onnxruntime, tensorflow, tensorflow1
 from converters.runtimes.base import Runtime, RuntimeInfo
-from converters.runtimes.javascript.browser import (
-    ONNXRUNTIME_WEB_CHROMIUM,
-    TFJS_CPU_CHROMIUM,
-    TFJS_WASM_CHROMIUM,
-    TFJS_WEBGL,
-)
-from converters.runtimes.javascript.node import ONNXRUNTIME_WEB, TFJS_CPU, TFJS_WASM
-from converters.runtimes.python import NUMPY, ONNXRUNTIME, TENSORFLOW
-from converters.runtimes.tensorflow1.found import TF1_4, TF1_7
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 
 #: In the order in which they are reported.
-RUNTIMES: tuple[Runtime, ...] = (
-    *(NUMPY, TENSORFLOW, TF1_4, TF1_7, ONNXRUNTIME, ONNXRUNTIME_WEB, TFJS_CPU, TFJS_WASM),
-    *(TFJS_WEBGL, TFJS_CPU_CHROMIUM, TFJS_WASM_CHROMIUM, ONNXRUNTIME_WEB_CHROMIUM),
+RUNTIMES: tuple[Runtime, ...] = tuple(
+    runtime for family in (numpy, tensorflow, tensorflow1, onnxruntime, javascript) for runtime in family.RUNTIMES
 )
 
 

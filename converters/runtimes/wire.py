@@ -18,6 +18,10 @@ import numpy as np
 Tensors = dict[str, np.ndarray]
 
 
+class FramingError(Exception):
+    """What came is no frame, so that nothing after it can be read."""
+
+
 def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None) -> None:
     """Send a header with its tensors."""
     parts = []
@@ -31,15 +35,18 @@ def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[st
 
 
 def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
-    """Receive a frame; EOFError at the end of the stream."""
+    """Receive a frame; raises EOFError at the end of the stream, FramingError where it is none."""
     (length,) = struct.unpack("<I", _exactly(stream, 4))
-    header: dict[str, Any] = json.loads(_exactly(stream, length))
+    text = _exactly(stream, length)
     tensors: Tensors = {}
-    for entry in header.get("tensors", ()):
-        dtype = np.dtype(entry["dtype"])
-        count = math.prod(entry["shape"])
-        data = _exactly(stream, count * dtype.itemsize)
-        tensors[entry["name"]] = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype).reshape(entry["shape"])
+    try:
+        header: dict[str, Any] = json.loads(text)
+        for entry in header.get("tensors", ()):
+            dtype = np.dtype(entry["dtype"])
+            data = _exactly(stream, math.prod(entry["shape"]) * dtype.itemsize)
+            tensors[entry["name"]] = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype).reshape(entry["shape"])
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise FramingError(f"what it said is no frame: {error}") from error
     return header, tensors
 
 

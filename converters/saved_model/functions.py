@@ -9,8 +9,8 @@ import importlib.util
 import json
 from pathlib import Path
 
-from converters.runtimes.command import child_command
 from converters.runtimes.process import RunFailedError, RuntimeProcess
+from converters.runtimes.python import child_command
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import RuntimeUnavailableError, SourceError
 

@@ -40,13 +40,13 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
         click.echo(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
         click.echo(f"next: host it anywhere, or: python -m http.server --directory {out}")
         return
-    from exporter.serve.server import listening
+    from exporter.serve.server import listening, until_interrupted
 
-    with listening(site, host, port) as server:
+    with listening(site, host, port) as server, until_interrupted():
         click.echo(f"{server.url}  (Ctrl-C ends)")
         if opens:
             import webbrowser
 
             webbrowser.open(server.url)
-        server.serve_until_interrupted()
+        server.serve_forever()
     click.echo("ended")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import signal
 import socketserver
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -45,10 +45,20 @@ class SiteServer(ThreadingHTTPServer):
         host, port = self.server_address[:2]
         return f"http://{host if isinstance(host, str) else host.decode()}:{port}/"
 
-    def serve_until_interrupted(self) -> None:
-        """Answer until Ctrl-C, which is the way to end it and no error."""
-        with contextlib.suppress(KeyboardInterrupt):
-            self.serve_forever()
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the block, and are no errors, whatever was inherited: a job in the background ignores
+    SIGINT unless it says otherwise.
+    """
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -11,12 +11,12 @@ from converters.runtimes.base import RuntimeInfo
 from converters.runtimes.javascript import browser
 from converters.runtimes.javascript.browser import (
     CHROMIUM_VARIABLE,
-    TFJS_WASM_CHROMIUM,
-    TFJS_WEBGL,
+    RUNTIMES,
     chromium_executable,
 )
 from signatures.errors import RuntimeUnavailableError
 
+WEBGL, WASM = (next(r for r in RUNTIMES if r.name == name) for name in ("tfjs-webgl", "tfjs-wasm@chromium"))
 Program = Callable[[str], Path]
 
 
@@ -81,32 +81,32 @@ def test_all_three_are_needed_and_how_names_what_is_missing(
     here = not steps
     how = " && ".join(steps) or "apt-get install chromium && export-model runtimes install tfjs"
     version = "4.22.0" if here else None
-    assert TFJS_WASM_CHROMIUM.find() == RuntimeInfo("tfjs-wasm@chromium", here, version, how)
+    assert WASM.find() == RuntimeInfo("tfjs-wasm@chromium", here, version, how)
 
 
 def test_webgl_does_not_ask_for_the_wasm_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser, "chromium_executable", lambda: "chromium")
     monkeypatch.setattr(browser, "node_executable", lambda: "node")
     monkeypatch.setattr(browser, "package_version", lambda home, name: None if "wasm" in name else "4.22.0")
-    assert TFJS_WEBGL.find().installed
-    assert not TFJS_WASM_CHROMIUM.find().installed
+    assert WEBGL.find().installed
+    assert not WASM.find().installed
 
 
 def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser, "node_executable", lambda: "node")
     monkeypatch.setattr(browser, "chromium_executable", lambda: None)
     with pytest.raises(RuntimeUnavailableError, match="Chromium is not installed"):
-        TFJS_WEBGL.command()
+        WEBGL.command()
     monkeypatch.setattr(browser, "chromium_executable", lambda: "chrome")
-    command = TFJS_WEBGL.command()
+    command = WEBGL.command()
     assert command[0] == "node"
     assert command[2:4] == ["--runtime", "tfjs-webgl"]
     assert command[-2:] == ["--chromium", "chrome"]
     monkeypatch.setattr(browser, "node_executable", lambda: None)
     with pytest.raises(RuntimeUnavailableError, match="Node is not installed"):
-        TFJS_WEBGL.command()
+        WEBGL.command()
 
 
 def test_a_browser_is_started_only_on_request() -> None:
-    assert not TFJS_WEBGL.automatic
-    assert TFJS_WEBGL.independent
+    assert not WEBGL.automatic
+    assert WEBGL.independent

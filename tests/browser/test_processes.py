@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.runtimes.javascript.browser import TFJS_CPU_CHROMIUM
+from converters.runtimes.javascript import RUNTIMES
 from converters.runtimes.javascript.node import JS_SOURCE, js_home, node_executable
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
@@ -29,6 +29,9 @@ pytestmark = [
 ]
 
 
+CHROMIUM = next(r for r in RUNTIMES if r.name == "tfjs-cpu@chromium")
+
+
 @pytest.fixture
 def room(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A temporary folder of this test's own, which every process of its Chromium has in its environment."""
@@ -40,7 +43,7 @@ def room(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def process(room: Path) -> Iterator[RuntimeProcess]:
-    with RuntimeProcess("tfjs-cpu@chromium", TFJS_CPU_CHROMIUM.command()) as started:
+    with RuntimeProcess(CHROMIUM.name, CHROMIUM.command()) as started:
         started.start()
         yield started
 
@@ -83,7 +86,7 @@ def test_close_leaves_no_process_and_no_folder(room: Path, process: RuntimeProce
 def test_close_in_the_middle_of_the_start_leaves_no_process_and_no_folder(room: Path) -> None:
     """A run that fails elsewhere closes runtimes that were started ahead."""
     for delay in (0.3, 1.2):
-        process = RuntimeProcess("tfjs-cpu@chromium", TFJS_CPU_CHROMIUM.command())
+        process = RuntimeProcess(CHROMIUM.name, CHROMIUM.command())
         process.launch()
         time.sleep(delay)
         process.close()
@@ -105,7 +108,7 @@ def test_a_kill_leaves_no_process_and_a_start_on_a_later_day_removes_the_folder(
     (runner,) = processes(room, "browser.mjs")
     os.kill(runner, signal.SIGKILL)
     assert process._process is not None
-    process._process.wait()
+    process._process.wait(30)
     assert nothing_left(room)
     (left,) = folders(room)
     young = "export-model-browser-young"

@@ -169,12 +169,15 @@ class Workshop:
             assert lines and block.argument in lines[-1], f"{block.where}: {''.join(lines)}"
             address = next((word for word in lines[-1].split() if word.startswith("http://")), None)
             if address is not None:
-                with urllib.request.urlopen(address) as answer:
+                with urllib.request.urlopen(address, timeout=60) as answer:
                     assert answer.status == 200
         finally:
             os.killpg(process.pid, signal.SIGINT)
             process.stdout.close()
-            process.wait()
+            try:
+                process.wait(60)
+            finally:
+                process.kill()
 
 
 HOW = {

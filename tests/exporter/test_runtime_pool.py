@@ -18,6 +18,7 @@ from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import ROOT
 
+NODE = {r.name: r for r in javascript.RUNTIMES}
 NAMES = ("numpy", "tensorflow", "tf1.4", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
 
 
@@ -158,7 +159,7 @@ def test_one_that_cannot_be_started_leaves_the_others() -> None:
 
 def test_one_that_refused_to_start_is_tried_again(tmp_path: Path) -> None:
     """It answers "hello" with an error and lives on; asked nothing again, it would be waited for in vain."""
-    empty = [*javascript.TFJS_CPU.command()[:-1], str(tmp_path)]
+    empty = [*NODE["tfjs-cpu"].command()[:-1], str(tmp_path)]
     with RuntimePool({"tfjs-cpu": lambda: empty}) as pool:
         for _ in range(2):
             with pytest.raises(RuntimeUnavailableError, match="Cannot find module"):
@@ -174,7 +175,7 @@ def test_without_node_tensorflow_js_is_unavailable(monkeypatch: pytest.MonkeyPat
 def test_tensorflow_js_runs_in_node_with_its_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(javascript, "node_executable", lambda: "node")
     monkeypatch.setenv("EXPORT_MODEL_JS", "/packages")
-    command = javascript.TFJS_WASM.command()
+    command = NODE["tfjs-wasm"].command()
     assert command[0] == "node"
     assert command[1].endswith("runner.mjs")
     assert command[2:] == ["--runtime", "tfjs-wasm", "--modules", "/packages"]

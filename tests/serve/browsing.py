@@ -49,7 +49,7 @@ def served(site: Mapping[str, bytes]) -> Iterator[SiteServer]:
             yield server
         finally:
             server.shutdown()
-            thread.join()
+            thread.join(30)
 
 
 def visit(url: str, steps: Sequence[Sequence[Any]], **context: Any) -> Visit:

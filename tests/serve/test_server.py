@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import os
 import signal
 import socket
 import subprocess
@@ -98,8 +97,13 @@ def test_a_port_that_is_taken_is_refused(bundle: Bundle) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGINT to send")
-def test_ctrl_c_ends_it_cleanly(bundle: Bundle) -> None:
+@pytest.mark.parametrize("ignored", [False, True], ids=["in front", "in the background"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(bundle: Bundle, number: signal.Signals, ignored: bool) -> None:
+    """A shell without job control starts jobs in the background with SIGINT ignored, and children inherit that."""
     command = [sys.executable, "-u", "-m", "exporter", "serve", str(bundle("continuous")), "--port", "0"]
+    if ignored:
+        command = ["sh", "-c", "trap '' INT TERM; exec \"$@\"", "sh", *command]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
@@ -108,7 +112,7 @@ def test_ctrl_c_ends_it_cleanly(bundle: Bundle) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", port)
         connection.request("GET", "/site.json")
         assert connection.getresponse().status == 200
-        os.kill(process.pid, signal.SIGINT)
-        out, err = process.communicate()
+        process.send_signal(number)
+        out, err = process.communicate(timeout=30)
         connection.close()
     assert (process.returncode, out, err) == (0, "ended\n", "")

@@ -98,7 +98,9 @@ def _runtime(name: str, kind: str, *packages: str) -> Runtime:
     return Runtime(name, (kind,), find, command, install_packages, automatic=False)
 
 
-TFJS_WEBGL = _runtime("tfjs-webgl", "tfjs", _TFJS)
-TFJS_CPU_CHROMIUM = _runtime("tfjs-cpu@chromium", "tfjs", _TFJS)
-TFJS_WASM_CHROMIUM = _runtime("tfjs-wasm@chromium", "tfjs", _TFJS, _TFJS_WASM)
-ONNXRUNTIME_WEB_CHROMIUM = _runtime("onnxruntime-web@chromium", "onnx", _ORT)
+RUNTIMES = (
+    _runtime("tfjs-webgl", "tfjs", _TFJS),
+    _runtime("tfjs-cpu@chromium", "tfjs", _TFJS),
+    _runtime("tfjs-wasm@chromium", "tfjs", _TFJS, _TFJS_WASM),
+    _runtime("onnxruntime-web@chromium", "onnx", _ORT),
+)

@@ -183,6 +183,8 @@ def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Ru
     return Runtime(name, (format_,), partial(_find, name, packages, how), partial(_command, name), install_packages)
 
 
-ONNXRUNTIME_WEB = _runtime("onnxruntime-web", "onnx", (_ONNXRUNTIME_WEB,), INSTALL_ONNXRUNTIME_WEB)
-TFJS_CPU = _runtime("tfjs-cpu", "tfjs", (_CORE, _CONVERTER, _CPU), INSTALL_TFJS)
-TFJS_WASM = _runtime("tfjs-wasm", "tfjs", (_CORE, _CONVERTER, _WASM), INSTALL_TFJS)
+RUNTIMES = (
+    _runtime("onnxruntime-web", "onnx", (_ONNXRUNTIME_WEB,), INSTALL_ONNXRUNTIME_WEB),
+    _runtime("tfjs-cpu", "tfjs", (_CORE, _CONVERTER, _CPU), INSTALL_TFJS),
+    _runtime("tfjs-wasm", "tfjs", (_CORE, _CONVERTER, _WASM), INSTALL_TFJS),
+)

@@ -1,1 +1,12 @@
 """ONNX Runtime."""
+
+from converters.runtimes.python import package_runtime
+
+#: First come, first taken: all of them provide the package.
+DISTRIBUTIONS = (
+    *("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino", "onnxruntime-qnn"),
+    "ort-nightly",
+)
+RUNTIMES = (
+    package_runtime("onnxruntime", ("source", "onnx"), "pip install 'export-model[onnxruntime]'", DISTRIBUTIONS),
+)

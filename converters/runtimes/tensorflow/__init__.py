@@ -1,1 +1,14 @@
 """TensorFlow 2."""
+
+from converters.runtimes.python import package_runtime
+
+#: First come, first taken: all of them provide the package.
+DISTRIBUTIONS = (
+    *("tensorflow", "tensorflow-cpu", "tensorflow-gpu", "tensorflow-intel", "tensorflow-macos"),
+    *("tensorflow-rocm", "tensorflow-cpu-aws", "intel-tensorflow", "tf-nightly", "tf-nightly-cpu"),
+)
+RUNTIMES = (
+    package_runtime(
+        "tensorflow", ("source", "bytes", "saved_model"), "pip install 'export-model[tensorflow]'", DISTRIBUTIONS
+    ),
+)

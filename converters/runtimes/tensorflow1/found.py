@@ -16,7 +16,7 @@ from pathlib import Path
 
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
 from converters.runtimes.cache import cache_folder
-from converters.runtimes.command import child_command
+from converters.runtimes.python import child_command
 from signatures.errors import RuntimeUnavailableError
 
 API_LIBRARY = "_pywrap_tensorflow_internal.so"
@@ -88,9 +88,7 @@ def _command(release: Release) -> list[str]:
 
 
 def _install(release: Release, progress: Progress) -> Path:
-    from converters.runtimes.tensorflow1.install import (
-        install,  # what fetches and unpacks is imported where that is done
-    )
+    from converters.runtimes.tensorflow1.install import install  # what unpacks is imported where that is done
 
     return install(release, progress)
 
@@ -102,4 +100,4 @@ def _runtime(release: Release) -> Runtime:
     )
 
 
-TF1_4, TF1_7 = (_runtime(release) for release in RELEASES)
+RUNTIMES = tuple(_runtime(release) for release in RELEASES)

@@ -204,6 +204,8 @@ async function main() {
   for (const signal of ["SIGINT", "SIGTERM", "SIGHUP"]) {
     process.once(signal, () => void end(128 + os.constants.signals[signal]));
   }
+  const parent = process.ppid; // one that is killed closes stdin, which is noticed between requests only
+  setInterval(() => process.ppid === parent || void end(1), 1000).unref();
   try {
     await serve(start, write);
     return 0;

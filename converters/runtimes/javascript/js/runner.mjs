@@ -10,6 +10,7 @@
 
 import process from "node:process";
 import { parseArgs } from "node:util";
+import { Worker } from "node:worker_threads";
 
 import { FramingError, takeStdout } from "./frames.mjs";
 import { serve } from "./serve.mjs";
@@ -29,7 +30,16 @@ function commandLine() {
   return { runtime, modules };
 }
 
+/**
+ * A parent that is killed closes stdin, which is noticed between requests only. A worker looks during one, too.
+ */
+function endWithParent() {
+  const look = "if (process.ppid !== parent) process.kill(process.pid, 'SIGKILL')";
+  new Worker(`const parent = process.ppid; setInterval(() => { ${look}; }, 1000);`, { eval: true }).unref();
+}
+
 async function main() {
+  endWithParent();
   const write = takeStdout();
   let options;
   try {
