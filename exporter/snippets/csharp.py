@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from string import Template
-
 from exporter.snippets.contract import (
     STEPS,
     Bundle,
@@ -15,52 +13,9 @@ from exporter.snippets.contract import (
     meaning,
     quoted,
 )
+from exporter.snippets.frames import filled
 from signatures.roles import Role
 from signatures.spec import TensorSpec
-
-_TENSORFLOWSHARP = Template("""\
-// NuGet package TensorFlowSharp; in Unity the plugin of ML-Agents 0.1 to 0.6, with ENABLE_TENSORFLOW defined
-using System;
-using System.IO;
-using TensorFlow;
-
-public static class $type
-{
-    public static void Main()
-    {
-        var graph = new TFGraph();
-        graph.Import(File.ReadAllBytes($path));  // in Unity: the bytes of a TextAsset
-        using (var session = new TFSession(graph))
-        {
-$play
-        }
-    }
-}
-""")
-
-_INFERENCE_ENGINE = Template("""\
-// Unity Inference Engine 2.2 and newer (com.unity.ai.inference); Sentis 2.1: using Unity.Sentis;
-using Unity.InferenceEngine;
-using UnityEngine;
-
-public class $type : MonoBehaviour
-{
-    public ModelAsset modelAsset;  // $file, dragged into Assets
-
-    Worker worker;
-$fields
-    void Start()
-    {
-        worker = new Worker(ModelLoader.Load(modelAsset), BackendType.CPU);
-    }
-
-$methods
-    void OnDestroy()
-    {
-        worker?.Dispose();
-    }
-}
-""")
 
 _TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool"}
 
@@ -107,8 +62,8 @@ def tensorflowsharp(bundle: Bundle) -> str:
     if bundle.remembers:
         lines = [f"for (var step = 0; step < {STEPS}; step++)", "{", *(f"    {line}" for line in lines), "}"]
     play = "\n".join(f"            {line}" for line in [*before, *lines])
-    return _TENSORFLOWSHARP.substitute(
-        type=class_name(bundle.name), path=quoted(bundle.path(f"{bundle.name}.bytes")), play=play
+    return filled(
+        "tensorflowsharp.cs", type=class_name(bundle.name), path=quoted(bundle.path(f"{bundle.name}.bytes")), play=play
     )
 
 
@@ -185,7 +140,8 @@ def inference_engine(bundle: Bundle) -> str:
     if kept:
         reset = [f"    {line.split('  //')[0].strip().split(' ', 1)[1]}" for line in fields]
         methods += ["public void BeginEpisode()", "{", *reset, "}", ""]
-    return _INFERENCE_ENGINE.substitute(
+    return filled(
+        "inference_engine.cs",
         type=class_name(bundle.name),
         file=f"{bundle.name}.onnx",
         fields="".join(f"{line}\n" for line in fields),

@@ -6,69 +6,30 @@ A page lies beside the bundle's folder and takes its runtime from ``node_modules
 from __future__ import annotations
 
 import re
-from string import Template
 
 from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, is_continuous, meaning, quoted
+from exporter.snippets.frames import filled
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
-_PAGE = Template("""\
-<!doctype html>
-<!-- Save as index.html beside the folder $name, then: npm install $package; python3 -m http.server -->
-<html lang="en">
-<meta charset="utf-8">
-<title>$name</title>
-<script type="importmap">
-{"imports": {"$package": "./node_modules/$module"}}
-</script>
-<script type="module">
-$code
-</script>
-</html>
-""")
 _TFJS = ("@tensorflow/tfjs", "@tensorflow/tfjs/dist/tf.fesm.min.js")
 _ORT = ("onnxruntime-web", "onnxruntime-web/dist/ort.wasm.bundle.min.mjs")
-
-_ACTING_TFJS = Template("""\
-import * as tf from "@tensorflow/tfjs";
-import { loadPolicy } from $module;
-
-const policy = await loadPolicy($model, { tf, seed: 0 });
-$play""")
-
-_ACTING_ORT = Template("""\
-import * as ort from "onnxruntime-web";
-import { loadPolicy } from $module;
-
-const policy = await loadPolicy($model, { ort, seed: 0 });
-$play""")
-
-_PLAIN_TFJS = Template("""\
-import * as tf from "@tensorflow/tfjs";
-
-await tf.ready();
-const model = await tf.loadGraphModel($model);
-$play""")
-
-_PLAIN_ORT = Template("""\
-import * as ort from "onnxruntime-web";
-
-const session = await ort.InferenceSession.create($model);
-$play""")
 
 _ARRAYS = {"float32": "Float32Array", "int32": "Int32Array", "int64": "BigInt64Array", "bool": "Uint8Array"}
 
 
 def acting_tfjs(bundle: Bundle) -> str:
     """policy.mjs with TensorFlow.js."""
-    code = _ACTING_TFJS.substitute(module=_module(bundle), model=_url(bundle, "tfjs/model.json"), play=_agents(bundle))
+    code = filled(
+        "acting_tfjs.mjs", module=_module(bundle), model=_url(bundle, "tfjs/model.json"), play=_agents(bundle)
+    )
     return _page(bundle, _TFJS, code)
 
 
 def acting_ort(bundle: Bundle) -> str:
     """policy.mjs with onnxruntime-web."""
     model = _url(bundle, f"{bundle.name}.onnx")
-    return _page(bundle, _ORT, _ACTING_ORT.substitute(module=_module(bundle), model=model, play=_agents(bundle)))
+    return _page(bundle, _ORT, filled("acting_ort.mjs", module=_module(bundle), model=model, play=_agents(bundle)))
 
 
 def plain_tfjs(bundle: Bundle) -> str:
@@ -81,7 +42,7 @@ def plain_tfjs(bundle: Bundle) -> str:
     return _page(
         bundle,
         _TFJS,
-        _PLAIN_TFJS.substitute(model=_url(bundle, "tfjs/model.json"), play=_steps(bundle, lines, _tf_value)),
+        filled("plain_tfjs.mjs", model=_url(bundle, "tfjs/model.json"), play=_steps(bundle, lines, _tf_value)),
     )
 
 
@@ -95,12 +56,12 @@ def plain_ort(bundle: Bundle) -> str:
     return _page(
         bundle,
         _ORT,
-        _PLAIN_ORT.substitute(model=_url(bundle, f"{bundle.name}.onnx"), play=_steps(bundle, lines, _ort_value)),
+        filled("plain_ort.mjs", model=_url(bundle, f"{bundle.name}.onnx"), play=_steps(bundle, lines, _ort_value)),
     )
 
 
 def _page(bundle: Bundle, runtime: tuple[str, str], code: str) -> str:
-    return _PAGE.substitute(name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
+    return filled("page.html", name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
 
 
 def _url(bundle: Bundle, relative: str) -> str:

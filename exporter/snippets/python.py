@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from string import Template
-
 from exporter.snippets.contract import (
     STEPS,
     Bundle,
@@ -13,44 +11,16 @@ from exporter.snippets.contract import (
     meaning,
     quoted,
 )
+from exporter.snippets.frames import filled
 from signatures.roles import Role
 from signatures.spec import TensorSpec
-
-_ONNXRUNTIME = Template("""\
-# pip install onnxruntime
-import numpy as np
-import onnxruntime
-
-session = onnxruntime.InferenceSession($path, providers=["CPUExecutionProvider"])
-names = [output.name for output in session.get_outputs()]
-$play""")
-
-_SAVED_MODEL = Template("""\
-# pip install tensorflow
-import numpy as np
-import tensorflow as tf
-
-model = tf.saved_model.load($path)  # keep it: the signature alone does not hold its graph
-policy = model.signatures["serving_default"]
-$play""")
-
-_LOAD_POLICY = Template("""\
-# pip install 'export-model[onnxruntime]'; it draws the discrete actions, and remembers
-import numpy as np
-
-from exporter import load_policy
-
-policy = load_policy($path, seed=0)
-# agents.reset() where an episode begins; policy.agent(deterministic=True): without chance
-agents = policy.agent()
-$play""")
 
 
 def onnxruntime(bundle: Bundle) -> str:
     """The ONNX in onnxruntime."""
     run = "dict(zip(names, session.run(names, feeds)))"
-    return _ONNXRUNTIME.substitute(
-        path=quoted(bundle.path(f"{bundle.name}.onnx")), play=play(bundle, [f"outputs = {run}"])
+    return filled(
+        "onnxruntime.py", path=quoted(bundle.path(f"{bundle.name}.onnx")), play=play(bundle, [f"outputs = {run}"])
     )
 
 
@@ -60,7 +30,7 @@ def saved_model(bundle: Bundle) -> str:
         "answer = policy(**{name: tf.constant(value) for name, value in feeds.items()})",
         "outputs = {name: tensor.numpy() for name, tensor in answer.items()}",
     ]
-    return _SAVED_MODEL.substitute(path=quoted(bundle.path("saved_model")), play=play(bundle, run))
+    return filled("saved_model.py", path=quoted(bundle.path("saved_model")), play=play(bundle, run))
 
 
 def load_policy(bundle: Bundle) -> str:
@@ -85,7 +55,7 @@ def load_policy(bundle: Bundle) -> str:
     lines.append(
         f"print({', '.join('decision.continuous' if is_continuous(h) else 'decision.discrete' for h in bundle.heads)})"
     )
-    return _LOAD_POLICY.substitute(path=quoted(bundle.folder.as_posix()), play=looped(bundle, lines))
+    return filled("load_policy.py", path=quoted(bundle.folder.as_posix()), play=looped(bundle, lines))
 
 
 def play(bundle: Bundle, run: list[str]) -> str:

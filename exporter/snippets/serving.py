@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import json
 import math
-from string import Template
 from typing import Any
 
 from exporter.snippets.contract import Bundle, action_meaning, example_shape, meaning, quoted
+from exporter.snippets.frames import filled
 from exporter.snippets.python import play
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -20,51 +20,10 @@ from signatures.spec import TensorSpec
 #: A body of more numbers is made by a command instead of being printed.
 _MOST_NUMBERS = 400
 
-_DOCKER = Template("""\
-# REST on port 8501, gRPC on port 8500
-docker run --rm -p 8500:8500 -p 8501:8501 \\
-  --mount type=bind,source=$folder,target=/models/$name/1,readonly \\
-  -e MODEL_NAME=$name tensorflow/serving
-""")
-
-_CURL = Template("""\
-# The outputs come back by name, a row per agent; GET .../v1/models/$name/metadata says what it takes.
-$comments
-curl -s -X POST http://localhost:8501/v1/models/$name:predict \\
-  -H 'Content-Type: application/json' -d @- <<'JSON'
-$body
-JSON
-""")
-
-_CURL_LARGE = Template("""\
-# The outputs come back by name, a row per agent; GET .../v1/models/$name/metadata says what it takes.
-$comments
-python3 - <<'PYTHON' > request.json
-import json
-
-def full(value, *shape):
-    return [full(value, *shape[1:]) for _ in range(shape[0])] if shape else value
-
-print(json.dumps($body))
-PYTHON
-curl -s -X POST http://localhost:8501/v1/models/$name:predict \\
-  -H 'Content-Type: application/json' -d @request.json
-""")
-
-_GRPC = Template("""\
-# pip install tensorflow-serving-api
-import grpc
-import numpy as np
-import tensorflow as tf
-from tensorflow_serving.apis import predict_pb2, prediction_service_pb2_grpc
-
-stub = prediction_service_pb2_grpc.PredictionServiceStub(grpc.insecure_channel("localhost:8500"))
-$play""")
-
 
 def docker(bundle: Bundle) -> str:
     """The container."""
-    return _DOCKER.substitute(folder=bundle.mount("saved_model"), name=bundle.name)
+    return filled("serving_docker.sh", folder=bundle.mount("saved_model"), name=bundle.name)
 
 
 def rest(bundle: Bundle) -> str:
@@ -77,12 +36,12 @@ def rest(bundle: Bundle) -> str:
     shapes = {s.name: example_shape(s)[1:] if rows else example_shape(s) for s in inputs}
     if sum(math.prod(shape) for shape in shapes.values()) <= _MOST_NUMBERS:
         body = _body({s.name: _nested(_value(s), shapes[s.name]) for s in inputs}, rows)
-        return _CURL.substitute(name=bundle.name, comments=comments, body=body)
+        return filled("serving_rest.sh", name=bundle.name, comments=comments, body=body)
     calls = (f"{quoted(s.name)}: full({', '.join([repr(_value(s)), *map(str, shapes[s.name])])})" for s in inputs)
     feeds = f"{{{', '.join(calls)}}}"
     given = f'"instances": [{feeds}]' if rows else f'"inputs": {feeds}'
     body = f'{{"signature_name": "serving_default", {given}}}'
-    return _CURL_LARGE.substitute(name=bundle.name, comments=comments, body=body)
+    return filled("serving_rest_large.sh", name=bundle.name, comments=comments, body=body)
 
 
 def grpc(bundle: Bundle) -> str:
@@ -96,7 +55,7 @@ def grpc(bundle: Bundle) -> str:
         "answer = stub.Predict(request, 10.0)  # seconds",
         "outputs = {name: tf.make_ndarray(tensor) for name, tensor in answer.outputs.items()}",
     ]
-    return _GRPC.substitute(play=play(bundle, run))
+    return filled("serving_grpc.py", play=play(bundle, run))
 
 
 def _body(feeds: dict[str, Any], rows: bool) -> str:
