@@ -1,0 +1,1 @@
+"""What a policy is written for: the programs that load it, with the rules that they have."""

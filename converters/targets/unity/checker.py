@@ -1,0 +1,170 @@
+"""What Unity would say to a file: importing it, loading it for running, and the Inspector's list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from converters.barracuda import format as nn_format
+from converters.recognise import read_bytes, recognise_path
+from converters.targets.unity import barracuda_model, importing, rules, sentis_model, trial_run
+from converters.targets.unity.consumers import Consumer, Engine
+from converters.targets.unity.findings import Finding, Thrown, UnityThrows
+from converters.targets.unity.model import CheckedModel
+from converters.targets.unity.onnx_file import OnnxFile, read_onnx_file
+from converters.targets.unity.settings import Brain
+from signatures.errors import SourceError
+
+#: Deterministic Inference of Behavior Parameters: off and on.
+MODES = {"stochastic": False, "deterministic": True}
+_NN_FORMATS = range(16, 21)
+#: Barracuda takes its format's number from the first eight bytes, which hold a magic number too.
+_MAGIC = 255
+
+
+@dataclass(frozen=True, slots=True)
+class ModeVerdict:
+    """What happens with Deterministic Inference off, or on.
+
+    ``load`` is what loading for running throws; ``checks`` the Inspector's list, in its order, and ``check_throws`` the
+    exception that takes its place; ``fetched`` the outputs that a player fetches, or the exception of finding them.
+    """
+
+    load: Thrown | None
+    checks: tuple[Finding, ...]
+    check_throws: Thrown | None = None
+    fetched: tuple[str, ...] | Thrown = ()
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it loads and the Inspector's list is empty."""
+        return self.load is None and self.check_throws is None and not self.checks
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        fetched = self.fetched.to_dict() if isinstance(self.fetched, Thrown) else list(self.fetched)
+        return {
+            "accepted": self.accepted,
+            "load": None if self.load is None else self.load.to_dict(),
+            "check": [f.to_dict() for f in self.checks],
+            "check_throws": None if self.check_throws is None else self.check_throws.to_dict(),
+            "fetched": fetched,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class UnityVerdict:
+    """What one release says to one file with one set of Behavior Parameters."""
+
+    path: Path
+    consumer: Consumer
+    brain: Brain
+    refused: Thrown | None
+    modes: Mapping[str, ModeVerdict] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> Mapping[str, bool]:
+        """Mode → whether the file is accepted in it."""
+        return {mode: mode in self.modes and self.modes[mode].accepted for mode in MODES}
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "release": self.consumer.name,
+            "package": self.consumer.package,
+            "runtime": self.consumer.runtime,
+            "brain": self.brain.to_dict(),
+            "accepted": dict(self.accepted),
+            "import": None if self.refused is None else self.refused.to_dict(),
+            **{mode: verdict.to_dict() for mode, verdict in self.modes.items()},
+        }
+
+
+def check_file(path: Path, consumer: Consumer, brain: Brain) -> UnityVerdict:
+    """Hold a file against the rules of a release. Raises SourceError, DamagedFileError for a file that is neither."""
+    kind = recognise_path(path).key
+    if kind == "nn" or (path.suffix.lower() == ".nn" and kind != "onnx"):
+        return _check_nn(path, consumer, brain)
+    if kind != "onnx":
+        raise SourceError(
+            "is no .onnx and no .nn",
+            where=str(path),
+            why="Unity's importers read these two",
+            fix=f"export it with --for {consumer.profile}, and check what that writes",
+        )
+    file = read_onnx_file(path)
+    refused = importing.refusal(file, consumer)
+    if refused is not None:
+        return UnityVerdict(path, consumer, brain, refused)
+    if consumer.engine is Engine.BARRACUDA:
+        return _verdict(path, consumer, brain, barracuda_model.of_onnx(file))
+    return _verdict(path, consumer, brain, sentis_model.of_onnx(file, consumer), file)
+
+
+def _check_nn(path: Path, consumer: Consumer, brain: Brain) -> UnityVerdict:
+    if consumer.engine is not Engine.BARRACUDA:
+        thrown = Thrown(
+            "no importer",
+            f"{consumer.runtime} does not read .nn",
+            str(path),
+            f"export it with --for {consumer.profile}",
+            worded=False,
+        )
+        return UnityVerdict(path, consumer, brain, thrown)
+    data = read_bytes(path)
+    version = int.from_bytes(data[:8], "little", signed=True) % _MAGIC
+    if version not in _NN_FORMATS:
+        thrown = Thrown(
+            "NotSupportedException",
+            f"Format version not supported: {version}",
+            str(path),
+            "export it with --to nn, or with --for barracuda-3: both write a version that is read",
+        )
+        return UnityVerdict(path, consumer, brain, thrown)
+    return _verdict(path, consumer, brain, barracuda_model.of_nn(nn_format.parse(data)))
+
+
+def _verdict(
+    path: Path, consumer: Consumer, brain: Brain, model: CheckedModel, file: OnnxFile | None = None
+) -> UnityVerdict:
+    modes = {name: _mode(model, consumer, brain, deterministic, file) for name, deterministic in MODES.items()}
+    return UnityVerdict(path, consumer, brain, None, modes)
+
+
+def _mode(
+    model: CheckedModel, consumer: Consumer, brain: Brain, deterministic: bool, file: OnnxFile | None
+) -> ModeVerdict:
+    if isinstance(model, sentis_model.SentisModel) and file is not None:
+        thrown = trial_run.failure(file, consumer) or _throws(lambda: model.load(deterministic))
+        if thrown is not None:
+            return ModeVerdict(thrown, (), thrown, thrown)
+    checks: tuple[Finding, ...] = ()
+    check_throws = None
+    try:
+        checks = tuple(rules.check(model, brain, deterministic, consumer.profile))
+    except UnityThrows as raised:
+        check_throws = raised.thrown
+    fetched: tuple[str, ...] | Thrown
+    try:
+        fetched = model.fetched(deterministic)
+    except UnityThrows as raised:
+        fetched = raised.thrown
+    return ModeVerdict(_load(model, consumer), checks, check_throws, fetched)
+
+
+def _load(model: CheckedModel, consumer: Consumer) -> Thrown | None:
+    try:
+        error = rules.version_error(model, consumer.profile)
+    except UnityThrows as raised:
+        return raised.thrown
+    return None if error is None else Thrown("UnityAgentsException", error.message, error.where, error.fix)
+
+
+def _throws(step: Callable[[], None]) -> Thrown | None:
+    try:
+        step()
+    except UnityThrows as raised:
+        return raised.thrown
+    return None

@@ -1,0 +1,70 @@
+"""What a check comes to: messages of Unity's lists, exceptions that Unity throws, and what Unity does not say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+
+class Severity(StrEnum):
+    """The type of a message in the list of ML-Agents' Inspector, by Unity's own names."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    INFO = "info"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong: ``message`` in Unity's words where Unity says it, ``where`` it lies, how to mend it."""
+
+    severity: Severity
+    message: str
+    where: str
+    fix: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {"severity": self.severity.value, "message": self.message, "where": self.where, "fix": self.fix}
+
+
+@dataclass(frozen=True, slots=True)
+class Thrown:
+    """An exception of Unity's: its C# class, its message, what in the file it comes from, how to mend it.
+
+    ``worded`` is false where Unity's own words are not known; ``message`` then says what happens.
+    """
+
+    exception: str
+    message: str
+    where: str
+    fix: str
+    worded: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "exception": self.exception,
+            "message": self.message,
+            "where": self.where,
+            "fix": self.fix,
+            "worded_by_unity": self.worded,
+        }
+
+
+class UnityThrows(Exception):  # noqa: N818 (it is no error of this project)
+    """Carries a ``Thrown`` out of the rule that meets it; caught inside of this package."""
+
+    def __init__(self, thrown: Thrown) -> None:
+        self.thrown = thrown
+        super().__init__(thrown.message)
+
+
+#: The text of a NullReferenceException, which says nothing of what is null.
+NULL_REFERENCE = "Object reference not set to an instance of an object."
+
+
+def null_reference(where: str, fix: str) -> Thrown:
+    """The exception of a value that is looked for and is not there."""
+    return Thrown("NullReferenceException", NULL_REFERENCE, where, fix)

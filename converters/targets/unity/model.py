@@ -1,0 +1,114 @@
+"""What ML-Agents' checkers ask of an imported model, whichever runtime imported it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+VERSION, MEMORY_SIZE = "version_number", "memory_size"
+CONTINUOUS_SHAPE, DISCRETE_SHAPE = "continuous_action_output_shape", "discrete_action_output_shape"
+IS_CONTINUOUS, ACTION_SHAPE = "is_continuous_control", "action_output_shape"
+ACTION, CONTINUOUS, DISCRETE = "action", "continuous_actions", "discrete_actions"
+DETERMINISTIC = "deterministic_"
+RECURRENT_IN, RECURRENT_OUT = "recurrent_in", "recurrent_out"
+#: Lowest and highest API version that release 17 and later load.
+FIRST_VERSION, LAST_VERSION = 2, 3
+_MOST_NEGATIVE = -(1 << 31)
+
+
+@dataclass(frozen=True, slots=True)
+class InputView:
+    """An input as the checker reads it: lengths by Unity's names for axes, 0 or 1 for those the file leaves free.
+
+    ``last`` is the length of the last axis as the runtime orders them.
+    """
+
+    name: str
+    height: int
+    width: int
+    channels: int
+    last: int
+
+
+class CheckedModel(ABC):
+    """An imported model. What raises says so: ``UnityThrows`` with the exception that Unity throws there."""
+
+    #: What is called missing when nothing of that name is there.
+    inputs: tuple[InputView, ...] = ()
+    outputs: tuple[str, ...] = ()
+    memories: tuple[str, ...] = ()
+    #: Whether outputs are found by a part of their name.
+    by_substring: ClassVar[bool] = False
+
+    @abstractmethod
+    def constant(self, name: str) -> np.ndarray | None:
+        """A constant's values, one after the other; None where there is none of that name."""
+
+    @property
+    @abstractmethod
+    def version(self) -> int:
+        """The API version."""
+
+    @property
+    @abstractmethod
+    def memory_size(self) -> int:
+        """The memory's size, 0 for none."""
+
+    @abstractmethod
+    def has_continuous(self, deterministic: bool) -> bool:
+        """Whether there are continuous actions to fetch."""
+
+    @abstractmethod
+    def has_discrete(self, deterministic: bool) -> bool:
+        """Whether there are discrete actions to fetch."""
+
+    @property
+    @abstractmethod
+    def continuous_size(self) -> int:
+        """The number of continuous actions that the model says it has."""
+
+    @property
+    @abstractmethod
+    def discrete_size(self) -> int:
+        """The sum of the branches that the model says it has."""
+
+    def has_output(self, name: str) -> bool:
+        """Whether an output is found under this name."""
+        if self.by_substring:
+            return any(name in output for output in self.outputs)
+        return name in self.outputs
+
+    @property
+    def names_kinds(self) -> bool:
+        """Whether actions come under names of their kind (ML-Agents 1.7 and later), not as ``action``."""
+        return self.has_output(CONTINUOUS) or self.has_output(DISCRETE)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Inputs and the memories that the runtime manages."""
+        return (*(i.name for i in self.inputs), *self.memories)
+
+    def fetched(self, deterministic: bool) -> tuple[str, ...]:
+        """The outputs that a player fetches."""
+        prefix = DETERMINISTIC if deterministic else ""
+        names = []
+        if self.names_kinds:
+            names += [prefix + CONTINUOUS] if self.has_continuous(deterministic) else []
+            names += [prefix + DISCRETE] if self.has_discrete(deterministic) else []
+        elif self.has_continuous(deterministic) or self.has_discrete(deterministic):
+            names = [ACTION]
+        return (*names, RECURRENT_OUT) if self.memory_size > 0 else tuple(names)
+
+
+def action_output(name: str, deterministic: bool) -> str:
+    """The name of an action output in this mode of inference."""
+    return DETERMINISTIC + name if deterministic else name
+
+
+def truncated(value: float) -> int:
+    """A float as C# casts it to int: towards zero; what does not fit becomes the most negative one."""
+    number = float(value)
+    return int(number) if abs(number) < -_MOST_NEGATIVE else _MOST_NEGATIVE
