@@ -1,4 +1,4 @@
-"""How the command line behaves as a whole: sources without a command's name, typos, --version, completion.
+"""How the command line behaves as a whole: sources without a command's name, typos, --version.
 
 Imports click only.
 """
@@ -9,18 +9,13 @@ import difflib
 from pathlib import Path
 
 import click
-from click.shell_completion import CompletionItem, get_completion_class
+from click.shell_completion import CompletionItem
 
 from exporter.version import __version__
 from signatures.errors import UsageError
 
-_PROGRAM = "export-model"
+PROGRAM = "export-model"
 _OWN = frozenset(("--help", "-h", "--version"))
-_SHELLS = {
-    "bash": 'add this to ~/.bashrc:  eval "$(export-model completion bash)"',
-    "zsh": 'add this to ~/.zshrc:  eval "$(export-model completion zsh)"',
-    "fish": "write it where fish looks:  export-model completion fish > ~/.config/fish/completions/export-model.fish",
-}
 
 
 class SourceGroup(click.Group):
@@ -40,7 +35,7 @@ class SourceGroup(click.Group):
         plain = word.replace("-", "").isalpha() and not word.startswith("-")
         close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7) if plain else []
         if close and not Path(word).exists():
-            raise UsageError(f"{word!r} is neither a command nor a file", fix=f"did you mean: {_PROGRAM} {close[0]}?")
+            raise UsageError(f"{word!r} is neither a command nor a file", fix=f"did you mean: {PROGRAM} {close[0]}?")
 
     def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Both ways to call the program."""
@@ -58,17 +53,7 @@ def show_version(ctx: click.Context, parameter: click.Parameter, wanted: bool) -
         return
     from converters.runtimes.registry import available_runtimes
 
-    click.echo(f"{_PROGRAM}, version {__version__}")
+    click.echo(f"{PROGRAM}, version {__version__}")
     here = [f"{i.name} {i.version or ''}".strip() for i in available_runtimes() if i.installed]
     click.echo(f"runtimes: {', '.join(here)}")
     ctx.exit()
-
-
-@click.command("completion")
-@click.argument("shell", type=click.Choice(tuple(_SHELLS)))
-def completion_command(shell: str) -> None:
-    """Print the script that completes commands, options and files; its last line says where it goes."""
-    found = get_completion_class(shell)
-    assert found is not None
-    click.echo(found(click.Command(_PROGRAM), {}, _PROGRAM, "_EXPORT_MODEL_COMPLETE").source())
-    click.echo(f"# {_SHELLS[shell]}")

@@ -19,9 +19,8 @@ from converters.registry import TARGETS
 from converters.runtimes.base import Progress
 from converters.runtimes.javascript.node import install_packages
 from converters.runtimes.registry import RUNTIMES, Runtime
+from exporter.cli.app import app
 from exporter.cli.console import Console
-from exporter.cli.main import app
-from exporter.cli.main import main as cli
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
@@ -413,7 +412,7 @@ def test_a_terminal_is_cleared_of_progress_before_a_result(
     shown = Terminal()
     monkeypatch.setattr(sys, "stderr", shown)
     monkeypatch.setenv("TERM", "xterm")
-    cli.app.main([str(BALL), "-o", str(tmp_path), *UNVERIFIED], standalone_mode=False)
+    app.main([str(BALL), "-o", str(tmp_path), *UNVERIFIED], standalone_mode=False)
     assert shown.getvalue().startswith("\r\x1b[2K  reading ")
     assert shown.getvalue().endswith("\r\x1b[2K")
     assert capsys.readouterr().out.startswith("continuous: ")

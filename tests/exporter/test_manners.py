@@ -12,7 +12,7 @@ import pytest
 
 import exporter
 from fixtures import path as fixture
-from tests.commands import export_model, is_refused
+from tests.commands import export_model, is_refused, python
 
 
 @pytest.mark.parametrize(("typo", "meant"), [("verfiy", "verify"), ("inspct", "inspect"), ("runtime", "runtimes")])
@@ -100,3 +100,20 @@ def test_bash_takes_the_script(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "-F" in done.stdout
+
+
+INTERRUPTED = """
+import sys
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "click":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+from exporter.cli.main import main
+main(["--help"])
+"""
+
+
+def test_an_interrupt_while_the_program_itself_is_loaded_is_no_traceback() -> None:
+    ran = python("-c", INTERRUPTED)
+    assert (ran.status, ran.out, ran.err) == (130, "", "\nstopped\n")

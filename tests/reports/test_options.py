@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from exporter.cli.app import app
 from exporter.cli.console import Console, Progress
-from exporter.cli.main import main as cli
 from exporter.export import pipeline
 from fixtures import path as fixture
 from tests.commands import Ran, export_model, is_refused
@@ -109,7 +109,7 @@ def test_colour_is_for_terminals_that_want_it(
     shown: Any = Terminal()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.stdout", shown)
-        cli.app.main([str(fixture("continuous")), "-o", str(tmp_path / "out")], standalone_mode=False)
+        app.main([str(fixture("continuous")), "-o", str(tmp_path / "out")], standalone_mode=False)
     assert ("\x1b[32mPASSED" in shown.getvalue()) is (no_colour == "")
     assert "PASSED" in shown.getvalue()
 

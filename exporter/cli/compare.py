@@ -1,0 +1,61 @@
+"""The command ``compare``. Imports click only; the rest when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from exporter.cli.console import Console, reporting
+from exporter.cli.options import comparing, pairs, understanding
+
+if TYPE_CHECKING:
+    from converters.graph.options import CompileOptions
+    from exporter.verify.subject import VerifyOptions
+
+
+@click.command("compare")
+@click.argument("reference", type=click.Path(path_type=Path))
+@click.argument("candidates", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CANDIDATE...")
+@click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call a name.")
+@click.option(
+    "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
+)
+@click.option("--allow-unverified", is_flag=True, help="Succeed although no runtime of theirs is installed.")
+@reporting
+@understanding
+@comparing
+def compare_command(
+    reference: Path,
+    candidates: tuple[Path, ...],
+    mapped: tuple[str, ...],
+    runtimes: str,
+    allow_unverified: bool,
+    compiling: CompileOptions,
+    console: Console,
+    options: VerifyOptions,
+) -> None:
+    """Hold artefacts that any tool made against a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    from exporter.compare.comparison import compare_artefacts
+    from exporter.reports.entry import Entry
+
+    console.prepare()
+    with console.progress() as progress:
+        report = compare_artefacts(
+            reference,
+            candidates,
+            names=pairs(mapped, "--map"),
+            runtimes=runtimes,
+            options=options,
+            understanding=compiling,
+            allow_unverified=allow_unverified,
+            progress=progress,
+        )
+    console.verified(report, ", ".join(map(str, candidates)))
+    console.check_rules([report])
+    console.json({"reports": [report.to_dict()]})
+    console.write_reports(lambda: [Entry(report, steps=options.steps)])
+    if report.passed is False:
+        sys.exit(1)

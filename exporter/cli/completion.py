@@ -1,0 +1,24 @@
+"""The command ``completion``. Imports click only."""
+
+from __future__ import annotations
+
+import click
+from click.shell_completion import get_completion_class
+
+from exporter.cli.group import PROGRAM
+
+_SHELLS = {
+    "bash": 'add this to ~/.bashrc:  eval "$(export-model completion bash)"',
+    "zsh": 'add this to ~/.zshrc:  eval "$(export-model completion zsh)"',
+    "fish": "write it where fish looks:  export-model completion fish > ~/.config/fish/completions/export-model.fish",
+}
+
+
+@click.command("completion")
+@click.argument("shell", type=click.Choice(tuple(_SHELLS)))
+def completion_command(shell: str) -> None:
+    """Print the script that completes commands, options and files; its last line says where it goes."""
+    found = get_completion_class(shell)
+    assert found is not None
+    click.echo(found(click.Command(PROGRAM), {}, PROGRAM, "_EXPORT_MODEL_COMPLETE").source())
+    click.echo(f"# {_SHELLS[shell]}")

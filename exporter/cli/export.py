@@ -1,0 +1,123 @@
+"""The command ``export``. Imports click only; the rest when it runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from exporter.cli.console import Console, reporting
+from exporter.cli.options import comparing, shapes, understanding
+
+if TYPE_CHECKING:
+    from converters.graph.options import CompileOptions
+    from exporter.export.pipeline import ExportResult
+    from exporter.reports.entry import Entry
+    from exporter.verify.subject import VerifyOptions
+
+TARGETS = "bytes,saved_model,tfjs,onnx"
+
+
+@click.command("export")
+@click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="SOURCE...")
+@click.option(
+    "-o",
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("exported"),
+    show_default=True,
+    help="Folder for the bundles.",
+)
+@click.option("--to", "targets", default=TARGETS, show_default=True, metavar="FORMATS", help="Formats to write.")
+@click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
+@click.option(
+    "--names",
+    type=click.Choice(["canonical", "source"]),
+    default="canonical",
+    show_default=True,
+    help="Tensor names: canonical, or the trainer's own (Unity looks those up).",
+)
+@click.option(
+    "--noise",
+    type=click.Choice(["lift", "keep", "zero"]),
+    default="lift",
+    show_default=True,
+    help="Noise drawn in the graph: an input, kept, or removed.",
+)
+@click.option("--deterministic", is_flag=True, help="Make 'action' the one without chance.")
+@click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
+@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
+@click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
+@click.option("--opset", type=int, default=15, show_default=True, help="ONNX opset.")
+@click.option(
+    "--verify",
+    "runtimes",
+    default="auto",
+    show_default=True,
+    metavar="auto|none|full|RUNTIME,...",
+    help="Runtimes to compare in.",
+)
+@reporting
+@understanding
+@comparing
+def export_command(
+    sources: tuple[Path, ...],
+    out: Path,
+    targets: str,
+    name: str | None,
+    opset: int,
+    runtimes: str,
+    step: int | None,
+    sensors: str,
+    labels: Path | None,
+    compiling: CompileOptions,
+    console: Console,
+    options: VerifyOptions,
+) -> None:
+    """Export policies (the command that is meant where none is named)."""
+    from converters.source import ReadOptions
+    from exporter.export.pipeline import ExportOptions, export
+
+    console.prepare(verifies=runtimes != "none")
+    job = ExportOptions(
+        out,
+        [t for t in targets.split(",") if t],
+        name,
+        compiling,
+        ReadOptions(step, shapes(sensors)),
+        opset,
+        runtimes,
+        options,
+        labels,
+    )
+    results = []
+    with console.progress() as progress:
+        for result in export(list(sources), job, progress):
+            results.append(result)
+            progress.clear()
+            console.result(result)
+    console.check_rules([r.report for r in results if r.report is not None])
+    console.json({"policies": [_result_dict(r) for r in results]})
+    console.next_step(results, compiling.names, job.targets)
+    console.write_reports(lambda: _entries(results, options.steps))
+    if any(r.passed is False for r in results):
+        sys.exit(1)
+
+
+def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:
+    from exporter.reports.entry import of_result
+
+    return [entry for entry in (of_result(result, steps) for result in results) if entry is not None]
+
+
+def _result_dict(result: ExportResult) -> dict[str, Any]:
+    return {
+        "name": result.policy.name,
+        "folder": str(result.folder),
+        "passed": result.passed,
+        "sizes": dict(result.sizes),
+        "parity": None if result.report is None else result.report.to_dict(),
+    }

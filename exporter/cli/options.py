@@ -1,0 +1,127 @@
+"""Options that several commands have, each group collected into what the job takes. Imports click only."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from exporter.cli.console import Console
+from signatures.errors import UsageError
+
+
+def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
+    """NAME=VALUE, given any number of times. Raises UsageError."""
+    found = {}
+    for value in values:
+        name, equals, rest = value.partition("=")
+        if not equals or not name or not rest:
+            raise UsageError(f"{flag} {value}: NAME=VALUE is expected", fix=f"for example {flag} action=Identity")
+        found[name] = rest
+    return found
+
+
+def shapes(text: str) -> tuple[tuple[int, ...], ...]:
+    """``"8,3x84x84"`` as the shapes of a vector of 8 and an image C, H, W."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    for part in parts:
+        if not re.fullmatch("[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}x[1-9][0-9]{0,6})?", part):
+            raise UsageError(
+                f"--sensors {text}: {part} is no shape of a sensor",
+                fix="give one shape per sensor: 8 for a vector, 3x84x84 (channels, height, width) for an image",
+            )
+    return tuple(tuple(int(n) for n in part.split("x")) for part in parts)
+
+
+def _numbers(values: Sequence[str]) -> dict[str, float]:
+    numbers = {}
+    words = {"true": 1.0, "false": 0.0}
+    for name, text in pairs(values, "--set").items():
+        try:
+            numbers[name] = words[text.lower()] if text.lower() in words else float(text)
+        except ValueError as error:
+            raise UsageError(f"--set {name}={text}: a number, true or false is expected") from error
+    return numbers
+
+
+def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that decide what inference cannot; the command gets them as ``compiling``, a CompileOptions.
+
+    A command's own --names, --noise and --deterministic go into it, too.
+    """
+
+    @functools.wraps(command)
+    def collected(
+        *args: Any, brain: str | None, inputs: Sequence[str], outputs: Sequence[str], values: Sequence[str], **rest: Any
+    ) -> Any:
+        from exporter.api import _compile_options
+
+        compiling = _compile_options(
+            rest.pop("names", "canonical"),
+            rest.pop("noise", "lift"),
+            bool(rest.pop("deterministic", False)),
+            brain,
+            pairs(inputs, "--input"),
+            pairs(outputs, "--output"),
+            _numbers(values),
+        )
+        return command(*args, compiling=compiling, **rest)
+
+    for option in (
+        click.option("--brain", metavar="NAME", help="Only this brain of a graph that holds several."),
+        click.option("--input", "inputs", multiple=True, metavar="N=ROLE", help="Say what an input is for."),
+        click.option("--output", "outputs", multiple=True, metavar="N=ROLE", help="Say what an output is."),
+        click.option("--set", "values", multiple=True, metavar="N=VALUE", help="Give a placeholder a fixed value."),
+    ):
+        collected = option(collected)
+    return collected
+
+
+def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
+    """How to compare; the command gets it as ``options``, a VerifyOptions with the rules of ``console``."""
+
+    @functools.wraps(command)
+    def collected(
+        *args: Any,
+        console: Console,
+        seed: int,
+        samples: int,
+        steps: int,
+        atol: float,
+        rtol: float,
+        golden: Path | None,
+        sizes: Sequence[str],
+        **rest: Any,
+    ) -> Any:
+        from exporter.verify.budget import parse_budget
+        from exporter.verify.subject import VerifyOptions
+        from exporter.verify.tolerances import Tolerance
+
+        tolerance = Tolerance(atol, rtol)
+        options = VerifyOptions(seed, samples, steps, tolerance, console.rules(), golden, parse_budget(sizes))
+        return command(*args, console=console, options=options, **rest)
+
+    for option in (
+        click.option(
+            "--samples", type=click.IntRange(1), default=2, show_default=True, help="Typical inputs per batch size."
+        ),
+        click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inputs."),
+        click.option(
+            "--steps", type=click.IntRange(1), default=4, show_default=True, help="Steps with the memory fed back."
+        ),
+        click.option("--max-size", "sizes", multiple=True, metavar="[FORMAT=]SIZE", help="Fail above this size: 1MB."),
+        click.option(
+            "--golden",
+            type=click.Path(path_type=Path, dir_okay=False),
+            metavar="FILE",
+            help="Recorded inputs (and outputs), an .npz.",
+        ),
+        click.option("--atol", type=float, default=1e-5, show_default=True, help="Absolute tolerance."),
+        click.option("--rtol", type=float, default=1e-5, show_default=True, help="Relative tolerance."),
+    ):
+        collected = option(collected)
+    return collected

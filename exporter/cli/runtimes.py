@@ -1,0 +1,49 @@
+"""The command ``runtimes``. Imports click only; the rest when it runs."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from signatures.errors import UsageError
+
+
+@click.group("runtimes", invoke_without_command=True)
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.pass_context
+def runtimes_command(ctx: click.Context, as_json: bool) -> None:
+    """Which runtimes are here, in which version, and how to install the others."""
+    if ctx.invoked_subcommand is not None:
+        return
+    from converters.runtimes.registry import available_runtimes
+    from exporter.cli.tables import table
+
+    found = available_runtimes()
+    if as_json:
+        rows = [{"name": i.name, "installed": i.installed, "version": i.version, "install": i.how} for i in found]
+        click.echo(json.dumps({"runtimes": rows}, indent=1))
+        return
+    cells = [[i.name, i.version or "-", "installed" if i.installed else i.how] for i in found]
+    click.echo(table(("runtime", "version", "state"), cells))
+
+
+@runtimes_command.command("install")
+@click.argument("name")
+def install_command(name: str) -> None:
+    """Install a runtime into the user's cache folder; "tfjs" and "tf1" stand for all whose names begin so."""
+    from converters.runtimes.registry import RUNTIMES
+
+    chosen = [r for r in RUNTIMES if r.name == name]
+    chosen = chosen or [r for r in RUNTIMES if r.name.startswith((f"{name}-", f"{name}."))]
+    steps = list(dict.fromkeys(r.install for r in chosen if r.install is not None))
+    if steps:
+        for install in steps:
+            install(lambda text: click.echo(text))
+        return
+    how = {r.name: r.find().how for r in chosen}.get(name)
+    raise UsageError(
+        f"runtimes install {name}: "
+        + ("there is no such runtime" if how is None else "this command does not install it"),
+        fix=how or "export-model runtimes lists the runtimes and how to install each",
+    )
