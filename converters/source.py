@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -73,7 +73,3 @@ class ReadOptions:
 
     step: int | None = None
     sensors: tuple[tuple[int, ...], ...] = ()
-
-
-#: A reader takes the path (a file whose content was recognised, or a folder) and gives its models.
-Reader = Callable[[Path, ReadOptions], "list[SourceModel]"]

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from converters.formats import DEFAULTS
 from converters.graph.options import CompileOptions
 from converters.graph.passes.noise import NoiseMode
-from converters.registry import TARGETS
 from converters.source import ReadOptions
 from exporter.export.labels import Labels
 from exporter.export.pipeline import ExportOptions, ExportResult, export, verify_folder
@@ -64,7 +64,7 @@ def export_model(
     session: Any = None,
     tf_function: Any = None,
     keras_model: Any = None,
-    to: str | Sequence[str] = TARGETS,
+    to: str | Sequence[str] = DEFAULTS,
     name: str | None = None,
     brain: str | None = None,
     names: str = "canonical",

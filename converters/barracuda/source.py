@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import to_graph
-from converters.source import ReadOptions, SourceModel
+from converters.fetch import Fetched
+from converters.source import SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.roles import ACTION_NAMES
 
@@ -16,16 +15,16 @@ _PARTS = ("_c", "_h")
 _BEFORE_NN = 1
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched) -> list[SourceModel]:
     """The one model in a file. Raises DamagedFileError, UnsupportedOpError, GraphError or SignatureError."""
-    model = parse(path.read_bytes())
+    model = parse(given.data)
     reading = to_graph(model)
     facts = SourceFacts(
         family="ML-Agents 0.7 (preview)" if model.number("version_number") == _BEFORE_NN else None,
         memory_layout=_memory_layout(model),
         notes=(*_notes(model), *reading.notes),
     )
-    return [SourceModel(reading.graph, (path,), facts)]
+    return [SourceModel(reading.graph, (given.path,), facts)]
 
 
 def _memory_layout(model: NnModel) -> tuple[str, ...]:

@@ -1,1 +1,7 @@
-"""Bundles: the folder that one policy is written to, with its contract; opened, embedded, exchanged."""
+"""Bundles, and the contract that every artefact of them embeds."""
+
+from converters.format import Format
+
+#: Its artefacts are read in its place (converters/read.py).
+BUNDLE = Format(key="bundle", label="a bundle of export-model", marker="policy.json")
+FORMATS = (BUNDLE,)

@@ -8,18 +8,17 @@ own: it is the source now, and the original that the result is compared with.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from converters.format import Format, Member
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph, NameScope, Node, topological
-from converters.registry import reader
 from converters.renaming import renamed
-from converters.source import ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 from converters.understand.signature import derived_notes
 from signatures.digest import sha256_hex
@@ -28,13 +27,6 @@ from signatures.roles import Role
 from signatures.spec import PolicySignature
 
 POLICY = "policy.json"
-#: The formats of a bundle, the one that is read first: kind, what its reader is given, the file that must be there.
-_FORMS = (
-    ("frozen_graph", "{name}.bytes", "{name}.bytes"),
-    ("saved_model", "saved_model", "saved_model/saved_model.pb"),
-    ("tfjs", "tfjs", "tfjs/model.json"),
-    ("onnx", "{name}.onnx", "{name}.onnx"),
-)
 _FIX = "export the policy again"
 #: The dtypes that TensorFlow.js has.
 _NARROW = ("float32", "int32", "bool")
@@ -158,26 +150,31 @@ def retyped(graph: Graph, contract: Contract) -> Graph:
 # ------------------------------------------------------------------ bundles
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
-    """The policy of a bundle, from its ``.bytes``, else its SavedModel, its TensorFlow.js model or its ONNX.
+def artefacts(folder: Path, formats: Sequence[Format]) -> list[tuple[Format, Path]]:
+    """The artefacts that lie in a bundle. Raises BundleError, where there is none too."""
+    name = _policy_json(folder / POLICY)["name"]
+    found = [(f, folder / f.main_of(name)) for f in formats if f.main and (folder / f.first_file_of(name)).exists()]
+    if not found:
+        raise BundleError("the bundle holds no model", where=str(folder), fix=_FIX)
+    return found
 
-    Raises BundleError where the file that is read is missing or not the one that policy.json names.
+
+def read_first(folder: Path, formats: Sequence[Format]) -> Member:
+    """The artefact that a bundle is read from: the first that policy.json names and that can be read.
+
+    Raises BundleError where a file of it is missing or not the one that policy.json names.
     """
-    content = _policy_json(path / POLICY)
+    content = _policy_json(folder / POLICY)
     name, files = content["name"], content["files"]
-    for kind, main, needed in _FORMS:
-        read_form = reader(kind)
-        if needed.format(name=name) not in files or read_form is None:
-            continue
-        given = path / main.format(name=name)
-        _check(path, main.format(name=name), files)
-        return [
-            replace(m, name=name, files=(path / POLICY, *m.files)) for m in read_form(given, ReadOptions(options.step))
-        ]
+    able = [f for f in formats if f.main and f.read is not None]
+    for found in able:
+        if found.first_file_of(name) in files:
+            _check(folder, {path: entry for path, entry in files.items() if found.owns(path, name)})
+            return Member(folder / found.main_of(name), name, files=(folder / POLICY,))
     raise BundleError(
         "names no file that can be read",
         where=POLICY,
-        why=f"a bundle has one of {', '.join(main.format(name=name) for _, main, _ in _FORMS)}",
+        why=f"a bundle has one of {', '.join(f.main_of(name) for f in able)}",
         fix=_FIX,
     )
 
@@ -198,11 +195,9 @@ def _policy_json(path: Path) -> dict[str, Any]:
     return {**content}
 
 
-def _check(folder: Path, main: str, files: Mapping[str, Any]) -> None:
+def _check(folder: Path, files: Mapping[str, Any]) -> None:
     """Raise BundleError unless the files of a format are those that policy.json names."""
     for relative, entry in files.items():
-        if relative != main and not relative.startswith(f"{main}/"):
-            continue
         file = folder / relative
         if not file.is_file():
             raise BundleError("is missing", where=relative, why=f"{POLICY} names it", fix=_FIX)

@@ -1,1 +1,83 @@
-"""TensorFlow 1.x checkpoints as sources, read without TensorFlow, and the folders that training leaves."""
+"""What training left: checkpoints with their graphs, and the folders of whole runs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from converters.format import Format, Member
+
+if TYPE_CHECKING:
+    from converters.content import Content
+    from converters.fetch import Fetched
+    from converters.source import ReadOptions, SourceModel
+
+#: The last bytes of a table (tensorflow/core/lib/io/format.h), which a checkpoint's index is.
+_TABLE_MAGIC = (0xDB4775248B80FB57).to_bytes(8, "little")
+#: The op of a node (field 2 of NodeDef, with its length) that keeps its value in a checkpoint.
+_VARIABLE = re.compile(rb"\x12(\x0aVariableV2|\x0bVarHandleOp|\x08Variable|\x12AutoReloadVariable)")
+_DATA = re.compile(r".+\.data-\d{5}-of-\d{5}")
+_LIST = ("model_checkpoint_path:", "all_model_checkpoint_paths:")
+
+
+def _is_checkpoint(file: Content) -> bool:
+    if file.text is not None:
+        return file.text.startswith(_LIST)
+    return file.data.endswith(_TABLE_MAGIC) or _DATA.fullmatch(file.name) is not None
+
+
+def _is_prefix(path: Path) -> bool:
+    return bool(path.name) and not path.is_dir() and path.with_name(path.name + ".index").is_file()
+
+
+def _is_run(path: Path) -> bool:
+    from converters.checkpoint.listing import behaviors
+
+    return path.is_dir() and bool(behaviors(path))
+
+
+def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    from converters.checkpoint.source import read
+
+    return read(given.path, options)
+
+
+def _members(folder: Path, options: ReadOptions) -> list[Member]:
+    from converters.checkpoint.run_folder import members
+
+    return members(folder, options)
+
+
+_STEPS = frozenset({"step"})
+FORMATS = (
+    Format(
+        key="checkpoint",
+        label="a TensorFlow checkpoint",
+        sniff=_is_checkpoint,
+        at=_is_prefix,
+        read=_read,
+        takes=_STEPS,
+    ),
+    Format(
+        key="raw_graph",
+        label="a graph with variables, as training begins with (raw_graph_def.pb)",
+        sniff=lambda file: file.is_graph and _VARIABLE.search(file.data) is not None,
+        read=_read,
+        takes=_STEPS,
+    ),
+    Format(
+        key="meta_graph",
+        label="a checkpoint's graph (.meta)",
+        sniff=lambda file: file.numbers >= {(1, 2), (2, 2)} and file.fields[0][:2] == (1, 2) and not file.is_graph,
+        read=_read,
+        takes=_STEPS,
+    ),
+    Format(
+        key="run_folder",
+        label="a folder that training left",
+        at=_is_run,
+        members=_members,
+        takes=frozenset({"step", "sensors"}),
+    ),
+)

@@ -1,1 +1,47 @@
-"""Frozen TensorFlow graphs: ``.bytes`` of Unity ML-Agents 0.1 to 0.6, ``frozen_graph_def.pb`` of 0.7 to 0.23."""
+"""Frozen TensorFlow graphs (GraphDef): read from ``.bytes`` and ``.pb``, and written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from converters.format import Format, Ports, WriteOptions
+
+if TYPE_CHECKING:
+    from converters.fetch import Fetched
+    from converters.policy import Policy
+    from converters.source import ReadOptions, SourceModel
+
+
+def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    from converters.frozen_graph.source import read
+
+    return read(given)
+
+
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+    from converters.frozen_graph.writer import write
+
+    return write(policy, options)
+
+
+def _ports(path: Path) -> Ports:
+    from converters.frozen_graph.ports import ports
+
+    return ports(path)
+
+
+FORMATS = (
+    Format(
+        key="bytes",
+        label="a TensorFlow graph (GraphDef)",
+        sniff=lambda file: file.is_graph,
+        read=_read,
+        write=_write,
+        main="{name}.bytes",
+        default=True,
+        ports=_ports,
+        runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
+    ),
+)

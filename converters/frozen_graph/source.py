@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from converters import schema
 from converters.bundle.source import facts_of, recalled
+from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
-from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.source import OriginalRun, SourceModel
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched) -> list[SourceModel]:
     """The one graph in a file; one that this tool wrote is what its contract says."""
-    definition = schema.parse(schema.GraphDef, path.read_bytes(), "TensorFlow graph")
+    definition = schema.parse(schema.GraphDef, given.data, "TensorFlow graph")
     graph, contract = recalled(from_graph_def(definition))
-    original = OriginalRun("tensorflow", path, definition=definition)
-    return [SourceModel(graph, (path,), facts_of(graph, contract), original=original)]
+    original = OriginalRun("tensorflow", given.path, definition=definition)
+    return [SourceModel(graph, (given.path,), facts_of(graph, contract), original=original)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from converters import schema
-from converters.artifact import Artifact, WriteOptions
+from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode, string_constant
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph
@@ -15,8 +15,11 @@ def with_contract(graph: Graph, contract: str) -> Graph:
     return Graph((*graph.nodes, string_constant(CONTRACT_NODE, contract)))
 
 
-def write(policy: Policy, options: WriteOptions) -> Artifact:
+def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     """The ``.bytes`` artefact."""
-    message = encode(with_contract(policy.graph, options.contract))
-    path = f"{policy.name}.bytes"
-    return Artifact("bytes", path, {path: schema.serialise(message)})
+    return {f"{policy.name}.bytes": frozen(policy, options.contract)}
+
+
+def frozen(policy: Policy, contract: str = "{}") -> bytes:
+    """The policy's GraphDef with its contract; without one, as the numpy reference needs it."""
+    return schema.serialise(encode(with_contract(policy.graph, contract)))

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from converters.format import Format
 from converters.graph.nodes import Graph
 from converters.live.functions import read_function, read_keras
 from converters.live.session import read_session
-from converters.recognise import FileKind
 from converters.source import SourceModel
 from signatures.digest import sha256_hex
 from signatures.errors import UsageError
 
 _KINDS = {
-    "session": (FileKind("session", "a live session"), read_session),
-    "tf_function": (FileKind("tf_function", "a live tf.function"), read_function),
-    "keras_model": (FileKind("keras_model", "a live Keras model"), read_keras),
+    "session": (Format(key="session", label="a live session"), read_session),
+    "tf_function": (Format(key="tf_function", label="a live tf.function"), read_function),
+    "keras_model": (Format(key="keras_model", label="a live Keras model"), read_keras),
 }
 #: What a caller may give: the parameters' names.
 LIVE = tuple(_KINDS)
@@ -29,7 +29,7 @@ LIVE = tuple(_KINDS)
 class Live:
     """What was read of a live object. ``sha256`` and ``size`` (bytes) are those of its frozen graph."""
 
-    kind: FileKind
+    format: Format
     model: SourceModel
     sha256: str
     size: int

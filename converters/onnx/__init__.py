@@ -1,1 +1,53 @@
-"""ONNX: opset 15 and IR 8 by default, which onnxruntime, onnxruntime-web and Unity's Inference Engine take."""
+"""ONNX models: read from every exporter that policies come from, and written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from converters.format import Format, Ports, WriteOptions
+
+if TYPE_CHECKING:
+    from converters.content import Content
+    from converters.fetch import Fetched
+    from converters.policy import Policy
+    from converters.source import ReadOptions, SourceModel
+
+
+def _sniff(file: Content) -> bool:
+    """ModelProto begins with its version (1), and has a graph (7) or opsets (8)."""
+    return bool(file.fields) and file.fields[0][:2] == (1, 0) and bool(file.numbers & {(7, 2), (8, 2)})
+
+
+def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    from converters.onnx.source import read
+
+    return read(given)
+
+
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+    from converters.onnx.writer import write
+
+    return write(policy, options)
+
+
+def _ports(path: Path) -> Ports:
+    from converters.onnx.ports import ports
+
+    return ports(path)
+
+
+FORMATS = (
+    Format(
+        key="onnx",
+        label="an ONNX model",
+        sniff=_sniff,
+        read=_read,
+        write=_write,
+        main="{name}.onnx",
+        default=True,
+        ports=_ports,
+        runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium"),
+    ),
+)

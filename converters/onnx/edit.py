@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from converters.fetch import read_bytes
 from converters.onnx.proto import load_external
-from converters.recognise import read_bytes
 
 _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
 _NORMAL = ("RandomNormal", "RandomNormalLike")

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from converters.fetch import MAX_BYTES, read_bytes
 from converters.graph.types import FLOAT32
-from converters.recognise import MAX_BYTES, read_bytes
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 _MAX_AXES = 32

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.fetch import Fetched
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import BATCH, Dim, TensorType
 from converters.onnx.importer.drafting import MAX_NODES
@@ -17,7 +18,6 @@ from converters.onnx.importer.node import DTYPES, STANDARD
 from converters.onnx.importer.table import TABLE
 from converters.onnx.memories import OnnxMemory, separate_memories
 from converters.onnx.proto import array_of, load_external, tensors
-from converters.recognise import read_bytes
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
@@ -61,9 +61,9 @@ class OnnxModel:
     memories: tuple[SeparateMemory, ...] = ()
 
 
-def read_onnx(path: Path) -> OnnxModel:
+def read_onnx(given: Fetched) -> OnnxModel:
     """Read a model. Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError."""
-    model, files = parse(path)
+    model, files = parse(given)
     opsets = _opsets(model)
     graph = model.graph
     constants = {t.name for t in graph.initializer}
@@ -81,7 +81,7 @@ def read_onnx(path: Path) -> OnnxModel:
     outputs, left_out = _outputs(raiser, [v.name for v in graph.output])
     return OnnxModel(
         raiser.graph(),
-        (path, *files),
+        (given.path, *files),
         f"{model.producer_name} {model.producer_version}".strip(),
         {v.name: raiser.values[v.name] for v in declared},
         outputs,
@@ -98,13 +98,13 @@ def read_onnx(path: Path) -> OnnxModel:
     )
 
 
-def parse(path: Path) -> tuple[Any, list[Path]]:
+def parse(given: Fetched) -> tuple[Any, list[Path]]:
     """(ModelProto without functions and with all its data, the files of that data). Raises DamagedFileError."""
     import onnx
     from google.protobuf.message import DecodeError
 
     try:
-        model = onnx.ModelProto.FromString(read_bytes(path))
+        model = onnx.ModelProto.FromString(given.data)
     except DecodeError as error:
         raise DamagedFileError(
             "cannot be decoded as ONNX", why="the file is cut off or damaged", fix="export or download it again"
@@ -116,7 +116,7 @@ def parse(path: Path) -> tuple[Any, list[Path]]:
             "the model has sparse weights", issues=[(model.graph.sparse_initializer[0].values.name, "Constant")]
         )
     model = _inlined(model)
-    return model, load_external(model.graph, path.parent)
+    return model, load_external(model.graph, given.path.parent)
 
 
 def _inlined(model: Any) -> Any:

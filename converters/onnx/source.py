@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from converters.fetch import Fetched
 from converters.onnx.reader import read_onnx
-from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.source import OriginalRun, SourceModel
 from converters.understand.onnx_trainers import understood
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched) -> list[SourceModel]:
     """The one model in a file. Raises SourceError, GraphError and their kinds.
 
     The model itself is run by onnxruntime, the draws of its samplers fed from outside (``lift``).
     """
-    model = read_onnx(path)
+    model = read_onnx(given)
     graph, facts = understood(model)
-    original = OriginalRun("onnxruntime", path, {"lift": list(model.draws)})
+    original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)})
     return [SourceModel(graph, model.files, facts, original=original)]

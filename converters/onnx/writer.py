@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.artifact import Artifact, WriteOptions
+from converters.format import WriteOptions
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.table import op_of, unsupported
 from converters.graph.passes.fuse import fuse
@@ -163,7 +163,7 @@ def _value_info(onnx: Any, spec: TensorSpec, batch: str = "batch") -> Any:
     )
 
 
-def write(policy: Policy, options: WriteOptions) -> Artifact:
+def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     """The ONNX artefact. Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering,
     GraphError when the checker refuses the result (a fault of this tool).
     """
@@ -205,8 +205,7 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
     onnx.helper.set_model_props(model, {CONTRACT_KEY: options.contract, **({TENSORS_KEY: tensors} if tensors else {})})
     data: bytes = model.SerializeToString(deterministic=True)
     _check(onnx, data, policy.name)
-    path = f"{policy.name}.onnx"
-    return Artifact("onnx", path, {path: data})
+    return {f"{policy.name}.onnx": data}
 
 
 def _check(onnx: Any, data: bytes, name: str) -> None:

@@ -6,29 +6,30 @@ import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 
-from converters.registry import TARGETS
+from converters.format import Format
 from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError, UsageError
 
-FORMATS = ("source", *TARGETS)
-#: Format → the runtimes that run it. "source" is the original file, read by a runtime of its own.
-RUNTIMES_OF = MappingProxyType({f: tuple(r.name for r in RUNTIMES if f in r.formats) for f in FORMATS})
 #: Runtimes that compute by themselves; numpy is this project's own.
 INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
+#: Runtimes that read originals by themselves.
+_ORIGINALS = tuple(r.name for r in RUNTIMES if "source" in r.formats)
 #: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for.
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
 _COMMANDS = MappingProxyType({r.name: r.command for r in RUNTIMES})
 
 
-def chosen_runtimes(wanted: str | Sequence[str], formats: Sequence[str]) -> tuple[tuple[str, ...], list[RuntimeInfo]]:
+def chosen_runtimes(
+    wanted: str | Sequence[str], formats: Iterable[Format]
+) -> tuple[tuple[str, ...], list[RuntimeInfo]]:
     """(runtimes to use, what is known of all of them) for ``auto``, ``none``, ``full`` or a list of names.
 
     Raises UsageError on a name that is none, RuntimeUnavailableError when one that was asked for is not installed.
     """
     infos = list(available_runtimes())
     known = {info.name: info for info in infos}
-    useful = [r for f in formats for r in RUNTIMES_OF[f]] + list(RUNTIMES_OF["source"])
+    useful = {*_ORIGINALS, *(r for f in formats for r in f.runtimes)}
     if wanted == "none":
         return (), infos
     if wanted == "auto":

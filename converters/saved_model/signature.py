@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.format import Port
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.renaming import renamed
@@ -45,6 +46,14 @@ class ModelSignature:
     def roots(self) -> list[str]:
         """The outputs' references."""
         return [normal_ref(t.name) for t in self.outputs.values()]
+
+    def ports(self) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
+        """Inputs and outputs as whoever calls the model must name them."""
+        inputs, outputs = (
+            tuple(Port(k, None if t.dtype is None else t.dtype.name, t.shape.dims, t.name) for k, t in side.items())
+            for side in (self.inputs, self.outputs)
+        )
+        return inputs, outputs
 
 
 def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Role]]:

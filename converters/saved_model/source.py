@@ -9,21 +9,23 @@ from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import training_graph
+from converters.fetch import Fetched
 from converters.frozen_graph.reader import read_graph
 from converters.saved_model.functions import frozen_by_tensorflow
 from converters.saved_model.reader import Saved, read_saved_model
 from converters.saved_model.signature import expose, fed_by_signature
-from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.source import OriginalRun, SourceModel
 from converters.understand.facts import SourceFacts
 
 FILE = "saved_model.pb"
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched) -> list[SourceModel]:
     """The policy behind ``serving_default`` (else the first signature)."""
+    path = given.path
     folder = path if path.is_dir() else path.parent
     file = folder / FILE if path.is_dir() else path
-    saved = read_saved_model(file.read_bytes())
+    saved = read_saved_model(given.bytes_of(file))
     values = sorted(p for p in folder.glob("variables/variables.*") if p.is_file())
     if saved.calls:
         return [_of_functions(folder, (file, *values), saved)]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.artifact import Artifact, WriteOptions
+from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.frozen_graph.writer import with_contract
 from converters.policy import Policy
@@ -51,7 +51,7 @@ def _fill(entries: Any, specs: Iterable[TensorSpec]) -> None:
             info.tensor_shape.dim.add(size=-1 if size is None else size)
 
 
-def write(policy: Policy, options: WriteOptions) -> Artifact:
+def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     """The SavedModel artefact."""
     message = schema.SavedModel(saved_model_schema_version=1)
     meta = message.meta_graphs.add()
@@ -62,4 +62,4 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
         definition.method_name = _METHOD
         _fill(definition.inputs, inputs)
         _fill(definition.outputs, outputs)
-    return Artifact("saved_model", "saved_model", {PATH: schema.serialise(message)})
+    return {PATH: schema.serialise(message)}

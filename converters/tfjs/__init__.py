@@ -1,1 +1,53 @@
-"""TensorFlow.js graph models: ``model.json`` and weight shards, made without the tensorflowjs package."""
+"""TensorFlow.js graph models: read from any converter, and written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from converters.format import Format, Ports, WriteOptions
+
+if TYPE_CHECKING:
+    from converters.fetch import Fetched
+    from converters.policy import Policy
+    from converters.source import ReadOptions, SourceModel
+
+
+def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    from converters.tfjs.source import read
+
+    return read(given)
+
+
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+    from converters.tfjs.writer import write
+
+    return write(policy, options)
+
+
+def _ports(path: Path) -> Ports:
+    from converters.tfjs.ports import ports
+
+    return ports(path)
+
+
+FORMATS = (
+    Format(
+        key="tfjs",
+        label="a TensorFlow.js model",
+        sniff=lambda file: "modelTopology" in (file.json or {}),
+        marker="model.json",
+        read=_read,
+        write=_write,
+        main="tfjs",
+        default=True,
+        ports=_ports,
+        runtimes=(
+            *("tfjs-cpu", "tfjs-wasm", "tfjs-webgl"),
+            *("tfjs-cpu@chromium", "tfjs-wasm@chromium"),
+        ),
+        predicts=True,
+        dtypes=frozenset({"float32", "int32", "bool"}),
+    ),
+)

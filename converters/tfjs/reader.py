@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.fetch import Fetched
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
@@ -53,10 +54,14 @@ class WebModel:
     contract: Any = None
 
 
-def read_model(path: Path) -> WebModel:
-    """Read a model.json and its shards. Raises DamagedFileError, NotAPolicyError, SourceError, GraphError."""
+def read_model(given: Fetched) -> WebModel:
+    """Read a model.json (or its folder) and its shards.
+
+    Raises DamagedFileError, NotAPolicyError, SourceError, GraphError.
+    """
+    path = given.path / MODEL if given.path.is_dir() else given.path
     try:
-        model = json.loads(path.read_bytes())
+        model = json.loads(given.bytes_of(path))
     except (ValueError, RecursionError) as error:
         raise _damaged("model.json is not JSON", str(error)[:200]) from error
     topology = model.get("modelTopology") if isinstance(model, dict) else None
@@ -71,7 +76,7 @@ def read_model(path: Path) -> WebModel:
             "or give the Keras model it came from",
         )
     try:
-        weights, shards = _weights(model.get("weightsManifest") or [], path.parent)
+        weights, shards = _weights(model.get("weightsManifest") or [], given, path.parent)
         if topology.get("library", {}).get("function"):
             _refuse_functions(topology)
         graph = Graph(topological([_node(entry, weights) for entry in topology["node"]]))
@@ -107,14 +112,16 @@ def _refuse_functions(topology: Mapping[str, Any]) -> None:
 # ------------------------------------------------------------------ weights
 
 
-def _weights(manifest: Sequence[Mapping[str, Any]], folder: Path) -> tuple[dict[str, np.ndarray], list[Path]]:
+def _weights(
+    manifest: Sequence[Mapping[str, Any]], given: Fetched, folder: Path
+) -> tuple[dict[str, np.ndarray], list[Path]]:
     """(name → value, the shards)."""
     found: dict[str, np.ndarray] = {}
     files: list[Path] = []
     for group in manifest:
         paths = [_shard(folder, name) for name in group["paths"]]
         files.extend(paths)
-        data = b"".join(_bytes(p) for p in paths)
+        data = b"".join(_bytes(given, p) for p in paths)
         at = 0
         for entry in group["weights"]:
             stored, shape = _stored(entry)
@@ -144,11 +151,12 @@ def _shard(folder: Path, name: str) -> Path:
     return path
 
 
-def _bytes(path: Path) -> bytes:
+def _bytes(given: Fetched, path: Path) -> bytes:
+    """A shard; that of a model without weights is empty."""
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise SourceError("cannot be read", where=path.name, why=error.strerror, fix=_FIX) from error
+        return given.bytes_of(path, empty=True)
+    except SourceError as error:
+        raise SourceError("cannot be read", where=path.name, why=error.why or error.what, fix=_FIX) from error
 
 
 def _stored(entry: Mapping[str, Any]) -> tuple[np.dtype, tuple[int, ...]]:

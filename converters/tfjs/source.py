@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from converters.bundle.source import contract_of, facts_of, redrawn, retyped
+from converters.fetch import Fetched
 from converters.saved_model.signature import expose
-from converters.source import ReadOptions, SourceModel
-from converters.tfjs.reader import MODEL, read_model
+from converters.source import SourceModel
+from converters.tfjs.reader import read_model
 from converters.tfjs.unfuse import unfuse
 from converters.understand.facts import SourceFacts
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched) -> list[SourceModel]:
     """The model's signature as a policy; one that this tool wrote is what its contract says."""
-    model = read_model(path / MODEL if path.is_dir() else path)
+    model = read_model(given)
     graph = unfuse(model.graph)
     if model.contract is None:
         graph, roles = expose(graph, model.signature)

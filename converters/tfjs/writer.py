@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.artifact import Artifact, WriteOptions
+from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.graph.nodes import Graph, Node
 from converters.graph.passes.fuse import fuse
@@ -143,7 +143,7 @@ def _shards(blob: bytes) -> Mapping[str, bytes]:
     return {f"group1-shard{i + 1}of{count}.bin": blob[i * SHARD_BYTES : (i + 1) * SHARD_BYTES] for i in range(count)}
 
 
-def write(policy: Policy, options: WriteOptions) -> Artifact:
+def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     """The TensorFlow.js artefact."""
     graph = fuse(for_tfjs(policy.graph), policy.fetches.values(), FUSED_ACTIVATIONS)
     entries, blob = _weights(graph)
@@ -167,4 +167,4 @@ def write(policy: Policy, options: WriteOptions) -> Artifact:
     text = json.dumps(model, separators=(",", ":"), ensure_ascii=True).encode()
     acting = {name: (_JS / name).read_bytes() for name in _ACTING}
     files = {"model.json": text, **shards, **acting}
-    return Artifact("tfjs", "tfjs", {f"tfjs/{name}": data for name, data in files.items()})
+    return {f"tfjs/{name}": data for name, data in files.items()}

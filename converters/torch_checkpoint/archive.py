@@ -14,12 +14,10 @@ import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from converters.recognise import read_bytes
 from converters.torch_checkpoint.unpickle import StorageType, Tensor, unpickle
 from signatures.errors import DamagedFileError, NotAPolicyError
 
@@ -53,9 +51,9 @@ class Storage:
 class Archive:
     """A checkpoint: ``value`` is what was saved, its tensors still in the file."""
 
-    def __init__(self, path: Path) -> None:
-        """Read it. Raises SourceError, NotAPolicyError, DamagedFileError."""
-        self._data = read_bytes(path)
+    def __init__(self, data: bytes) -> None:
+        """Read the bytes of a file. Raises SourceError, NotAPolicyError, DamagedFileError."""
+        self._data = data
         self._order: Literal["<", ">"] = "<"
         #: key → the storage's bytes
         self._storages: dict[str, memoryview] = {}

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from converters.fetch import Fetched
 from converters.source import ReadOptions, SourceModel
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.policy import to_graph
 from converters.torch_checkpoint.state import State
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The one policy of a checkpoint (``checkpoint.pt``, ``<behavior>-<step>.pt``).
 
     Raises NotAPolicyError for another file of PyTorch's, SourceError for a network that is not built or whose sensors
     the weights do not tell, DamagedFileError, UsageError for sensors that do not fit.
     """
-    graph, facts = to_graph(State(Archive(path)), options.sensors)
-    return [SourceModel(graph, (path,), facts)]
+    graph, facts = to_graph(State(Archive(given.data)), options.sensors)
+    return [SourceModel(graph, (given.path,), facts)]

@@ -18,7 +18,19 @@ if TYPE_CHECKING:
     from exporter.reports.entry import Entry
     from exporter.verify.subject import VerifyOptions
 
-TARGETS = "bytes,saved_model,tfjs,onnx"
+
+class _Lazy(click.Option):
+    """An option whose default is a function, shown in the help all the same."""
+
+    def get_default(self, ctx: click.Context, call: bool = True) -> Any:
+        """What the function gives."""
+        return super().get_default(ctx, call=True)
+
+
+def _formats() -> str:
+    from converters.formats import DEFAULTS
+
+    return ",".join(DEFAULTS)
 
 
 @click.command("export")
@@ -31,7 +43,15 @@ TARGETS = "bytes,saved_model,tfjs,onnx"
     show_default=True,
     help="Folder for the bundles.",
 )
-@click.option("--to", "targets", default=TARGETS, show_default=True, metavar="FORMATS", help="Formats to write.")
+@click.option(
+    "--to",
+    "targets",
+    cls=_Lazy,
+    default=_formats,
+    show_default=True,
+    metavar="FORMATS",
+    help="Formats to write.",
+)
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
 @click.option(
     "--names",

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.artifact import WriteOptions
-from converters.frozen_graph.writer import write as write_frozen
+from converters.format import Format, Port, Ports
+from converters.frozen_graph.writer import frozen
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
-from converters.ports import Interface, Port, interfaces_of
-from converters.runtimes.pool import RUNTIMES_OF, RuntimePool, chosen_runtimes
+from converters.read import ports_of
+from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun
 from exporter.export.bundle import POLICY, read_policy_json
@@ -51,10 +51,11 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A candidate's interface with the reference's names: what it is fed and asked for under its own."""
+    """A candidate's ports with the reference's names: what it is fed and asked for under its own."""
 
     label: str
-    interface: Interface
+    format: Format
+    ports: Ports
     #: canonical input → the candidate's port
     inputs: Mapping[str, Port]
     #: canonical output → the candidate's name of it
@@ -91,25 +92,27 @@ def compare_artefacts(
     be read, UsageError where a name of ``names`` is none, RuntimeUnavailableError where no runtime could run any.
     """
     policy, source = _reference(reference, understanding)
-    interfaces = [(path, found) for path in candidates for found in interfaces_of(path)]
-    if not interfaces:
+    artefacts = [(path, *found) for path in candidates for found in ports_of(path)]
+    if not artefacts:
         raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
-    aliases = _mapped(_aliases(policy, reference), names or {}, [i for _, i in interfaces])
+    aliases = _mapped(_aliases(policy, reference), names or {}, [p for *_, p in artefacts])
     made = _made_here(reference, policy)
-    labels = _labels(interfaces)
-    matched = [_match(lb, found, policy, aliases, made) for lb, (_, found) in zip(labels, interfaces, strict=True)]
-    used, known = chosen_runtimes(runtimes, [m.interface.format for m in matched])
+    labels = _labels(artefacts)
+    matched = [
+        _match(label, kind, ports, policy, aliases, made)
+        for label, (_, kind, ports) in zip(labels, artefacts, strict=True)
+    ]
+    used, known = chosen_runtimes(runtimes, [m.format for m in matched])
     with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
-        artifact = write_frozen(policy, WriteOptions("{}"))
-        frozen = Path(folder, artifact.main)
-        frozen.write_bytes(artifact.files[artifact.main])
+        reference_file = Path(folder, "reference.bytes")
+        reference_file.write_bytes(frozen(policy))
         subject = Subject(
             policy.name,
             policy.signature,
             policy.graph,
             {},
-            {m.label: _size(m.interface.path) for m in matched},
-            frozen,
+            {m.label: _size(m.ports.path) for m in matched},
+            reference_file,
             source,
             policy.source,
         )
@@ -124,7 +127,7 @@ def compare_artefacts(
     if report.passed is None and not allow_unverified:
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",
-            why=f"they are {', '.join(sorted({m.interface.format for m in matched}))}",
+            why=f"they are {', '.join(sorted({m.format.key for m in matched}))}",
             fix="export-model runtimes lists the runtimes and how to install each; or --allow-unverified",
         )
     return report
@@ -148,12 +151,12 @@ def _reference(path: Path, understanding: CompileOptions | None) -> tuple[Policy
     return policy, model.original
 
 
-def _labels(found: Sequence[tuple[Path, Interface]]) -> list[str]:
+def _labels(found: Sequence[tuple[Path, Format, Ports]]) -> list[str]:
     """What each candidate is called in the report: its format where that is enough, else with its path."""
-    formats = [i.format for _, i in found]
-    if len(set(formats)) == len(formats) and len({p for p, _ in found}) == 1:
+    formats = [kind.key for _, kind, _ in found]
+    if len(set(formats)) == len(formats) and len({path for path, *_ in found}) == 1:
         return formats
-    return [f"{interface.format} {_short(interface.path)}" for _, interface in found]
+    return [f"{kind.key} {_short(ports.path)}" for _, kind, ports in found]
 
 
 def _short(path: Path) -> str:
@@ -176,7 +179,7 @@ def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
     """Canonical name → what a candidate may call it: first what the reference's own file does, then the canonical."""
     keys: dict[str, str] = {}
     try:
-        own = interfaces_of(path)
+        own = [ports for _, ports in ports_of(path)]
     except ExportModelError:  # a checkpoint, a .nn: what nobody feeds by name has no names beside the policy's
         own = []
     for port in (p for i in own for p in (*i.inputs, *i.outputs) if p.tensor is not None):
@@ -189,10 +192,10 @@ def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
 
 
 def _mapped(
-    aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], interfaces: Sequence[Interface]
+    aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], artefacts: Sequence[Ports]
 ) -> dict[str, tuple[str, ...]]:
     """The aliases, with what --map says before all others of a name. Raises UsageError."""
-    ports = [p for i in interfaces for p in (*i.inputs, *i.outputs)]
+    ports = [p for i in artefacts for p in (*i.inputs, *i.outputs)]
     mapped = dict(aliases)
     for name, other in names.items():
         canonical = next((c for c, known in aliases.items() if _base(name) in known), None)
@@ -230,7 +233,12 @@ def _made_here(path: Path, policy: Policy) -> frozenset[str]:
 
 
 def _match(
-    label: str, interface: Interface, policy: Policy, aliases: Mapping[str, Sequence[str]], made: frozenset[str]
+    label: str,
+    kind: Format,
+    own: Ports,
+    policy: Policy,
+    aliases: Mapping[str, Sequence[str]],
+    made: frozenset[str],
 ) -> _Candidate:
     """The candidate's ports for the reference's names, and what does not fit."""
     problems: list[_Problem] = []
@@ -239,8 +247,8 @@ def _match(
         return next((p for a in aliases[spec.name] if (p := _find(a, ports)) is not None), None)
 
     signature = policy.signature
-    inputs = {s.name: p for s in signature.inputs if (p := port_of(s, interface.inputs)) is not None}
-    found = {s.name: p for s in signature.outputs if (p := port_of(s, interface.outputs)) is not None}
+    inputs = {s.name: p for s in signature.inputs if (p := port_of(s, own.inputs)) is not None}
+    found = {s.name: p for s in signature.outputs if (p := port_of(s, own.outputs)) is not None}
     lacking = [s for s in signature.inputs if s.name not in inputs]
     noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
     reached = {s.name: policy.graph.ancestors([s.name]) for s in signature.outputs}
@@ -249,23 +257,23 @@ def _match(
     spared = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
     for spec in signature.outputs:
         if spec.name not in found and spec.name not in spared:
-            text = f"there is no output {aliases[spec.name][0]!r}; there are {_names(interface.outputs)}"
+            text = f"there is no output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
             problems.append(_Problem(spec.name, text))
     for spec in lacking:
         if spec.role is not Role.NOISE and any(spec.name in reached[name] for name in found):
-            text = f"there is no input {aliases[spec.name][0]!r}; there are {_names(interface.inputs)}"
+            text = f"there is no input {aliases[spec.name][0]!r}; there are {_names(own.inputs)}"
             problems.append(_Problem(spec.name, text, blocking=True))
     for spec in signature.inputs:
         misfit = _misfit(spec, inputs[spec.name]) if spec.name in inputs else ""
         if misfit:
             problems.append(_Problem(spec.name, misfit, blocking=True))
-    constant, left = _constants(interface, policy, {p.name for p in inputs.values()})
-    if not interface.open:
+    constant, left = _constants(own, policy, {p.name for p in inputs.values()})
+    if not own.open:
         for port in left:
             text = f"it takes an input {port.name!r} that the reference has not"
             problems.append(_Problem(port.name, text, blocking=True))
     outputs = {n: p.name for n, p in found.items()}
-    return _Candidate(label, interface, inputs, outputs, constant, drawn, tuple(problems), spared)
+    return _Candidate(label, kind, own, inputs, outputs, constant, drawn, tuple(problems), spared)
 
 
 def _names(ports: Sequence[Port]) -> str:
@@ -294,15 +302,13 @@ def _dims(shape: Sequence[int | None]) -> str:
     return "[" + ", ".join("?" if n is None else str(n) for n in shape) + "]"
 
 
-def _constants(
-    interface: Interface, policy: Policy, taken: set[str]
-) -> tuple[dict[str, np.ndarray | None], list[Port]]:
+def _constants(own: Ports, policy: Policy, taken: set[str]) -> tuple[dict[str, np.ndarray | None], list[Port]]:
     """(the candidate's inputs that are not policy inputs but known: batch_size, sequence_length; those unknown)."""
     fixed = {_base(n): np.asarray(v) for n, v in policy.source.fixed.items()}
     batches = {_base(n) for n in policy.source.batch_sizes}
     constant: dict[str, np.ndarray | None] = {}
     left = []
-    for port in interface.inputs:
+    for port in own.inputs:
         base = _base(port.name)
         if port.name in taken:
             continue
@@ -328,11 +334,10 @@ def _entrants(
     pool: RuntimePool,
     failure: Failure,
 ) -> Iterator[Entrant]:
-    kind = candidate.interface.format
-    chosen = [r for r in RUNTIMES_OF[kind] if r in runtimes and r != "numpy"]
+    chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
         try:
-            model = pool.process(runtime).load(str(candidate.interface.path), **candidate.interface.options)
+            model = pool.process(runtime).load(str(candidate.ports.path), **candidate.ports.options)
         except RunFailedError as error:
             failure(candidate.label, runtime, error, "*")
             for problem in candidate.problems:
@@ -344,7 +349,9 @@ def _entrants(
             failure(candidate.label, runtime, RunFailedError(problem.text + hints.get(problem.name, "")), problem.name)
         if candidate.outputs and not blocked:
             run = _renamed(model, candidate)
-            yield Entrant(kind, runtime, run, list(candidate.outputs), model, candidate.label, candidate.drawn)
+            yield Entrant(
+                candidate.format.key, runtime, run, list(candidate.outputs), model, candidate.label, candidate.drawn
+            )
         unload(model)
 
 
@@ -352,10 +359,10 @@ def _same_numbers(
     candidate: _Candidate, policy: Policy, numpy_model: LoadedModel, model: LoadedModel
 ) -> dict[str, str]:
     """Missing output → a hint, where an output under another name has its numbers."""
-    left = [p.name for p in candidate.interface.outputs if p.name not in candidate.outputs.values()]
+    left = [p.name for p in candidate.ports.outputs if p.name not in candidate.outputs.values()]
     drawn = random_outputs(policy.graph, candidate.missing)
     wanted = [n for n in candidate.missing if n not in drawn]
-    if not wanted or not left or candidate.interface.open:
+    if not wanted or not left or candidate.ports.open:
         return {}
     case = draw_cases(policy.signature)[1]
     try:
@@ -377,7 +384,7 @@ def _renamed(model: LoadedModel, candidate: _Candidate) -> Callable[[Feeds, Sequ
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         rows = next((len(a) for a in feeds.values() if a.ndim), 1)
         given = {p.name: _cast(feeds[name], p.dtype) for name, p in candidate.inputs.items()}
-        ranks = {p.name: len(p.shape or ()) for p in candidate.interface.inputs}
+        ranks = {p.name: len(p.shape or ()) for p in candidate.ports.inputs}
         for name, value in candidate.constant.items():
             given[name] = np.full([1] * ranks[name], rows, np.int32) if value is None else np.asarray(value)
         answers = model.run(given, [candidate.outputs[n] for n in fetch])

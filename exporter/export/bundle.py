@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from converters.artifact import Artifact
+from converters.format import Artifact
 from converters.policy import Policy
 from exporter.version import __version__
 from signatures.digest import sha256_hex

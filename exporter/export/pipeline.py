@@ -10,14 +10,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from converters.artifact import Artifact, WriteOptions
+from converters.format import Artifact, Format, WriteOptions
+from converters.formats import DEFAULTS, WRITTEN, written
 from converters.frozen_graph.reader import read_graph
-from converters.frozen_graph.writer import write as write_frozen
+from converters.frozen_graph.writer import frozen
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
-from converters.registry import TARGETS, writer
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
@@ -39,7 +39,7 @@ class ExportOptions:
     """What ``export-model`` may be told; see the command line for the meaning of each."""
 
     out: Path = Path("exported")
-    targets: Sequence[str] = TARGETS
+    targets: Sequence[str] = DEFAULTS
     name: str | None = None
     compile: CompileOptions = field(default_factory=CompileOptions)
     read: ReadOptions = field(default_factory=ReadOptions)
@@ -88,10 +88,10 @@ def export(
     """
     if not paths:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
-    writers = {target: writer(target) for target in dict.fromkeys(options.targets)}
-    if not writers:
-        raise UsageError("--to names no format", fix=f"the formats are {', '.join(TARGETS)}")
-    runtimes, known = chosen_runtimes(options.verify, list(writers))
+    formats = [written(target) for target in dict.fromkeys(options.targets)]
+    if not formats:
+        raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
+    runtimes, known = chosen_runtimes(options.verify, formats)
     labels = read_labels(options.labels)
     jobs: list[_Job] = []
     origins: list[tuple[str, str]] = []
@@ -107,9 +107,9 @@ def export(
     for policy in (j.policy for j in jobs):
         bundle.recover(options.out / policy.name)
         bundle.check_replaceable(options.out / policy.name)
-    written = [(j, *_write(j, writers, options)) for j in jobs]
+    made = [(j, *_write(j, formats, options)) for j in jobs]
     with nullcontext(pool) if pool is not None else RuntimePool() as pool:
-        for job, content, artifacts in written:
+        for job, content, artifacts in made:
             policy = job.policy
             with _staged(options.out, content, artifacts) as stage, tempfile.TemporaryDirectory() as scratch:
                 report = None
@@ -121,7 +121,7 @@ def export(
                 failed = report is not None and report.passed is False
                 place = options.out / (f"{policy.name}.failed" if failed else policy.name)
                 bundle.put_in_place(stage, place)
-            yield ExportResult(policy, place, content, {a.format: a.size for a in artifacts}, report)
+            yield ExportResult(policy, place, content, {a.format.key: a.size for a in artifacts}, report)
 
 
 def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list[Policy]:
@@ -132,7 +132,7 @@ def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list
     return [replace(p, name=bundle.safe_name(p.name)) for p in policies]
 
 
-def _write(job: _Job, writers: Mapping[str, Any], options: ExportOptions) -> tuple[dict[str, Any], list[Artifact]]:
+def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tuple[dict[str, Any], list[Artifact]]:
     origin: dict[str, Any] = {"path": job.source.path.name, "sha256": job.source.sha256}
     if job.model.name is not None:
         origin["model"] = job.model.name
@@ -143,7 +143,7 @@ def _write(job: _Job, writers: Mapping[str, Any], options: ExportOptions) -> tup
     content = bundle.contract(job.policy, origin)
     with naming(job.source.path):
         how = WriteOptions(bundle.compact(content), options.opset)
-        return content, [write(job.policy, how) for write in writers.values()]
+        return content, [f.artifact(job.policy, how) for f in formats]
 
 
 @contextmanager
@@ -159,20 +159,19 @@ def _staged(out: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]
 
 def _subject(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> Subject:
     policy = job.policy
-    paths = {a.format: stage / a.main for a in artifacts}
+    paths = {a.format.key: stage / a.main for a in artifacts}
     reference = paths.get("bytes")
     if reference is None:
         # The numpy reference reads a .bytes; one is made for it where none was asked for.
-        artifact = write_frozen(policy, WriteOptions("{}"))
-        reference = scratch / artifact.main
-        reference.write_bytes(artifact.files[artifact.main])
+        reference = scratch / "reference.bytes"
+        reference.write_bytes(frozen(policy))
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     return Subject(
         policy.name,
         policy.signature,
         policy.graph,
         paths,
-        {a.format: a.size for a in artifacts},
+        {a.format.key: a.size for a in artifacts},
         reference,
         job.model.original,
         policy.source,
@@ -221,7 +220,7 @@ def verify_folder(
         {s.name: s.name for s in signature.outputs},
         source_map,
     )
-    used, known = chosen_runtimes(runtimes, list(artefacts))
+    used, known = chosen_runtimes(runtimes, [WRITTEN[key] for key in artefacts])
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     subject = Subject(name, signature, policy.graph, artefacts, _sizes(content), graph_file, original, source_map, keys)
     with RuntimePool() as pool:
@@ -272,22 +271,13 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
 def _artefacts(folder: Path, content: Mapping[str, Any]) -> dict[str, Path]:
     """Format → what a loader is given, for the formats whose files policy.json names."""
     name, files = content["name"], content["files"]
-    mains = {
-        "bytes": (f"{name}.bytes", f"{name}.bytes"),
-        "saved_model": ("saved_model/saved_model.pb", "saved_model"),
-        "tfjs": ("tfjs/model.json", "tfjs"),
-        "onnx": (f"{name}.onnx", f"{name}.onnx"),
-    }
-    return {kind: folder / main for kind, (file, main) in mains.items() if file in files}
+    return {key: folder / f.main_of(name) for key, f in WRITTEN.items() if f.first_file_of(name) in files}
 
 
 def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
-    sizes: dict[str, int] = {}
-    for path, entry in content["files"].items():
-        head = path.split("/")[0]
-        kind = head if head in ("saved_model", "tfjs") else path.rsplit(".", 1)[-1]
-        sizes[kind] = sizes.get(kind, 0) + int(entry["bytes"])
-    return sizes
+    name, files = content["name"], content["files"]
+    owned = {key: [e["bytes"] for path, e in files.items() if f.owns(path, name)] for key, f in WRITTEN.items()}
+    return {key: sum(found) for key, found in owned.items() if found}
 
 
 def _original_of(

@@ -7,18 +7,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from converters.format import Format
 from converters.graph.compile import compile_graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
-from converters.recognise import FileKind, not_readable, recognise_path
-from converters.registry import reader
+from converters.read import check_options, fetched, read_models
 from converters.source import ReadOptions, SourceModel
-from signatures.digest import sha256_hex
-from signatures.errors import ExportModelError, GraphError, SourceError, UsageError
+from signatures.errors import ExportModelError, GraphError, SourceError
 
-#: Kinds of source that have checkpoints of several steps, and those whose sensors have to be said.
-_STEPS = frozenset(("run_folder", "checkpoint", "raw_graph", "meta_graph"))
-_SENSORS = frozenset(("torch_checkpoint", "run_folder"))
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
 
@@ -52,7 +48,7 @@ class Source:
     """A file or folder that was read: its models, and where they came from."""
 
     path: Path
-    kind: FileKind
+    format: Format
     sha256: str
     size: int
     models: Sequence[SourceModel] = field(default_factory=tuple)
@@ -101,37 +97,16 @@ def live_source(kind: str, given: object) -> Iterator[Source]:
         place = Path(label(kind))
         with naming(place):
             live = read_live(kind, given, Path(folder))
-        yield Source(place, live.kind, live.sha256, live.size, [live.model])
+        yield Source(place, live.format, live.sha256, live.size, [live.model])
 
 
 def read_source(path: Path | str, options: ReadOptions | None = None) -> Source:
     """Read a source. Raises SourceError, NotAPolicyError, DamagedFileError or GraphError, each naming the file."""
     path = Path(path)
-    kind = recognise_path(path)
-    read = reader(kind.key)
-    if read is None:
-        raise not_readable(kind, path)
     options = options or ReadOptions()
-    _check_options(kind, path, options)
+    given, found = fetched(path)
+    check_options(found, path, options)
     with naming(path):
-        models = read(path, options)
-        files = sorted({f for model in models for f in model.files})
-        return Source(path, kind, _digest(files), sum(f.stat().st_size for f in files), models)
-
-
-def _check_options(kind: FileKind, path: Path, options: ReadOptions) -> None:
-    """Raise UsageError where an option was given that this kind of source has no use for."""
-    for flag, given, kinds in (("--step", options.step is not None, _STEPS), ("--sensors", options.sensors, _SENSORS)):
-        if given and kind.key not in kinds:
-            raise UsageError(
-                f"{flag} says nothing about this source",
-                where=str(path),
-                why=f"it is {kind.label}",
-                fix=f"leave {flag} out, or give " + ("a checkpoint or a run's folder" if flag == "--step" else "a .pt"),
-            )
-
-
-def _digest(files: Sequence[Path]) -> str:
-    """The sha256 of a single file, or of the hashes of several in the order of their names."""
-    hashes = [sha256_hex(f.read_bytes()) for f in files]
-    return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())
+        models = read_models(given, found, options)
+        files = {f for model in models for f in model.files}
+        return Source(path, found, given.digest(files), sum(f.stat().st_size for f in files), models)

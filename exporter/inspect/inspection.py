@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.artifact import WriteOptions
+from converters.format import Format, WriteOptions
+from converters.formats import WRITTEN
 from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
-from converters.registry import TARGETS, writer
 from converters.source import ReadOptions
 from exporter.cli.tables import size_text, table
 from exporter.export.bundle import safe_name
@@ -97,10 +97,12 @@ def inspect_source(
     found = []
     for policy in source.policies(options):
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
-        found.append(PolicyInspection(policy, ops, {t: _refusal(source.path, policy, t) for t in TARGETS}))
+        found.append(
+            PolicyInspection(policy, ops, {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()})
+        )
     return Inspection(
         source.path,
-        source.kind.label,
+        source.format.label,
         source.sha256,
         source.size,
         sum(len(m.graph.nodes) for m in source.models),
@@ -109,11 +111,11 @@ def inspect_source(
     )
 
 
-def _refusal(path: Path, policy: Policy, target: str) -> str | None:
+def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
     """Why a target cannot take the policy, None if it can: the writer is asked, nothing is kept."""
     try:
         with naming(path):
-            writer(target)(policy, WriteOptions("{}"))
+            target.artifact(policy, WriteOptions("{}"))
     except ExportModelError as error:
         return error.what
     return None

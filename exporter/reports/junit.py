@@ -9,7 +9,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 
-from converters.runtimes.pool import RUNTIMES_OF
+from converters.formats import FORMATS
 from exporter.cli.summary import explanation, verdict
 from exporter.reports.entry import Entry
 from exporter.reports.markup import printable
@@ -84,7 +84,7 @@ def _not_run(entry: Entry) -> dict[str, dict[str, str]]:
     for runtime, state in entry.report.runtimes.items():
         if state["status"] != "not run":
             continue
-        formats = [f for f, names in RUNTIMES_OF.items() if runtime in names and f in entry.report.sizes]
+        formats = [f.key for f in FORMATS if runtime in f.runtimes and f.key in entry.report.sizes]
         for kind in formats:
             missing.setdefault(kind, {})[runtime] = state["reason"] or "not run"
     return missing

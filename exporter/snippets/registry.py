@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from converters.formats import WRITTEN
 from exporter.snippets import csharp, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle
 from signatures.errors import BundleError, UsageError
@@ -76,10 +77,5 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
 
 
 def _has(bundle: Bundle, target: Target) -> bool:
-    mains = {
-        "bytes": f"{bundle.name}.bytes",
-        "saved_model": "saved_model/saved_model.pb",
-        "tfjs": "tfjs/model.json",
-        "onnx": f"{bundle.name}.onnx",
-    }
-    return any(all(mains[part] in bundle.files for part in need.split("+")) for need in target.needs)
+    has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
+    return any(has.issuperset(need.split("+")) for need in target.needs)

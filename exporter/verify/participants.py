@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.runtimes.pool import RUNTIMES_OF, RuntimePool
+from converters.formats import WRITTEN
+from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from exporter.verify.report import Comparison
 from exporter.verify.subject import Subject
@@ -48,7 +49,7 @@ class Entrant:
 def needed_runtimes(subject: Subject, runtimes: Sequence[str]) -> list[str]:
     """Those of ``runtimes`` that run something of this subject, the reference's first."""
     source = () if subject.source is None else (subject.source.runtime,)
-    useful = ["numpy", *source, *(r for kind in subject.artefacts for r in RUNTIMES_OF[kind])]
+    useful = ["numpy", *source, *(r for kind in subject.artefacts for r in WRITTEN[kind].runtimes)]
     return [r for r in dict.fromkeys(useful) if r == "numpy" or r in runtimes]
 
 
@@ -65,24 +66,23 @@ def entrants(
     """
     outputs = [s.name for s in subject.signature.outputs]
     yield Entrant("reference", "numpy", reference.run, outputs, reference, path=subject.reference)
-    pairs = [(kind, runtime) for kind in subject.artefacts for runtime in RUNTIMES_OF[kind]]
+    pairs = [(kind, runtime) for kind in subject.artefacts for runtime in WRITTEN[kind].runtimes]
     taking_part = [(kind, runtime) for kind, runtime in pairs if runtime in runtimes and runtime != "numpy"]
     # The others run while TensorFlow is still being imported; ``in_order`` puts the report right again.
     for kind, runtime in sorted(taking_part, key=lambda pair: pair[1] == _SLOWEST):
         path = subject.artefacts[kind]
         loads = {"": list(outputs)}
-        if kind == "saved_model":
+        if WRITTEN[kind].signatures:
             loads = {key: list(names[1]) for key, names in subject.signatures.items()}
         for key, names in loads.items():
             label = kind if key in ("", "serving_default") else f"{kind}:{key}"
             try:
-                shape = {"kind": "saved_model", "signature": key} if kind == "saved_model" else {"kind": "graph"}
-                model = pool.process(runtime).load(str(path), **shape)
+                model = pool.process(runtime).load(str(path), **WRITTEN[kind].loader(key))
             except RunFailedError as error:
                 failure(label, runtime, error, "*")
                 continue
             run = _limited(model.run, subject.signatures.get(key))
-            if kind == "tfjs":
+            if WRITTEN[kind].predicts:
                 run = _predicting(model, names)
             yield Entrant(label, runtime, run, names, model, path=path)
             unload(model)
@@ -94,9 +94,9 @@ def in_order(results: Iterable[Comparison], subject: Subject) -> tuple[Compariso
 
     def place(result: Comparison) -> tuple[int, int]:
         kind = result.format.partition(":")[0]
-        if kind not in kinds or result.runtime not in RUNTIMES_OF[kind]:
+        if kind not in kinds or result.runtime not in WRITTEN[kind].runtimes:
             return (-1, 0)
-        return kinds.index(kind), RUNTIMES_OF[kind].index(result.runtime)
+        return kinds.index(kind), WRITTEN[kind].runtimes.index(result.runtime)
 
     return tuple(sorted(results, key=place))
 

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from converters.runtimes.pool import FORMATS
+from converters.formats import WRITTEN
 from converters.runtimes.registry import RUNTIMES
 from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
@@ -59,7 +59,7 @@ def _rule(entry: Any, where: str) -> ToleranceRule:
         raise UsageError(
             "gives no reason", where=where, why="a tolerance other than the default is data with a reason", fix=_FIX
         )
-    known = {"format": [f for f in FORMATS if f != "source"] + ["reference"], "runtime": [r.name for r in RUNTIMES]}
+    known = {"format": [*WRITTEN, "reference"], "runtime": [r.name for r in RUNTIMES]}
     for key in ("policy", "format", "runtime", "output"):
         value = entry.get(key)
         if value is not None and (not isinstance(value, str) or not value):

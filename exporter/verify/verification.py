@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from converters.formats import narrows
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.run import run_graph
@@ -229,7 +230,7 @@ class _Verification:
             self._settled({name: got})[name],
             self._tolerance(name, entrant),
             free=self._ties(name, expected, entrant),
-            narrowed=entrant.format == "tfjs",
+            narrowed=narrows(entrant.format),
             rounding=rounding,
         )
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.artifact import WriteOptions
 from converters.barracuda.format import parse
+from converters.format import WriteOptions
+from converters.formats import WRITTEN
 from converters.graph.run import run_graph
-from converters.registry import TARGETS, writer
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError
 from signatures.roles import Role
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.corpus
 @pytest.mark.parametrize("path", params([p for p in public_files() if p.name != UNSLICED], lambda p: p.name[:70]))
 def test_a_public_model_compiles_and_is_written_in_four_formats(path: Path, shared: Path) -> None:
     source = read_source(path)
-    assert source.kind.key == "nn"
+    assert source.format.key == "nn"
     (policy,) = source.policies()
     signature, model = policy.signature, parse(path.read_bytes())
     given = {i.name: i.shape for i in model.inputs}
@@ -58,8 +58,8 @@ def test_a_public_model_compiles_and_is_written_in_four_formats(path: Path, shar
             feeds[spec.name] = np.ones(shape, np.float32)
     for name, value in run_graph(policy.graph, feeds, [s.name for s in signature.outputs]).items():
         assert np.isfinite(value).all(), name
-    for target in TARGETS:
-        artifact = writer(target)(policy, WriteOptions(json.dumps(signature.to_dict())))
+    for target in WRITTEN:
+        artifact = WRITTEN[target].artifact(policy, WriteOptions(json.dumps(signature.to_dict())))
         assert artifact.files
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.artifact import WriteOptions
-from converters.registry import writer
+from converters.format import WriteOptions
+from converters.formats import WRITTEN
 from converters.runtimes.pool import RuntimePool
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
@@ -58,7 +58,7 @@ def test_every_layer_computes_the_same_in_every_runtime(cases: list[Case], tmp_p
             ("tfjs", "tfjs-cpu"),
             ("tfjs", "tfjs-wasm"),
         ):
-            artifact = writer(target)(policy, WriteOptions("{}"))
+            artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
             folder = tmp_path / case.name / runtime
             for name, data in artifact.files.items():
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -10,13 +10,13 @@ import pytest
 from converters.barracuda.format import NnModel, Trailer, parse
 from converters.barracuda.graph import to_graph
 from converters.barracuda.source import read
+from converters.fetch import Fetched
 from converters.graph.compile import compile_graph
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.ops.samplers import reseed
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.policy import Policy
-from converters.source import ReadOptions
 from signatures.errors import DamagedFileError, SignatureError
 from signatures.roles import Role
 from tests.barracuda.nn_files import Maker, write_nn
@@ -42,7 +42,7 @@ def policy_of(model: NnModel, **options: object) -> Policy:
 def source_of(model: NnModel, folder: Path) -> tuple[Graph, object]:
     path = folder / "Brain.nn"
     path.write_bytes(write_nn(model))
-    (source,) = read(path, ReadOptions())
+    (source,) = read(Fetched(path))
     assert source.original is None
     assert source.files == (path,)
     return source.graph, source.facts

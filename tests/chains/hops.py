@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from converters.formats import WRITTEN
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.policy import Policy
-from converters.runtimes.pool import RUNTIMES_OF, RuntimePool
+from converters.runtimes.pool import RuntimePool
 from exporter.export.bundle import safe_name
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.difference import compare, floored
@@ -95,7 +96,7 @@ def assert_runs_alike(wanted: ExportResult, got: ExportResult, form: str, pool: 
     random = {s.name for s in signature.outputs if s.role is Role.SAMPLED}
     names = [s.name for s in signature.outputs if s.name not in random]
     kind = "tfjs" if form == "bundle" else form
-    runtime = next(r for r in RUNTIMES_OF[kind] if r != "numpy")
+    runtime = next(r for r in WRITTEN[kind].runtimes if r != "numpy")
     loading = {"kind": "saved_model"} if kind == "saved_model" else {"kind": "graph"}
     models = [
         pool.process(runtime).load(str(r.folder / _MAIN[kind].format(name=r.policy.name)), **loading)

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.recognise import recognise_path
+from converters.fetch import Fetched
+from converters.recognise import recognised
 from converters.source import ReadOptions
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
@@ -27,7 +28,7 @@ def frozen(place: Path, name: str = "continuous") -> Path:
 def read_from(folder: Path, step: int | None = None) -> dict[str, list[str]]:
     """Policy → the files that it was read from."""
     source = read_source(folder, ReadOptions(step=step))
-    assert source.kind.key == "run_folder"
+    assert source.format.key == "run_folder"
     names = [p.name for p in source.policies()]
     files = [sorted(str(f.relative_to(folder)) for f in m.files) for m in source.models]
     assert len(names) == len(files)
@@ -143,11 +144,11 @@ def test_names_of_several_behaviors_are_the_bundles(tmp_path: Path) -> None:
 
 def test_folders_are_told_apart(tmp_path: Path) -> None:
     (result,) = export([fixture("continuous.bytes")], ExportOptions(tmp_path, verify="none"))
-    assert recognise_path(result.folder).key == "bundle"
-    assert recognise_path(result.folder / "saved_model").key == "saved_model"
-    assert recognise_path(result.folder / "tfjs").key == "tfjs"
+    assert recognised(Fetched(result.folder)).key == "bundle"
+    assert recognised(Fetched(result.folder / "saved_model")).key == "saved_model"
+    assert recognised(Fetched(result.folder / "tfjs")).key == "tfjs"
     run_of(tmp_path / "run")
-    assert recognise_path(tmp_path / "run").key == "run_folder"
+    assert recognised(Fetched(tmp_path / "run")).key == "run_folder"
 
 
 def test_a_folder_without_a_model_says_what_is_in_it(tmp_path: Path) -> None:

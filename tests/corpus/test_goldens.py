@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.artifact import WriteOptions
+from converters.format import WriteOptions
+from converters.formats import WRITTEN
 from converters.policy import Policy
-from converters.registry import TARGETS, writer
-from converters.runtimes.pool import RUNTIMES_OF, RuntimePool
+from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
 from exporter.export.sources import read_source
 from exporter.verify.difference import compare
@@ -80,13 +80,13 @@ def answers(policy: Policy, folder: Path, pool: RuntimePool, source: Path) -> di
     """Runtime → (how to run it, whether draws can be fed to it)."""
     outputs = [s.name for s in policy.signature.outputs]
     result: dict[str, tuple[Answer, bool]] = {}
-    for target in TARGETS:
-        artifact = writer(target)(policy, WriteOptions("{}"))
+    for target in WRITTEN:
+        artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
         for name, data in artifact.files.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        for runtime in (r for r in RUNTIMES_OF[target] if r in ("numpy", *NEEDED)):
+        for runtime in (r for r in WRITTEN[target].runtimes if r in ("numpy", *NEEDED)):
             kind = {"kind": "saved_model"} if target == "saved_model" else {"kind": "graph"}
             model = pool.process(runtime).load(str(folder / artifact.main), **kind)
             feedable = runtime == "numpy"

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import exporter
-from converters.registry import TARGETS
+from converters.formats import WRITTEN
 from converters.runtimes.base import Progress
 from converters.runtimes.javascript.node import install_packages
 from converters.runtimes.registry import RUNTIMES, Runtime
@@ -109,7 +109,7 @@ def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) 
     assert lines[0].endswith(f" -> {tmp_path / 'continuous'}")
     assert lines[-1].startswith(f"next: export-model verify {tmp_path / 'continuous'}")
     assert "NOT VERIFIED: --verify none" in lines
-    assert [line.split()[0] for line in lines[3:7]] == list(TARGETS)
+    assert [line.split()[0] for line in lines[3:7]] == list(WRITTEN)
 
 
 def test_an_export_of_bytes_says_that_unity_wants_the_trainers_names(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_inspection_as_json_has_the_contract_of_each_policy() -> None:
     policy = ran.json["policies"][0]
     assert policy["memory"] == {"size": 32, "input": "recurrent_in", "output": "recurrent_out", "layout": ["c", "h"]}
     assert policy["branches"] == [3, 2]
-    assert policy["targets"] == {t: {"ok": True, "reason": None} for t in TARGETS}
+    assert policy["targets"] == {t: {"ok": True, "reason": None} for t in WRITTEN}
     assert policy["ops"]["Placeholder"] == 4
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.formats import DEFAULTS, WRITTEN
 from converters.runtimes import pool as pools
 from converters.runtimes.javascript import node as javascript
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
@@ -33,7 +34,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
 
 def names(wanted: str | list[str], *formats: str) -> tuple[str, ...]:
-    return chosen_runtimes(wanted, formats or ("bytes", "saved_model", "tfjs", "onnx"))[0]
+    return chosen_runtimes(wanted, [WRITTEN[f] for f in formats or DEFAULTS])[0]
 
 
 def test_what_is_installed_for_the_formats_is_chosen_by_itself(here: set[str]) -> None:
@@ -68,7 +69,7 @@ def test_names_that_are_none_or_not_installed_are_refused(here: set[str]) -> Non
 
 def test_what_is_known_is_told_whatever_is_chosen(here: set[str]) -> None:
     for wanted in ("none", "auto", "numpy"):
-        assert [info.name for info in chosen_runtimes(wanted, ["onnx"])[1]] == list(NAMES)
+        assert [info.name for info in chosen_runtimes(wanted, [WRITTEN["onnx"]])[1]] == list(NAMES)
 
 
 # ------------------------------------------------------------------ processes

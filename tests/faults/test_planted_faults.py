@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from converters.runtimes.pool import RUNTIMES_OF
+from converters.formats import WRITTEN
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import verify_folder
 from exporter.verify.report import Comparison, ParityReport
@@ -67,7 +67,7 @@ def test_a_fault_is_caught_and_pointed_at(fault: Fault, kind: str, bundle: Bundl
     assert wrong - {"reference"} == {kind}, "\n".join(failure_lines(report))
     assert ("reference" in wrong) <= (kind == "bytes")
     for runtime in RUNTIMES[kind]:
-        if runtime in RUNTIMES_OF[kind]:
+        if runtime in WRITTEN[kind].runtimes:
             _pointed_at(fault, kind, runtime, report)
 
 

@@ -15,13 +15,13 @@ import numpy.typing as npt
 import pytest
 
 from converters import schema
-from converters.artifact import WriteOptions
+from converters.format import WriteOptions
+from converters.formats import WRITTEN
 from converters.frozen_graph.encode import encode
 from converters.graph.nodes import Graph, Node
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType, static_shape
 from converters.policy import Policy
-from converters.registry import writer
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import available_runtimes
@@ -88,7 +88,7 @@ class Runtimes:
         return [results[name] for name in names]
 
     def _load(self, runtime: str, policy: Policy, target: str, opset: int = 15) -> LoadedModel:
-        artifact = writer(target)(policy, WriteOptions('{"tool": {"version": "test"}}', opset))
+        artifact = WRITTEN[target].artifact(policy, WriteOptions('{"tool": {"version": "test"}}', opset))
         root = self._folder / str(next(self._numbers))
         for name, data in artifact.files.items():
             path = root / name

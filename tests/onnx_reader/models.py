@@ -15,6 +15,7 @@ import pytest
 from onnx import helper, numpy_helper
 
 from converters import schema
+from converters.fetch import Fetched
 from converters.frozen_graph.encode import encode
 from converters.graph.nodes import Graph, Node
 from converters.graph.passes.normalise import normalise
@@ -115,7 +116,7 @@ def save(message: Any, folder: Path, name: str = "model.onnx") -> Path:
 
 def raised_graph(path: Path, outputs: Sequence[str]) -> tuple[OnnxModel, Graph, list[str]]:
     """(the model, its graph as the passes begin with it, the nodes that give ``outputs``)."""
-    found = read_onnx(path)
+    found = read_onnx(Fetched(path))
     assert not found.left_out, found.left_out
     pins = [Node(f"output_{i}", "Identity", (found.outputs[name],)) for i, name in enumerate(outputs)]
     return found, normalise(Graph((*found.graph.nodes, *pins))), [p.name for p in pins]
@@ -130,7 +131,7 @@ def raised(path: Path, feeds: Mapping[str, Array], outputs: Sequence[str]) -> li
 
 def read(message: Any, folder: Path) -> OnnxModel:
     """A model through a file and the reader."""
-    return read_onnx(save(message, folder))
+    return read_onnx(Fetched(save(message, folder)))
 
 
 class Bench:

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.artifact import WriteOptions
-from converters.frozen_graph.writer import write
+from converters.frozen_graph.writer import frozen
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RuntimeProcess
@@ -39,9 +38,8 @@ def legacy(request: pytest.FixtureRequest) -> Iterator[RuntimeProcess]:
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem[:80])
 def test_runs_there_and_agrees(source: Path, legacy: RuntimeProcess, tmp_path: Path) -> None:
     (policy,) = read_source(source).policies()
-    artifact = write(policy, WriteOptions("{}"))
     path = tmp_path / "policy.bytes"
-    path.write_bytes(artifact.files[artifact.main])
+    path.write_bytes(frozen(policy))
     model = legacy.load(str(path))
     outputs = [s for s in policy.signature.outputs if s.role is not Role.SAMPLED]
     for case in draw_cases(policy.signature):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.artifact import WriteOptions
+from converters.format import WriteOptions
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.onnx.writer import CONTRACT_KEY, write
@@ -31,9 +31,9 @@ ORIGIN = {"path": "source", "sha256": "0" * 64}
 
 
 def written(policy: Policy, folder: Path, opset: int = 15) -> Path:
-    artifact = write(policy, WriteOptions(compact(contract(policy, ORIGIN)), opset))
+    (data,) = write(policy, WriteOptions(compact(contract(policy, ORIGIN)), opset)).values()
     place = folder / f"{policy.name}-{opset}.onnx"
-    place.write_bytes(artifact.files[artifact.main])
+    place.write_bytes(data)
     return place
 
 

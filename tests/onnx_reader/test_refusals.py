@@ -12,6 +12,7 @@ import onnx
 import pytest
 from onnx import TensorProto, numpy_helper
 
+from converters.fetch import Fetched
 from converters.onnx.reader import read_onnx
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
@@ -243,7 +244,7 @@ def test_no_nodes(tmp_path: Path) -> None:
     path = tmp_path / "empty.onnx"
     path.write_bytes(onnx.ModelProto(ir_version=8).SerializeToString())
     with pytest.raises(NotAPolicyError):
-        read_onnx(path)
+        read_onnx(Fetched(path))
 
 
 # ------------------------------------------------------------------ external data
@@ -278,7 +279,7 @@ def test_weights_outside_of_the_folder_are_refused(location: str, tmp_path: Path
     folder.mkdir()
     (tmp_path / "weights.data").write_bytes(bytes(64))
     with pytest.raises(DamagedFileError, match=r"folder|not there"):
-        read_onnx(external(folder, location))
+        read_onnx(Fetched(external(folder, location)))
 
 
 def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
@@ -288,7 +289,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     path = external(folder, "link.data")
     (folder / "link.data").symlink_to(tmp_path / "secret")
     with pytest.raises(DamagedFileError, match="outside"):
-        read_onnx(path)
+        read_onnx(Fetched(path))
 
 
 @pytest.mark.parametrize(("offset", "length"), [(0, 4096), (4096, 32), (-8, 32)])
@@ -299,4 +300,4 @@ def test_weights_that_are_too_short_are_refused(offset: int, length: int, tmp_pa
     entry.value = str(offset)
     save(message, tmp_path)
     with pytest.raises(DamagedFileError):
-        read_onnx(path)
+        read_onnx(Fetched(path))

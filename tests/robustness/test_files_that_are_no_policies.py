@@ -103,7 +103,7 @@ def test_what_this_tool_writes_is_recognised_by_its_content(tmp_path: Path) -> N
     assert export_model(fixture("continuous"), "-o", tmp_path, "--verify", "none").status == 0
     bundle = tmp_path / "continuous"
     kinds = {
-        "continuous.bytes": "frozen_graph",
+        "continuous.bytes": "bytes",
         "saved_model/saved_model.pb": "saved_model",
         "tfjs/model.json": "tfjs",
         "continuous.onnx": "onnx",

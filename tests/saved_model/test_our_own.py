@@ -67,8 +67,8 @@ def test_the_contract_is_kept(name: str, form: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("target", WITHOUT_ONNX)
 def test_the_contract_of_every_public_and_genuine_graph_is_kept(target: str, tmp_path: Path) -> None:
-    from converters.artifact import WriteOptions
-    from converters.registry import writer
+    from converters.format import WriteOptions
+    from converters.formats import WRITTEN
 
     sources = frozen_corpus() + [f / c["frozen"]["file"] for f, c in genuine_cases()]
     if not sources:
@@ -78,7 +78,7 @@ def test_the_contract_of_every_public_and_genuine_graph_is_kept(target: str, tmp
         for policy in read_source(source).policies():
             folder = tmp_path / f"{number}-{policy.name}"
             text = compact(contract(policy, {"path": source.name, "sha256": "0"}))
-            artifact = writer(target)(policy, WriteOptions(text))
+            artifact = WRITTEN[target].artifact(policy, WriteOptions(text))
             for relative, data in artifact.files.items():
                 (folder / relative).parent.mkdir(parents=True, exist_ok=True)
                 (folder / relative).write_bytes(data)

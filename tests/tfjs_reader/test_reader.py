@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from converters.fetch import Fetched
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
 from converters.tfjs.reader import read_model
@@ -177,7 +178,7 @@ def test_a_model_without_a_signature_goes_by_names(tmp_path: Path) -> None:
                 node["name"] = "log"
         content["modelTopology"]["node"].append({"name": "action", "op": "AddV2", "input": ["add", "add"], "attr": {}})
 
-    found = read_model(model(tmp_path, change) / "model.json")
+    found = read_model(Fetched(model(tmp_path, change)))
     assert found.signature.outputs == {}
 
 
@@ -260,5 +261,5 @@ def test_what_is_not_known_to_be_fused_is_refused(steps: tuple[str, ...], extra:
 def test_strings_in_attributes_are_base64() -> None:
     content = json.loads((OFFICIAL / "keras/model.json").read_text())
     node = next(n for n in content["modelTopology"]["node"] if n["op"] == "_FusedConv2D")
-    steps = read_model(OFFICIAL / "keras/model.json").graph[node["name"]].attrs["fused_ops"]
+    steps = read_model(Fetched(OFFICIAL / "keras")).graph[node["name"]].attrs["fused_ops"]
     assert steps == tuple(base64.b64decode(s).decode() for s in node["attr"]["fused_ops"]["list"]["s"])

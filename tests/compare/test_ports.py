@@ -9,7 +9,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from converters.ports import Port, interfaces_of
+from converters.format import Port
+from converters.read import ports_of
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
@@ -23,9 +24,9 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_format_of_a_bundle_has_the_same_ports(bundle: Path) -> None:
     content = json.loads((bundle / "policy.json").read_text())
-    found = interfaces_of(bundle)
-    assert [i.format for i in found] == ["bytes", "saved_model", "tfjs", "onnx"]
-    for interface in found:
+    found = ports_of(bundle)
+    assert [kind.key for kind, _ in found] == ["bytes", "saved_model", "tfjs", "onnx"]
+    for _, interface in found:
         inputs = {p.name: p for p in interface.inputs}
         assert set(inputs) == {i["name"] for i in content["inputs"]}
         assert {o["name"] for o in content["outputs"]} <= {p.name for p in interface.outputs}
@@ -36,7 +37,7 @@ def test_every_format_of_a_bundle_has_the_same_ports(bundle: Path) -> None:
 
 
 def test_a_graph_is_open_and_the_others_name_their_outputs(bundle: Path) -> None:
-    graph, *others = interfaces_of(bundle)
+    graph, *others = [ports for _, ports in ports_of(bundle)]
     assert graph.open
     assert not any(i.open for i in others)
     assert len(graph.outputs) > len(others[0].outputs) == len(others[1].outputs) == len(others[2].outputs)
@@ -44,7 +45,7 @@ def test_a_graph_is_open_and_the_others_name_their_outputs(bundle: Path) -> None
 
 def test_a_file_inside_stands_for_its_folder(bundle: Path) -> None:
     for file in ("saved_model/saved_model.pb", "tfjs/model.json"):
-        (inside,), (folder,) = interfaces_of(bundle / file), interfaces_of((bundle / file).parent)
+        (inside,), (folder,) = ports_of(bundle / file), ports_of((bundle / file).parent)
         assert inside == folder
 
 
@@ -59,7 +60,7 @@ def test_stored_weights_are_no_inputs_and_an_odd_dtype_is_not_known(tmp_path: Pa
     graph = helper.make_graph([helper.make_node("Mul", ["x", "w"], ["y"])], "g", ports, [result], [weight])
     file = tmp_path / "model.onnx"
     onnx.save(helper.make_model(graph), file)
-    (found,) = interfaces_of(file)
+    ((_, found),) = ports_of(file)
     assert found.inputs == (Port("x", "float32", (None, 3)), Port("s", None, None))
     assert found.outputs == (Port("y", "float32", (7, 3)),)
 
@@ -69,25 +70,25 @@ def test_an_op_that_nobody_knows_is_no_matter_here(tmp_path: Path, bundle: Path)
     model.graph.node[0].op_type = "Betainc"
     file = tmp_path / "model.onnx"
     onnx.save(model, file)
-    assert {p.name for p in interfaces_of(file)[0].inputs} == {p.name for p in interfaces_of(bundle)[3].inputs}
+    assert {p.name for p in ports_of(file)[0][1].inputs} == {p.name for p in ports_of(bundle)[3][1].inputs}
 
 
 def test_what_no_runtime_loads_by_itself_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "notes.txt"
     file.write_text("the policy is in the other folder\n")
     with pytest.raises(SourceError, match="cannot be compared") as caught:
-        interfaces_of(file)
+        ports_of(file)
     assert "export it" in (caught.value.fix or "")
 
 
 def test_damaged_files_are_named(tmp_path: Path, bundle: Path) -> None:
     (tmp_path / "model.json").write_text('{"modelTopology": {"node": [{"name": 1}]}, "format": "graph-model"}')
     with pytest.raises(DamagedFileError):
-        interfaces_of(tmp_path / "model.json")
+        ports_of(tmp_path / "model.json")
     cut = tmp_path / "cut.onnx"
     cut.write_bytes(next(bundle.glob("*.onnx")).read_bytes()[:-50])
     with pytest.raises(DamagedFileError):
-        interfaces_of(cut)
+        ports_of(cut)
 
 
 def test_a_saved_model_without_a_signature_cannot_be_called(tmp_path: Path, bundle: Path) -> None:
@@ -97,4 +98,4 @@ def test_a_saved_model_without_a_signature_cannot_be_called(tmp_path: Path, bund
     message.meta_graphs[0].signature_def.clear()
     (tmp_path / "saved_model.pb").write_bytes(message.SerializeToString())
     with pytest.raises(NotAPolicyError, match="no signature"):
-        interfaces_of(tmp_path)
+        ports_of(tmp_path)

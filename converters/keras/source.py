@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from converters.fetch import Fetched
 from converters.frozen_graph.reader import read_graph
 from converters.saved_model.functions import frozen_by_tensorflow
 from converters.saved_model.signature import expose
-from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.source import OriginalRun, SourceModel
 from converters.understand.facts import SourceFacts
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched) -> list[SourceModel]:
     """What calling the model computes, with ``training=False``."""
-    data, signature = frozen_by_tensorflow(path, "keras")
+    data, signature = frozen_by_tensorflow(given.path, "keras")
     graph, roles = expose(read_graph(data), signature)
-    original = OriginalRun("tensorflow", path, {"kind": "function", "form": "keras"})
-    return [SourceModel(graph, (path,), SourceFacts(roles=roles), None, original)]
+    original = OriginalRun("tensorflow", given.path, {"kind": "function", "form": "keras"})
+    return [SourceModel(graph, (given.path,), SourceFacts(roles=roles), None, original)]

@@ -1,0 +1,110 @@
+"""What can be seen of a file's bytes without reading its format: text, JSON, a ZIP archive, protobuf's fields."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import json
+import struct
+import zipfile
+from functools import cached_property
+from typing import Any
+
+_HEAD = 4096
+
+
+class Content:
+    """A file's bytes and name, looked at from all sides; each look is taken once. Nothing here raises."""
+
+    def __init__(self, data: bytes, name: str = "") -> None:
+        self.data, self.name = data, name
+        self.head = data[:_HEAD]
+
+    def starts(self, *beginnings: bytes) -> bool:
+        """Whether it begins with one of these."""
+        return self.head.startswith(beginnings)
+
+    @cached_property
+    def text(self) -> str | None:
+        """The beginning as text, white space before it left out; None where it is none."""
+        try:
+            text = codecs.getincrementaldecoder("utf-8-sig")().decode(self.head)  # may end inside a character
+        except UnicodeDecodeError:
+            return None
+        return None if any(ord(c) < 9 or 13 < ord(c) < 27 for c in text) else text.lstrip()
+
+    @cached_property
+    def json(self) -> dict[str, Any] | None:
+        """The object that it is in JSON, None where it is none."""
+        if self.text is None or not self.text.startswith("{"):
+            return None
+        try:
+            found: dict[str, Any] = json.loads(self.data)
+        except (ValueError, RecursionError):
+            return None
+        return found
+
+    @cached_property
+    def entries(self) -> list[str]:
+        """The names in a ZIP archive; empty where it is none, or damaged."""
+        if not self.starts(b"PK\x03\x04"):
+            return []
+        try:
+            return zipfile.ZipFile(io.BytesIO(self.data)).namelist()
+        except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, struct.error):
+            return []
+
+    @cached_property
+    def fields(self) -> list[tuple[int, int, bytes]]:
+        """(number, wire type, payload) of the first fields of a protobuf message; empty where it is none."""
+        return _fields(self.data) if self.text is None else []
+
+    @property
+    def numbers(self) -> set[tuple[int, int]]:
+        """(number, wire type) of the first fields of a protobuf message."""
+        return {(number, wire) for number, wire, _ in self.fields}
+
+    @cached_property
+    def is_graph(self) -> bool:
+        """Whether it is a GraphDef: it begins with a node (field 1), which has a name (1) and an op (2)."""
+        if not self.fields or self.fields[0][:2] != (1, 2):
+            return False
+        first = _fields(self.fields[0][2], 3)
+        return [field[:2] for field in first[:2]] == [(1, 2), (2, 2)] and _is_op_name(first[1][2])
+
+
+def _is_op_name(data: bytes) -> bool:
+    return bool(data) and data[:1].isalpha() | data.startswith(b"_") and all(c < 128 for c in data) and len(data) < 100
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while at < len(data) and shift < 64:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at += 1
+        if byte < 0x80:
+            return value, at
+        shift += 7
+    return -1, at
+
+
+def _fields(data: bytes, limit: int = 64) -> list[tuple[int, int, bytes]]:
+    found: list[tuple[int, int, bytes]] = []
+    at = 0
+    while at < len(data) and len(found) < limit:
+        tag, at = _varint(data, at)
+        number, wire = tag >> 3, tag & 7
+        if tag < 0 or number == 0 or wire not in (0, 1, 2, 5):
+            return found if at >= len(data) else []
+        if wire == 0:
+            start = at
+            _, at = _varint(data, at)
+            found.append((number, wire, data[start:at]))
+        else:
+            length, at = _varint(data, at) if wire == 2 else ({1: 8, 5: 4}[wire], at)
+            if length < 0:
+                return []
+            found.append((number, wire, data[at : at + length]))
+            at += length
+    return found

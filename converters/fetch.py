@@ -1,0 +1,88 @@
+"""What was given: a path, and the bytes of its files, each read from disk once."""
+
+from __future__ import annotations
+
+import difflib
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+
+from signatures.digest import sha256_hex
+from signatures.errors import DamagedFileError, SourceError
+
+#: Protobuf's own limit; no policy comes near it.
+MAX_BYTES = (2 << 30) - 1
+
+
+class Fetched:
+    """A path that was given. What a reader asks of it is kept for those that ask again: recognition, hashing."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read: dict[Path, bytes] = {}
+
+    @property
+    def data(self) -> bytes:
+        """The bytes of the file itself. Raises what ``read_bytes`` raises."""
+        return self.bytes_of(self.path)
+
+    def bytes_of(self, file: Path, *, empty: bool = False) -> bytes:
+        """The bytes of a file that belongs to it. Raises what ``read_bytes`` raises."""
+        if file not in self._read:
+            self._read[file] = read_bytes(file, empty=empty)
+        return self._read[file]
+
+    def inside(self, path: Path) -> Fetched:
+        """A path that belongs to it, given in its place."""
+        other = Fetched(path)
+        other._read = self._read
+        return other
+
+    def digest(self, files: Iterable[Path]) -> str:
+        """The sha256 of a single file, or of the hashes of several in the order of their names. Raises OSError."""
+        hashes = [sha256_hex(self._read[f] if f in self._read else f.read_bytes()) for f in sorted(set(files))]
+        return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())
+
+
+def read_bytes(path: Path, *, empty: bool = False) -> bytes:
+    """The file's bytes. Raises SourceError where it is missing, a folder or unreadable, DamagedFileError where it is
+    empty, unless it may be.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise SourceError(
+                "is a folder", where=str(path), why="a single model file is expected", fix="give a file in it"
+            )
+        if not stat.S_ISREG(status.st_mode):
+            raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
+        if status.st_size > MAX_BYTES:
+            raise SourceError(
+                f"has {status.st_size} bytes, and no model of 2 GiB or more is read",
+                where=str(path),
+                fix="give the frozen graph of the policy; it has some hundred kilobytes",
+            )
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise SourceError("no such file", where=str(path), fix=_neighbours(path)) from error
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except ValueError as error:  # a null character in the path
+        raise SourceError("is no path", where=repr(str(path)), why=str(error), fix="check the path") from error
+    if not data and not empty:
+        raise DamagedFileError("the file is empty", where=str(path), fix="copy or download it again")
+    return data
+
+
+def unreadable(path: Path, error: OSError) -> SourceError:
+    """What the system refused."""
+    return SourceError("cannot be read", where=str(path), why=error.strerror, fix="check the path and its permissions")
+
+
+def _neighbours(path: Path) -> str:
+    try:
+        names = sorted(p.name for p in path.parent.iterdir())
+    except OSError:  # there is no such folder, or it may not be listed
+        names = []
+    close = difflib.get_close_matches(path.name, names, n=1)
+    return f"did you mean {path.parent / close[0]}?" if close else "check the path"

@@ -1,0 +1,156 @@
+"""What a format is: one object, declared in the ``__init__`` of its room, that answers every question about it.
+
+How its files are recognised, read and written, what an artefact of it takes and gives, which runtimes run it, what it
+is called everywhere (``--to``, parity.json, tolerances, budgets). What is heavy is imported inside its functions, so
+that the list of formats (converters/formats.py) costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from converters.content import Content
+    from converters.fetch import Fetched
+    from converters.policy import Policy
+    from converters.source import ReadOptions, SourceModel
+
+Dims = tuple[int | None, ...]
+#: How a child process is told to load an artefact that has no signatures.
+_GRAPH: Mapping[str, Any] = MappingProxyType({"kind": "graph"})
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, and the profile's name where
+    the file is made for one consumer (``--for``).
+    """
+
+    contract: str
+    opset: int = 15
+    profile: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Artifact:
+    """One policy in one format, in memory: relative path (``/`` between parts) → bytes."""
+
+    format: Format
+    name: str
+    files: Mapping[str, bytes]
+
+    @property
+    def main(self) -> str:
+        """The path that a loader is given: a file, or the folder that all files lie in."""
+        return self.format.main_of(self.name)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files together."""
+        return sum(len(data) for data in self.files.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """An input or output: the name that a caller uses, its dtype (numpy's name) and shape where the file tells them.
+
+    ``tensor`` is the tensor behind the name, where the format has both (the signatures of TensorFlow).
+    """
+
+    name: str
+    dtype: str | None = None
+    shape: Dims | None = None
+    tensor: str | None = None
+
+
+@dataclass(frozen=True)
+class Ports:
+    """What an artefact takes and gives, whichever tool made it; ``path`` and ``options`` are what its loader takes.
+
+    ``open`` is set where any node can be asked for (a frozen graph): ``outputs`` are then all nodes that can be.
+    """
+
+    path: Path
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    open: bool = False
+
+
+@dataclass(frozen=True)
+class Member:
+    """A source inside of another (a run folder's export, a bundle's artefact), to be read in its place.
+
+    ``name`` is the policy's where the folder says it, ``notes`` go to the policy's, ``files`` are those that said so.
+    """
+
+    path: Path
+    name: str | None = None
+    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Format:
+    """A form in which policies are given, written or both. What it has not is None or empty.
+
+    - ``key`` is its one name, ``label`` what people call it, ``advice`` what to do where it cannot be read.
+    - ``sniff`` looks at a file's content. ``marker`` is the file that makes a folder one of this format; ``at`` says
+      whether a path that is no file (a folder, a checkpoint's prefix) stands for one.
+    - ``read`` gives the models of a file or folder; ``members`` instead says which sources inside are to be read.
+      ``takes`` are the options that mean something to it: ``step``, ``sensors``.
+    - ``write`` gives the files of an artefact by their path in the bundle; ``main`` is the one that a loader is given,
+      with ``{name}`` for the policy's name. A ``default`` is written unless ``--to`` says otherwise.
+    - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
+      ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
+      once; ``dtypes`` are the only ones that it has (empty: all).
+    """
+
+    key: str
+    label: str
+    advice: str = ""
+    sniff: Callable[[Content], bool] | None = None
+    marker: str = ""
+    at: Callable[[Path], bool] | None = None
+    read: Callable[[Fetched, ReadOptions], list[SourceModel]] | None = None
+    members: Callable[[Path, ReadOptions], list[Member]] | None = None
+    takes: frozenset[str] = frozenset()
+    write: Callable[[Policy, WriteOptions], Mapping[str, bytes]] | None = None
+    main: str = ""
+    default: bool = False
+    ports: Callable[[Path], Ports] | None = None
+    runtimes: tuple[str, ...] = ()
+    signatures: bool = False
+    predicts: bool = False
+    dtypes: frozenset[str] = frozenset()
+
+    @property
+    def readable(self) -> bool:
+        """Whether it is a source."""
+        return self.read is not None or self.members is not None
+
+    def main_of(self, name: str) -> str:
+        """The path in a bundle that a loader is given, for the policy ``name``."""
+        return self.main.format(name=name)
+
+    def first_file_of(self, name: str) -> str:
+        """The file in a bundle without which there is no artefact of this format."""
+        return self.main_of(name) + (f"/{self.marker}" if self.marker else "")
+
+    def owns(self, path: str, name: str) -> bool:
+        """Whether a file of the bundle of the policy ``name`` is of this format's artefact."""
+        main = self.main_of(name)
+        return path == main or (bool(self.marker) and path.startswith(f"{main}/"))
+
+    def artifact(self, policy: Policy, options: WriteOptions) -> Artifact:
+        """The policy in this format, which has a writer. Raises GraphError and its like where it cannot be."""
+        assert self.write is not None, f"{self.key} is not written"
+        return Artifact(self, policy.name, self.write(policy, options))
+
+    def loader(self, signature: str = "") -> Mapping[str, Any]:
+        """What a child process is told beside the path; ``signature`` is the one to call, where it has some."""
+        return {"kind": self.key, "signature": signature} if self.signatures else _GRAPH

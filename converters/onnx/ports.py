@@ -1,0 +1,34 @@
+"""What an ONNX model takes and gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from converters.fetch import read_bytes
+from converters.format import Port, Ports
+from converters.onnx.proto import dtype_name
+from signatures.errors import DamagedFileError
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a file. Raises SourceError, DamagedFileError."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        graph = onnx.ModelProto.FromString(read_bytes(path)).graph
+    except DecodeError as error:
+        raise DamagedFileError(
+            "cannot be decoded as ONNX", where=str(path), why="the file is cut off or damaged", fix="export it again"
+        ) from error
+    stored = {t.name for t in graph.initializer}
+    inputs = tuple(_port(v) for v in graph.input if v.name not in stored)
+    return Ports(path, inputs, tuple(_port(v) for v in graph.output))
+
+
+def _port(value: Any) -> Port:
+    """A length of 0 or below, and a named one, is free (as the importer reads it)."""
+    tensor = value.type.tensor_type
+    dims = tuple(int(d.dim_value) if d.dim_value > 0 else None for d in tensor.shape.dim)
+    return Port(value.name, dtype_name(tensor.elem_type), dims if tensor.HasField("shape") else None)

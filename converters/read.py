@@ -1,0 +1,87 @@
+"""From a path to models: fetched, recognised, read by its format; and what an artefact at a path takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from converters.bundle import BUNDLE
+from converters.bundle.source import artefacts, read_first
+from converters.fetch import Fetched
+from converters.format import Format, Member, Ports
+from converters.formats import FORMATS
+from converters.recognise import not_readable, recognised
+from converters.source import ReadOptions, SourceModel
+from signatures.errors import ExportModelError, SourceError, UsageError
+
+#: What only some sources have a use for: option, flag, and what to give to have one.
+_TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"))
+
+
+def fetched(path: Path) -> tuple[Fetched, Format]:
+    """What lies at ``path``, recognised and not read yet. Raises SourceError, NotAPolicyError, DamagedFileError."""
+    given = Fetched(path)
+    found = recognised(given)
+    if not found.readable and found is not BUNDLE:
+        raise not_readable(found, path)
+    return given, found
+
+
+def check_options(found: Format, path: Path, options: ReadOptions) -> None:
+    """Raise UsageError where an option was given that this kind of source has no use for."""
+    for option, fix in _TAKEN:
+        if getattr(options, option) not in (None, ()) and option not in found.takes:
+            raise UsageError(
+                f"--{option} says nothing about this source",
+                where=str(path),
+                why=f"it is {found.label}",
+                fix=f"leave --{option} out, or give {fix}",
+            )
+
+
+def read_models(given: Fetched, found: Format, options: ReadOptions) -> list[SourceModel]:
+    """The models of a source. Raises SourceError, GraphError and their kinds, UsageError."""
+    if found.read is not None:
+        return found.read(given, options)
+    members = [read_first(given.path, FORMATS)] if found.members is None else found.members(given.path, options)
+    inside = replace(options, step=None)
+    return [model for member in members for model in _of_member(member, given, inside)]
+
+
+def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[SourceModel]:
+    """The models of one source inside of another; errors name it relative to the folder."""
+    where = member.path.relative_to(folder.path)
+    given = folder.inside(member.path)
+    found = recognised(given)
+    if found.read is None:
+        raise not_readable(found, where)
+    try:
+        models = found.read(given, options)
+    except ExportModelError as error:
+        raise (error.at(str(where)) if member.path.is_file() else error) from error.__cause__
+    return [_named(model, member) for model in models]
+
+
+def _named(model: SourceModel, member: Member) -> SourceModel:
+    facts = replace(model.facts, notes=(*model.facts.notes, *member.notes))
+    name = model.name if member.name is None else member.name
+    return replace(model, name=name, facts=facts, files=(*member.files, *model.files))
+
+
+def ports_of(path: Path) -> list[tuple[Format, Ports]]:
+    """The artefacts at ``path``, one file or folder or every format of a bundle, and what each takes and gives.
+
+    Raises SourceError where no runtime loads the format by itself, DamagedFileError, NotAPolicyError, BundleError.
+    """
+    found = recognised(Fetched(path))
+    if found is BUNDLE:
+        return [(f, f.ports(place)) for f, place in artefacts(path, FORMATS) if f.ports is not None]
+    if found.ports is None:
+        able = ", ".join(f.key for f in FORMATS if f.ports is not None or f is BUNDLE)
+        raise SourceError(
+            f"{found.label} cannot be compared as it is",
+            where=str(path),
+            why=f"no runtime loads it by itself; what can be compared: {able}",
+            fix="export it, and compare the bundle",
+        )
+    return [(found, found.ports(path))]
