@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from converters.barracuda import format as nn_format
-from converters.recognise import read_bytes, recognise_path
+from converters.fetch import Fetched, read_bytes
+from converters.recognise import recognised
 from converters.targets.unity import barracuda_model, importing, rules, sentis_model, trial_run
 from converters.targets.unity.consumers import Consumer, Engine
 from converters.targets.unity.findings import Finding, Thrown, UnityThrows
@@ -84,7 +85,7 @@ class UnityVerdict:
 
 def check_file(path: Path, consumer: Consumer, brain: Brain) -> UnityVerdict:
     """Hold a file against the rules of a release. Raises SourceError, DamagedFileError for a file that is neither."""
-    kind = recognise_path(path).key
+    kind = recognised(Fetched(path)).key
     if kind == "nn" or (path.suffix.lower() == ".nn" and kind != "onnx"):
         return _check_nn(path, consumer, brain)
     if kind != "onnx":

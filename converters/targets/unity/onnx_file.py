@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from converters.fetch import read_bytes
 from converters.onnx.proto import load_external
-from converters.recognise import read_bytes
 from converters.targets.unity.onnx_constants import RANDOM_OPS, value_of
 from signatures.errors import DamagedFileError
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.recognise import read_bytes
+from converters.fetch import read_bytes
 from signatures.errors import UsageError
 
 #: Class of a sensor by the number of its axes, where nobody names it.
