@@ -70,8 +70,28 @@ def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower) -> 
 
 
 def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
-    lowering = direct(lower) if isinstance(lower, str) else lower
+    lowering = _pair(lower) if isinstance(lower, str) else lower
     return OpDef(name, broadcast_of(count=2), _plain(function), lowering, (T,))
+
+
+def _pair(onnx_op: str) -> Lower:
+    """An ONNX op of two operands. A constant is written without leading axes of length 1 where the other operand has
+    as many: Barracuda 1.1 gives the result of [B, n] and [1, n] another shape (Add_02).
+    """
+
+    def lower(node: Node, builder: OnnxBuilder) -> str:
+        kinds = [builder.type_of(r) for r in node.inputs]
+        values = []
+        for kind, other, reference in zip(kinds, reversed(kinds), node.inputs, strict=True):
+            value, constant = builder.value(reference), kind.constant
+            if constant is not None and constant.shape[:1] == (1,) and 1 < constant.ndim <= (other.rank or 0):
+                leading = next((i for i, n in enumerate(constant.shape) if n != 1), constant.ndim - 1)
+                value = builder.const(constant.reshape(constant.shape[leading:]), "row")
+            values.append(value)
+        result: str = builder.emit(onnx_op, values)
+        return result
+
+    return lower
 
 
 def _comparison(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
