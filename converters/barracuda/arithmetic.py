@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import MappingProxyType
 
-from converters.barracuda.builder import Builder, Shape, Value, with_length
-from converters.barracuda.moves import axis_of
+from converters.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
+from converters.barracuda.shaping import axis_of
 from converters.barracuda.vocabulary import C, LayerType, N
 from converters.graph.types import FLOAT32
 
@@ -42,85 +42,85 @@ _REDUCED = MappingProxyType(
 )
 
 
-def folded(b: Builder, args: Sequence[Value]) -> Value:
+def folded(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The inputs combined from left to right: ((a − b) − c) …; the mean divides the sum by their number."""
     kind, total = LayerType(b.layer.type), args[0]
     for value in args[1:]:
         operands, shape = b.operands([total, value])
-        total = Value(b.op(_FOLDED[kind], operands), shape)
+        total = Value(b.add(_FOLDED[kind], operands), shape)
     if kind is LayerType.MEAN and len(args) > 1:
-        total = Value(b.op("Mul", [total.reference, b.const(1 / len(args), "share")]), total.shape)
+        total = Value(b.add("Mul", [total.reference, b.floats(1 / len(args), "share")]), total.shape)
     return total
 
 
-def compared(b: Builder, args: Sequence[Value]) -> Value:
+def compared(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """1 where the comparison holds, else 0."""
     operands, shape = b.operands(args)
-    return _as_float(b, b.op(_COMPARED[LayerType(b.layer.type)], operands), shape)
+    return _as_float(b, b.add(_COMPARED[LayerType(b.layer.type)], operands), shape)
 
 
-def logical(b: Builder, args: Sequence[Value]) -> Value:
+def logical(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """And, or, not, exclusive or of truths: a number is true unless it is 0."""
     operands, shape = b.operands(args)
     truths = [_truth(b, r) for r in operands]
     kind = LayerType(b.layer.type)
     if kind is LayerType.LOGICAL_NOT:
-        result = b.op("LogicalNot", truths)
+        result = b.add("LogicalNot", truths)
     elif kind is LayerType.LOGICAL_XOR:
-        neither = b.op("LogicalNot", [b.op("LogicalAnd", truths)])
-        result = b.op("LogicalAnd", [b.op("LogicalOr", truths), neither])
+        neither = b.add("LogicalNot", [b.add("LogicalAnd", truths)])
+        result = b.add("LogicalAnd", [b.add("LogicalOr", truths), neither])
     else:
-        result = b.op("LogicalAnd" if kind is LayerType.LOGICAL_AND else "LogicalOr", truths)
+        result = b.add("LogicalAnd" if kind is LayerType.LOGICAL_AND else "LogicalOr", truths)
     return _as_float(b, result, shape)
 
 
-def where(b: Builder, args: Sequence[Value]) -> Value:
+def where(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The second input where the first is not 0, else the third."""
     (condition, *choices), shape = b.operands(args)
-    return Value(b.op("SelectV2", [_truth(b, condition), *choices]), shape)
+    return Value(b.add("SelectV2", [_truth(b, condition), *choices]), shape)
 
 
-def sign(b: Builder, args: Sequence[Value]) -> Value:
+def sign(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """−1, 0 or 1."""
-    return Value(b.op("Sign", [args[0].reference]), args[0].shape)
+    return Value(b.add("Sign", [args[0].reference]), args[0].shape)
 
 
-def _truth(b: Builder, reference: str) -> str:
-    return b.op("NotEqual", [reference, b.const(0, "zero")])
+def _truth(b: LayerBuilder, reference: str) -> str:
+    return b.add("NotEqual", [reference, b.floats(0, "zero")])
 
 
-def _as_float(b: Builder, truth: str, shape: Shape) -> Value:
-    return Value(b.op("Cast", [truth], DstT=FLOAT32), shape)
+def _as_float(b: LayerBuilder, truth: str, shape: Shape) -> Value:
+    return Value(b.add("Cast", [truth], DstT=FLOAT32), shape)
 
 
-def reduced(b: Builder, args: Sequence[Value], version: int) -> Value:
+def reduced(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     """One number per row along an axis, which stays with length 1. A second input names the axis and is ignored."""
     x = args[0]
     axis = axis_of(b, b.layer.axis, version)
     if axis == N:
         raise b.unsupported("it reduces over the batch", "an agent's action would depend on the other agents")
     small = x.shape[1:3] == (1, 1)
-    data, along = (b.matrix(x), 1) if small and axis == C else (b.image(x), axis)
+    data, along = (b.as_matrix(x), 1) if small and axis == C else (b.as_image(x), axis)
     shape = with_length(x.shape, axis, 1)
     kind = LayerType(b.layer.type)
     operand = b.ints(along, "axis")
     if kind in (LayerType.ARG_MAX, LayerType.ARG_MIN):
-        best = b.op("ArgMax" if kind is LayerType.ARG_MAX else "ArgMin", [data, operand])
-        return b.shaped(b.op("Cast", [best], DstT=FLOAT32), shape, best if small else None)
+        best = b.add("ArgMax" if kind is LayerType.ARG_MAX else "ArgMin", [data, operand])
+        return b.shaped(b.add("Cast", [best], DstT=FLOAT32), shape, best if small else None)
     result = _reduction(b, kind, data, b.ints([along], "axes"))
     return b.rows(result, shape[0], shape[3]) if small and axis == C else b.shaped(result, shape)
 
 
-def _reduction(b: Builder, kind: LayerType, data: str, axes: str) -> str:
+def _reduction(b: LayerBuilder, kind: LayerType, data: str, axes: str) -> str:
     if kind in _REDUCED:
-        return b.op(_REDUCED[kind], [data, axes], keep_dims=True)
+        return b.add(_REDUCED[kind], [data, axes], keep_dims=True)
     if kind is LayerType.REDUCE_LOG_SUM_EXP:
-        top = b.op("Max", [data, axes], keep_dims=True)
-        total = b.op("Sum", [b.op("Exp", [b.op("Sub", [data, top])]), axes], keep_dims=True)
-        return b.op("Add", [b.op("Log", [total]), top])
+        top = b.add("Max", [data, axes], keep_dims=True)
+        total = b.add("Sum", [b.add("Exp", [b.add("Sub", [data, top])]), axes], keep_dims=True)
+        return b.add("Add", [b.add("Log", [total]), top])
     if kind is LayerType.REDUCE_L1:
-        return b.op("Sum", [b.op("Abs", [data]), axes], keep_dims=True)
+        return b.add("Sum", [b.add("Abs", [data]), axes], keep_dims=True)
     if kind is LayerType.REDUCE_LOG_SUM:
-        return b.op("Log", [b.op("Sum", [data, axes], keep_dims=True)])
-    squares = b.op("Sum", [b.op("Square", [data]), axes], keep_dims=True)
-    return squares if kind is LayerType.REDUCE_SUM_SQUARE else b.op("Sqrt", [squares])
+        return b.add("Log", [b.add("Sum", [data, axes], keep_dims=True)])
+    squares = b.add("Sum", [b.add("Square", [data]), axes], keep_dims=True)
+    return squares if kind is LayerType.REDUCE_SUM_SQUARE else b.add("Sqrt", [squares])

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.barracuda.builder import Builder, Shape, Value
+from converters.barracuda.layer_builder import LayerBuilder, Shape, Value
+from converters.graph.nn.activations import scaled
 from converters.graph.types import FLOAT32, INT32, INT64
 
 
-def dense(b: Builder, args: Sequence[Value]) -> Value:
+def dense(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """X flattened to [N, H·W·C], times K [in, 1, 1, out], plus a bias [1, 1, 1, out]."""
     x, kernel, bias = args
     rows, columns = kernel.n, kernel.size
@@ -19,15 +20,15 @@ def dense(b: Builder, args: Sequence[Value]) -> Value:
             f"a row of {x.size} numbers, a kernel of shape {list(kernel.shape)}, a bias of {bias.size}",
             "the kernel's rows must be the input's numbers, its columns the bias's",
         )
-    product = b.op("MatMul", [b.matrix(x), b.matrix(kernel)])
+    product = b.add("MatMul", [b.as_matrix(x), b.as_matrix(kernel)])
     return b.rows(biased(b, product, bias), x.n, columns)
 
 
-def biased(b: Builder, product: str, bias: Value) -> str:
+def biased(b: LayerBuilder, product: str, bias: Value) -> str:
     """``product`` plus a bias along its last axis; the zeros that ML-Agents' converter makes up are left out."""
     if _all(bias, 0):
         return product
-    return b.op("BiasAdd", [product, b.vector(bias)])
+    return b.add("BiasAdd", [product, b.as_vector(bias)])
 
 
 def _all(value: Value, number: float) -> bool:
@@ -36,7 +37,7 @@ def _all(value: Value, number: float) -> bool:
         return value.constant is not None and bool(np.all(value.constant == number))
 
 
-def matmul(b: Builder, args: Sequence[Value]) -> Value:
+def matmul(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """X·Y of two tensors. ``pool`` are their ranks in ONNX; empty in the old versions, which know rank 2 alone.
 
     A tensor of rank 2 is [N, C], of rank 3 (ONNX: N, C, W) is [N, 1, W, C], of rank 4 (ONNX: NCHW) is NHWC.
@@ -48,86 +49,86 @@ def matmul(b: Builder, args: Sequence[Value]) -> Value:
     if ranks[1] == 2:
         if y.n is None:
             raise b.unsupported("its second input has a row per agent", "the batch cannot be summed over")
-        return _times_matrix(b, x, ranks[0], b.matrix(y), y.n, y.size)
+        return _times_matrix(b, x, ranks[0], b.as_matrix(y), y.n, y.size)
     left, right = (_onnx_order(b, v, ranks[0]) for v in (x, y))
-    product = b.op("BatchMatMul", [left, right])
+    product = b.add("BatchMatMul", [left, right])
     if ranks[0] == 3:
         # ONNX [N, C, W]·[N, W, M] = [N, C, M], back to [N, 1, M, C]
         return _from_onnx(b, product, (x.n, 1, y.w, x.c))
     return _from_onnx(b, product, (x.n, x.h, y.w, x.c))
 
 
-def dense3(b: Builder, args: Sequence[Value]) -> Value:
+def dense3(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The product of a rank-3 X [N, 1, W, C] with K [W, 1, 1, M], over W, plus a bias of M: [N, 1, M, C]."""
     x, kernel, bias = args
     if kernel.n is None or bias.constant is None:
         raise b.unsupported("its kernel or bias is computed", "they are constants in every model known")
-    product = _times_matrix(b, x, 3, b.matrix(kernel), kernel.n, kernel.size)
-    column = b.const(bias.constant.reshape(1, 1, -1, 1), "bias")
+    product = _times_matrix(b, x, 3, b.as_matrix(kernel), kernel.n, kernel.size)
+    column = b.floats(bias.constant.reshape(1, 1, -1, 1), "bias")
     if bias.size != kernel.size:
         raise b.damaged(f"a kernel of {kernel.size} columns, a bias of {bias.size}", "they must be equal")
-    total = b.op("Add", [b.image(product), column])
+    total = b.add("Add", [b.as_image(product), column])
     return b.shaped(total, product.shape)
 
 
-def _times_matrix(b: Builder, x: Value, rank: int, matrix: str, rows: int, columns: int) -> Value:
+def _times_matrix(b: LayerBuilder, x: Value, rank: int, matrix: str, rows: int, columns: int) -> Value:
     inner = x.size if rank == 2 else x.w
     if inner != rows:
         raise b.damaged(f"{list(x.shape)} times a matrix of {rows} rows", f"{inner} numbers meet {rows}")
     if rank == 2:
-        return b.rows(b.op("MatMul", [b.matrix(x), matrix]), x.n, columns)
+        return b.rows(b.add("MatMul", [b.as_matrix(x), matrix]), x.n, columns)
     n, h, w, c = x.shape
     if rank == 3 and h != 1:
         raise b.damaged(f"{list(x.shape)} as a tensor of rank 3", "its height is not 1")
-    flat = b.op("Reshape", [_onnx_order(b, x, 4), b.ints([-1, w], "rows")], label="rows")
-    product = b.op("MatMul", [flat, matrix])
+    flat = b.add("Reshape", [_onnx_order(b, x, 4), b.ints([-1, w], "rows")], name="rows")
+    product = b.add("MatMul", [flat, matrix])
     lead = b.ints([-1 if n is None else n, c, h, columns], "lead")
-    return _from_onnx(b, b.op("Reshape", [product, lead], label="split"), (n, h, columns, c))
+    return _from_onnx(b, b.add("Reshape", [product, lead], name="split"), (n, h, columns, c))
 
 
-def _onnx_order(b: Builder, x: Value, rank: int) -> str:
+def _onnx_order(b: LayerBuilder, x: Value, rank: int) -> str:
     """NHWC as [N, C, H, W], or [N, C, W] for rank 3."""
-    turned = b.op("Transpose", [b.image(x), b.ints([0, 3, 1, 2], "nchw")], label="nchw_order")
+    turned = b.add("Transpose", [b.as_image(x), b.ints([0, 3, 1, 2], "nchw")], name="nchw_order")
     if rank == 4:
         return turned
     n, _, w, c = x.shape
-    return b.op("Reshape", [turned, b.ints([-1 if n is None else n, c, w], "ncw")], label="ncw_order")
+    return b.add("Reshape", [turned, b.ints([-1 if n is None else n, c, w], "ncw")], name="ncw_order")
 
 
-def _from_onnx(b: Builder, x: str, shape: Shape) -> Value:
+def _from_onnx(b: LayerBuilder, x: str, shape: Shape) -> Value:
     """[N, C, H, W] (or [N, C, W]) back to NHWC."""
     n, h, w, c = shape
-    image = b.op("Reshape", [x, b.ints([-1 if n is None else n, c, h, w], "nchw_shape")], label="nchw_form")
-    return b.shaped(b.op("Transpose", [image, b.ints([0, 2, 3, 1], "nhwc_perm")], label="nhwc_order"), shape)
+    image = b.add("Reshape", [x, b.ints([-1 if n is None else n, c, h, w], "nchw_shape")], name="nchw_form")
+    return b.shaped(b.add("Transpose", [image, b.ints([0, 2, 3, 1], "nhwc_perm")], name="nhwc_order"), shape)
 
 
-def scale_bias(b: Builder, args: Sequence[Value]) -> Value:
+def scale_bias(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """x·S + B along the channels; S of ones is what ML-Agents' converter makes of a bias alone."""
     x, scale, bias = args
     if scale.size != x.c or bias.size != x.c:
         raise b.damaged(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
     result = x.reference
     if not _all(scale, 1):
-        result = b.op("Mul", [result, b.vector(scale)])
+        result = b.add("Mul", [result, b.as_vector(scale)])
     if x.rank == 1:
-        return Value(b.op("Add", [result, b.vector(bias)]), x.shape)
+        return Value(b.add("Add", [result, b.as_vector(bias)]), x.shape)
     return Value(biased(b, result, bias), x.shape)
 
 
 # ------------------------------------------------------------------ chance
 
 
-def random_normal(b: Builder, args: Sequence[Value]) -> Value:
+def random_normal(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """alpha·N(0, 1) + beta of the shape of the input, or of ``pool``."""
     return _random(b, args, "RandomStandardNormal", origin=True)
 
 
-def random_uniform(b: Builder, args: Sequence[Value]) -> Value:
+def random_uniform(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """alpha·U(0, 1) + beta of the shape of the input, or of ``pool``."""
     return _random(b, args, "RandomUniform", origin=False)
 
 
-def _random(b: Builder, args: Sequence[Value], op: str, *, origin: bool) -> Value:
+def _random(b: LayerBuilder, args: Sequence[Value], op: str, *, origin: bool) -> Value:
     if b.layer.pool:
         shape: Shape = b.four(b.layer.pool)
         n, h, w, c = shape
@@ -140,28 +141,24 @@ def _random(b: Builder, args: Sequence[Value], op: str, *, origin: bool) -> Valu
         size = b.ints([int(v or 0) for v in lengths], "size")
     elif args:
         shape = args[0].shape
-        size = b.op("Shape", [args[0].reference], out_type=INT32)
+        size = b.add("Shape", [args[0].reference], out_type=INT32)
     else:
         raise b.damaged("it has neither a shape nor an input", "the shape of what it draws is not known")
-    drawn = b.sample(op, size) if origin else b.op(op, [size], dtype=FLOAT32)
-    if b.layer.alpha != 1:
-        drawn = b.op("Mul", [drawn, b.const(b.layer.alpha, "alpha")])
-    if b.layer.beta != 0:
-        drawn = b.op("Add", [drawn, b.const(b.layer.beta, "beta")])
-    return Value(drawn, shape)
+    drawn = b.add(op, [size], origin=b.layer.name, dtype=FLOAT32) if origin else b.add(op, [size], dtype=FLOAT32)
+    return Value(scaled(b, drawn, b.layer.alpha, b.layer.beta), shape)
 
 
-def multinomial(b: Builder, args: Sequence[Value]) -> Value:
+def multinomial(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """``pool[0]`` classes per row, drawn from the row's log-probabilities; a ``.nn`` holds them as floats."""
     (x,) = args
     if len(b.layer.pool) != 1 or b.layer.pool[0] < 1:
         raise b.damaged(f"it draws {list(b.layer.pool)} times", "the number of draws is one number above 0")
     count = b.layer.pool[0]
-    drawn = b.op("Multinomial", [b.matrix(x), b.ints(count, "count")], output_dtype=INT64)
-    return b.rows(b.op("Cast", [drawn], DstT=FLOAT32), x.n, count, drawn)
+    drawn = b.add("Multinomial", [b.as_matrix(x), b.ints(count, "count")], output_dtype=INT64)
+    return b.rows(b.add("Cast", [drawn], DstT=FLOAT32), x.n, count, drawn)
 
 
-def one_hot(b: Builder, args: Sequence[Value], version: int) -> Value:
+def one_hot(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     """A row of ``pool[0]`` numbers per index: alpha at the index, beta elsewhere.
 
     Up to version 16 [N, 1, 1, n] becomes [N, 1, n, depth]; later, ``axis`` is the rank of the indices in ONNX, and the
@@ -174,10 +171,10 @@ def one_hot(b: Builder, args: Sequence[Value], version: int) -> Value:
     b.sized(count, depth)
     index = x.integer
     if index is None:
-        index = b.op("Cast", [b.matrix(x)], DstT=INT32)
-    hot = b.op(
+        index = b.add("Cast", [b.as_matrix(x)], DstT=INT32)
+    hot = b.add(
         "OneHot",
-        [index, b.ints(depth, "depth"), b.const(b.layer.alpha, "on"), b.const(b.layer.beta, "off")],
+        [index, b.ints(depth, "depth"), b.floats(b.layer.alpha, "on"), b.floats(b.layer.beta, "off")],
         axis=-1,
     )
     if count == 1 and (version <= 16 or b.layer.axis < 2):
@@ -185,7 +182,7 @@ def one_hot(b: Builder, args: Sequence[Value], version: int) -> Value:
     if version <= 16:
         return b.shaped(hot, (n, 1, count, depth))
     if b.layer.axis == 2 and x.rank != 4:
-        turned = b.op("Transpose", [hot, b.ints([0, 2, 1], "before")])
+        turned = b.add("Transpose", [hot, b.ints([0, 2, 1], "before")])
         return b.shaped(turned, (n, 1, depth, count))
     raise b.unsupported(
         f"indices of shape {list(x.shape)}, rank {b.layer.axis}",

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-from converters.barracuda.builder import MAX_ELEMENTS, Builder, Value, node_name
 from converters.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
+from converters.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
 from converters.barracuda.layers import check_bypassed, translate
 from converters.barracuda.vocabulary import LayerType
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape
@@ -54,7 +54,7 @@ class _Reader:
         for name in _names(model):
             self.nodes[name] = names.fresh(node_name(name))
         reserved = [*self.nodes.values(), MEMORY_IN, MEMORY_OUT]
-        self.builder = Builder(reserved)
+        self.builder = LayerBuilder(reserved)
         self.values: dict[str, Value] = {}
         #: what could not be translated, and is read by nothing that is needed so far
         self.failed: dict[str, ExportModelError] = {}
@@ -118,17 +118,17 @@ class _Reader:
         integer = given.name in _INTEGER_INPUTS
         dims = (None, c) if (h, w) == (1, 1) else shape
         attrs = {"dtype": INT32 if integer else FLOAT32, "shape": TensorShape(dims)}
-        self.builder.place(Node(name, "Placeholder", attrs=attrs, origin=given.name))
+        self.builder.append(Node(name, "Placeholder", attrs=attrs, origin=given.name))
         if not integer:
             return Value(name, shape)
-        return Value(self.builder.op("Cast", [name], label="float", DstT=FLOAT32), shape, integer=name)
+        return Value(self.builder.add("Cast", [name], name="float", DstT=FLOAT32), shape, integer=name)
 
     def _entities(self, given: NnInput, count: int, size: int) -> Value:
         """A sensor of rank 2: [N, 1, W, C] in Unity, whose first dimension is C and second W; [B, C, W] here."""
         b, name = self.builder, self.nodes[given.name]
         attrs = {"dtype": FLOAT32, "shape": TensorShape((None, size, count))}
-        b.place(Node(name, "Placeholder", attrs=attrs, origin=given.name))
-        turned = b.op("Transpose", [name, b.ints([0, 2, 1], "order")])
+        b.append(Node(name, "Placeholder", attrs=attrs, origin=given.name))
+        turned = b.add("Transpose", [name, b.ints([0, 2, 1], "order")])
         return b.shaped(turned, (None, 1, count, size))
 
     # ------------------------------------------------------------------ memories
@@ -146,7 +146,7 @@ class _Reader:
                 fix="copy or download the .nn again",
             )
         attrs = {"dtype": FLOAT32, "shape": TensorShape((None, sum(sizes)))}
-        self.builder.place(Node(MEMORY_IN, "Placeholder", attrs=attrs, origin=_joined([m.input for m in memories])))
+        self.builder.append(Node(MEMORY_IN, "Placeholder", attrs=attrs, origin=_joined([m.input for m in memories])))
         start = 0
         for memory, (h, w, c), size in zip(memories, shapes, sizes, strict=True):
             part, name = MEMORY_IN, self.nodes[memory.input]
@@ -154,7 +154,7 @@ class _Reader:
                 begun = self.builder.start(Layer(memory.input, LayerType.NOP), name)
                 bounds = ([0, start], [0, start + size], [1, 1])
                 operands = [self.builder.ints(v, k) for v, k in zip(bounds, ("begin", "end", "steps"), strict=True)]
-                part = self.builder.op("StridedSlice", [MEMORY_IN, *operands], begin_mask=1, end_mask=1)
+                part = self.builder.add("StridedSlice", [MEMORY_IN, *operands], begin_mask=1, end_mask=1)
                 part = self.builder.finish(part, begun, name, memory.input)
             start += size
             value = Value(part, (None, 1, 1, size))
@@ -175,8 +175,8 @@ class _Reader:
                     why=f"{memory.output!r} gives the shape {list(value.shape)}",
                     fix="convert the model again",
                 )
-            parts.append(b.matrix(value))
-        joined = parts[0] if len(parts) == 1 else b.op("ConcatV2", [*parts, b.ints(1, "axis")])
+            parts.append(b.as_matrix(value))
+        joined = parts[0] if len(parts) == 1 else b.add("ConcatV2", [*parts, b.ints(1, "axis")])
         b.finish(joined, begun, MEMORY_OUT, _joined([m.output for m in memories]))
 
     # ------------------------------------------------------------------ layers
@@ -197,7 +197,7 @@ class _Reader:
         for dataset in layer.datasets:
             if dataset.name not in self.values:
                 array = self.model.array(dataset)
-                self.values[dataset.name] = self.builder.constant(dataset.name, array, self.nodes[dataset.name])
+                self.values[dataset.name] = self.builder.dataset(dataset.name, array, self.nodes[dataset.name])
             if len(layer.datasets) == 1:
                 self.values[layer.name] = self.values[dataset.name]
 
@@ -206,8 +206,8 @@ class _Reader:
         if self.model.from_python:
             check_bypassed(layer)
         b.start(layer, name)
-        args = [self._value(i, b.where) for i in layer.inputs]
-        args += [b.constant(d.name, self.model.array(d)) for d in layer.datasets]
+        args = [self._value(i, b.location) for i in layer.inputs]
+        args += [b.dataset(d.name, self.model.array(d)) for d in layer.datasets]
         begun = b.start(layer, name)
         result = translate(b, layer, args, self.model.version)
         if result.integer is not None and OUTPUT_NAMES.get(layer.name) in _INTEGER_ROLES:

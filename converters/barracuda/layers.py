@@ -5,26 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from types import MappingProxyType
 
-from converters.barracuda import activations, arithmetic, dense, moves, windows
-from converters.barracuda.builder import Builder, Value
+from converters.barracuda import activations, arithmetic, convolution, dense, shaping
 from converters.barracuda.format import Layer
+from converters.barracuda.layer_builder import LayerBuilder, Value
 from converters.barracuda.vocabulary import Activation, LayerType, layer_label
-from signatures.errors import DamagedFileError
+from signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: Takes (builder, the layer's inputs and then its datasets, the file's version).
-Translate = Callable[[Builder, Sequence[Value], int], Value]
+Translate = Callable[[LayerBuilder, Sequence[Value], int], Value]
 _ANY = 1 << 16
 
 
-def _plain(function: Callable[[Builder, Sequence[Value]], Value]) -> Translate:
+def _plain(function: Callable[[LayerBuilder, Sequence[Value]], Value]) -> Translate:
     return lambda b, args, version: function(b, args)
 
 
-def _same(b: Builder, args: Sequence[Value], version: int) -> Value:
+def _same(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     return args[0]
 
 
-def _activation(b: Builder, args: Sequence[Value], version: int) -> Value:
+def _activation(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     if b.layer.activation == Activation.PRELU:
         if len(args) != 2:
             raise b.damaged(f"it has {len(args)} inputs", "a PRelu takes a tensor and its slopes")
@@ -47,34 +47,34 @@ _LAYERS: MappingProxyType[int, tuple[int, int, Translate]] = MappingProxyType(
         LayerType.RANDOM_UNIFORM: (0, 1, _plain(dense.random_uniform)),
         LayerType.MULTINOMIAL: (1, 1, _plain(dense.multinomial)),
         LayerType.ONE_HOT: (1, 1, dense.one_hot),
-        LayerType.CONV2D: (3, 3, _plain(windows.conv2d)),
-        LayerType.DEPTHWISE_CONV2D: (3, 3, _plain(windows.depthwise)),
-        LayerType.CONV2D_TRANS: (3, 3, _plain(windows.conv2d_trans)),
-        LayerType.UPSAMPLE2D: (1, 2, _plain(windows.upsample)),
-        LayerType.NORMALIZATION: (3, 3, _plain(windows.normalization)),
+        LayerType.CONV2D: (3, 3, _plain(convolution.conv2d)),
+        LayerType.DEPTHWISE_CONV2D: (3, 3, _plain(convolution.depthwise)),
+        LayerType.CONV2D_TRANS: (3, 3, _plain(convolution.conv2d_trans)),
+        LayerType.UPSAMPLE2D: (1, 2, _plain(convolution.upsample)),
+        LayerType.NORMALIZATION: (3, 3, _plain(convolution.normalization)),
         LayerType.ACTIVATION: (1, 2, _activation),
         LayerType.WHERE: (3, 3, _plain(arithmetic.where)),
         LayerType.SIGN: (1, 1, _plain(arithmetic.sign)),
         LayerType.LOGICAL_NOT: (1, 1, _plain(arithmetic.logical)),
-        LayerType.FLATTEN: (1, 1, _plain(moves.flatten)),
-        LayerType.RESHAPE: (1, 2, _plain(moves.reshape)),
-        LayerType.TRANSPOSE: (1, 1, _plain(moves.transpose)),
-        LayerType.SQUEEZE: (1, 1, _plain(moves.squeeze)),
-        LayerType.UNSQUEEZE: (1, 1, _plain(moves.squeeze)),
-        LayerType.GATHER: (2, 2, moves.gather),
-        LayerType.CONCAT: (1, _ANY, moves.concat),
-        LayerType.STRIDED_SLICE: (1, 1, _plain(moves.strided_slice)),
-        LayerType.TILE: (1, 1, _plain(moves.tile)),
-        LayerType.EXPAND: (1, 1, _plain(moves.expand)),
-        LayerType.DEPTH_TO_SPACE: (1, 1, _plain(moves.depth_to_space)),
-        LayerType.SPACE_TO_DEPTH: (1, 1, _plain(moves.space_to_depth)),
-        **dict.fromkeys((LayerType.MAX_POOL2D, LayerType.AVG_POOL2D), (1, 1, _plain(windows.pool))),
+        LayerType.FLATTEN: (1, 1, _plain(shaping.flatten)),
+        LayerType.RESHAPE: (1, 2, _plain(shaping.reshape)),
+        LayerType.TRANSPOSE: (1, 1, _plain(shaping.transpose)),
+        LayerType.SQUEEZE: (1, 1, _plain(shaping.squeeze)),
+        LayerType.UNSQUEEZE: (1, 1, _plain(shaping.squeeze)),
+        LayerType.GATHER: (2, 2, shaping.gather),
+        LayerType.CONCAT: (1, _ANY, shaping.concat),
+        LayerType.STRIDED_SLICE: (1, 1, _plain(shaping.strided_slice)),
+        LayerType.TILE: (1, 1, _plain(shaping.tile)),
+        LayerType.EXPAND: (1, 1, _plain(shaping.expand)),
+        LayerType.DEPTH_TO_SPACE: (1, 1, _plain(shaping.depth_to_space)),
+        LayerType.SPACE_TO_DEPTH: (1, 1, _plain(shaping.space_to_depth)),
+        **dict.fromkeys((LayerType.MAX_POOL2D, LayerType.AVG_POOL2D), (1, 1, _plain(convolution.pool))),
         **dict.fromkeys(
-            (LayerType.GLOBAL_MAX_POOL2D, LayerType.GLOBAL_AVG_POOL2D), (1, 1, _plain(windows.global_pool))
+            (LayerType.GLOBAL_MAX_POOL2D, LayerType.GLOBAL_AVG_POOL2D), (1, 1, _plain(convolution.global_pool))
         ),
         **dict.fromkeys(
             (LayerType.BORDER2D, LayerType.PAD2D_REFLECT, LayerType.PAD2D_SYMMETRIC, LayerType.PAD2D_EDGE),
-            (1, 1, _plain(windows.border)),
+            (1, 1, _plain(convolution.border)),
         ),
         **dict.fromkeys((*range(LayerType.ADD, LayerType.POW + 1),), (1, _ANY, _plain(arithmetic.folded))),
         **dict.fromkeys((*range(LayerType.MIN, LayerType.MEAN + 1),), (1, _ANY, _plain(arithmetic.folded))),
@@ -96,7 +96,7 @@ _WHY = MappingProxyType(
 )
 
 
-def translate(b: Builder, layer: Layer, args: Sequence[Value], version: int) -> Value:
+def translate(b: LayerBuilder, layer: Layer, args: Sequence[Value], version: int) -> Value:
     """What a layer computes, activation included; ``args`` are its inputs and then its datasets.
 
     Raises UnsupportedOpError that names the layer, GraphError where it contradicts itself.
@@ -111,7 +111,12 @@ def translate(b: Builder, layer: Layer, args: Sequence[Value], version: int) -> 
     if not fewest <= len(args) <= most:
         wanted = fewest if fewest == most else f"{fewest} to {most}" if most < _ANY else f"{fewest} or more"
         raise b.damaged(f"it has {len(args)} inputs and datasets", f"it takes {wanted}")
-    result = function(b, args, version)
+    try:
+        result = function(b, args, version)
+    except UnsupportedOpError as error:
+        if error.issues:
+            raise
+        raise b.unsupported(error.what, error.why or "a policy's tensors have another form") from error
     b.sized(*result.shape[1:])
     if layer.type != LayerType.ACTIVATION and layer.activation != Activation.NONE:
         result = activations.activate(b, layer.activation, result, version, fused=True)

@@ -8,17 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref, topological
-from converters.graph.ops.base import REQUIRED
-from converters.graph.ops.table import TABLE
+from converters.graph.builder import Builder
+from converters.graph.nodes import Graph, NameScope, Node, topological
 
 
-class Editor:
-    """Collects nodes for a new graph; tensors of the old one may be redirected on the way."""
+class Editor(Builder):
+    """A builder whose names keep off an old graph's; tensors of that may be redirected on the way.
+
+    It knows no types: the ops of a graph that is not normalised yet need not be in the op table.
+    """
+
+    typed = False
 
     def __init__(self, graph: Graph) -> None:
-        self.nodes: list[Node] = []
-        self._names = NameScope(n.name for n in graph.nodes)
+        super().__init__(NameScope(n.name for n in graph.nodes))
         self._redirected: dict[str, str] = {}
 
     def resolve(self, reference: str) -> str:
@@ -34,49 +37,32 @@ class Editor:
 
     def keep(self, node: Node) -> None:
         """Take a node over, its inputs redirected."""
-        self.nodes.append(node.with_inputs(self.resolve(r) for r in node.inputs))
+        self.append(node.with_inputs(self.resolve(r) for r in node.inputs))
 
     def add(
-        self, op: str, inputs: Iterable[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
+        self,
+        op: str,
+        inputs: Iterable[str],
+        name: str = "",
+        origin: str | tuple[str, ...] | None = None,
+        **attrs: Any,
     ) -> str:
         """A new node with the op's default attributes under a fresh name like ``name``; returns its output 0."""
-        defaults = {a.name: a.default for a in TABLE[op].attrs if a.derive is None and a.default is not REQUIRED}
-        fresh = self._names.fresh(name)
-        self.nodes.append(Node(fresh, op, tuple(self.resolve(r) for r in inputs), {**defaults, **attrs}, origin=origin))
-        return fresh
+        return super().add(op, [self.resolve(r) for r in inputs], name, origin, **attrs)
 
     def add_name(self, wish: str) -> str:
         """A free node name like ``wish``."""
-        return self._names.fresh(wish)
-
-    def const(self, array: np.ndarray, name: str) -> str:
-        """A new Const."""
-        fresh = self._names.fresh(name)
-        self.nodes.append(Node(fresh, "Const", value=array))
-        return fresh
+        return self.names.fresh(wish)
 
     def replace_const(self, name: str, array: np.ndarray, origin: str | tuple[str, ...] | None) -> str:
         """A Const under the name of the node of the old graph that it stands for."""
-        self.nodes.append(Node(name, "Const", value=array, origin=origin))
-        return name
+        return self.append(Node(name, "Const", value=array, origin=origin))
 
     def placeholder(self, name: str, node: Node) -> str:
         """A new Placeholder that is ``node`` under a fresh name like ``name``."""
-        fresh = self._names.fresh(name)
-        self.nodes.append(replace(node, name=fresh))
-        return fresh
+        return self.append(replace(node, name=self.names.fresh(name)))
 
     def graph(self) -> Graph:
         """The new graph, redirections applied to all nodes, in topological order."""
         nodes = [n.with_inputs(self.resolve(r) for r in n.inputs) for n in self.nodes]
         return Graph(topological(nodes))
-
-
-def outputs_of(node: Node, count: int) -> list[str]:
-    """References to the first ``count`` outputs of a node."""
-    return [ref(node.name, i) for i in range(count)]
-
-
-def same_tensor(a: str, b: str) -> bool:
-    """Whether two references name one tensor."""
-    return split_ref(a) == split_ref(b)

@@ -1,4 +1,4 @@
-"""ONNX bytes to Graph: the model is checked, its functions are inlined, its nodes are raised one after the other."""
+"""ONNX bytes to Graph: the model is checked, its functions are inlined, its nodes are translated one by one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from converters.fetch import Fetched
+from converters.graph.builder import MAX_NODES
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import BATCH, Dim, TensorType
-from converters.onnx.importer.drafting import MAX_NODES
-from converters.onnx.importer.importer import Raiser, joined_errors
+from converters.onnx.importer.importer import Importer, joined_errors
 from converters.onnx.importer.node import DTYPES, STANDARD
 from converters.onnx.importer.table import TABLE
 from converters.onnx.memories import OnnxMemory, separate_memories
@@ -72,29 +72,29 @@ def read_onnx(given: Fetched) -> OnnxModel:
     batch = _fixed_batch(declared, axes)
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
     reserved = [v.name for v in (*declared, *graph.output)] + [c for c in CONSTANT_NAMES if c in constants]
-    raiser = Raiser(TABLE, opsets, reserved, batch)
+    importer = Importer(TABLE, opsets, reserved, batch)
     for value in declared:
-        _input(raiser, value, batch, axes.get(value.name, 0))
+        _input(importer, value, batch, axes.get(value.name, 0))
     for tensor in graph.initializer:
-        raiser.initializer(tensor.name, array_of(tensor))
-    raiser.run(graph.node)
-    outputs, left_out = _outputs(raiser, [v.name for v in graph.output])
+        importer.initializer(tensor.name, array_of(tensor))
+    importer.run(graph.node)
+    outputs, left_out = _outputs(importer, [v.name for v in graph.output])
     return OnnxModel(
-        raiser.graph(),
+        importer.graph(),
         (given.path, *files),
         f"{model.producer_name} {model.producer_version}".strip(),
-        {v.name: raiser.values[v.name] for v in declared},
+        {v.name: importer.values[v.name] for v in declared},
         outputs,
-        tuple(raiser.draws),
+        tuple(importer.draws),
         batch,
         {p.key: p.value for p in model.metadata_props},
         left_out,
         frozenset(n.op_type for n in _all_nodes(graph)),
-        raiser.one_row,
+        importer.one_row,
         any(a.name == "seed" and a.type == _INT for n in graph.node for a in n.attribute),
         any(t.data_type == _DOUBLE for t in tensors(graph)),
-        {n: raiser.type_of(n).shape for n in (*(raiser.values[v.name] for v in declared), *outputs.values())},
-        _joint(raiser, memories, outputs),
+        {n: importer.type_of(n).shape for n in (*(importer.values[v.name] for v in declared), *outputs.values())},
+        _joint(importer, memories, outputs),
     )
 
 
@@ -230,14 +230,16 @@ def _memories(graph: Any, declared: Sequence[Any]) -> tuple[tuple[OnnxMemory, ..
     )
 
 
-def _joint(raiser: Raiser, memories: Sequence[OnnxMemory], outputs: Mapping[str, str]) -> tuple[SeparateMemory, ...]:
+def _joint(
+    importer: Importer, memories: Sequence[OnnxMemory], outputs: Mapping[str, str]
+) -> tuple[SeparateMemory, ...]:
     """The memories by nodes; empty where one of them could not be made."""
     if any(m.output not in outputs for m in memories):
         return ()
     found = []
     for memory in memories:
-        node = raiser.values[memory.input]
-        shape = tuple(None if isinstance(d, str) else d for d in raiser.type_of(node).shape or ())
+        node = importer.values[memory.input]
+        shape = tuple(None if isinstance(d, str) else d for d in importer.type_of(node).shape or ())
         found.append(SeparateMemory(node, outputs[memory.output], shape, shape, memory.part))
     return tuple(found)
 
@@ -258,7 +260,7 @@ def _fixed_batch(declared: Sequence[Any], axes: Mapping[str, int]) -> int | None
     return leading.pop() if len(leading) == 1 else None
 
 
-def _input(raiser: Raiser, value: Any, batch: int | None, axis: int) -> None:
+def _input(importer: Importer, value: Any, batch: int | None, axis: int) -> None:
     kind = value.type.tensor_type
     if not value.type.HasField("tensor_type") or kind.elem_type not in DTYPES or kind.elem_type == _DOUBLE:
         wide = value.type.HasField("tensor_type") and kind.elem_type in (_FLOAT16, _BFLOAT16, _DOUBLE)
@@ -275,30 +277,30 @@ def _input(raiser: Raiser, value: Any, batch: int | None, axis: int) -> None:
         assumed, dims = np.ones((), dtype), ()
     elif batch is not None and dims is not None and len(dims) > 1 and dims[axis] == batch:
         dims = (*dims[:axis], None, *dims[axis + 1 :])
-    node = raiser.placeholder(value.name, dtype, TensorShape(dims), assumed)
+    node = importer.placeholder(value.name, dtype, TensorShape(dims), assumed)
     if axis and dims is not None:
-        raiser.types[node] = TensorType(dtype, tuple(BATCH if i == axis else d or 0 for i, d in enumerate(dims)))
+        importer.types[node] = TensorType(dtype, tuple(BATCH if i == axis else d or 0 for i, d in enumerate(dims)))
 
 
-def _outputs(raiser: Raiser, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+def _outputs(importer: Importer, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
     """(output → node, output that could not be made → why). An action that cannot be made is an error."""
     outputs: dict[str, str] = {}
     broken: dict[str, UnsupportedOpError] = {}
     for name in dict.fromkeys(names):
-        if name in raiser.values:
-            outputs[name] = raiser.values[name]
-        elif name in raiser.broken:
-            broken[name] = raiser.broken[name]
+        if name in importer.values:
+            outputs[name] = importer.values[name]
+        elif name in importer.broken:
+            broken[name] = importer.broken[name]
         else:
             raise DamagedFileError(
                 f"nothing makes the output {name!r}", why="the model was cut or edited", fix="export the model again"
             )
     needed = [n for n in broken if n.split(":")[0] in ACTION_NAMES]
-    if broken and (needed or not _computed(outputs, raiser)):
+    if broken and (needed or not _computed(outputs, importer)):
         raise joined_errors([broken[n] for n in needed or broken])
     return outputs, {name: error.what for name, error in broken.items()}
 
 
-def _computed(outputs: Mapping[str, str], raiser: Raiser) -> Collection[str]:
+def _computed(outputs: Mapping[str, str], importer: Importer) -> Collection[str]:
     """The outputs that are no constants of the model."""
-    return [name for name, node in outputs.items() if raiser.constant(node) is None]
+    return [name for name, node in outputs.items() if importer.constant(node) is None]

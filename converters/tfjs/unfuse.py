@@ -6,14 +6,10 @@ after it: BiasAdd, then an activation. ``Prelu`` has its slopes as a further inp
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
-from typing import Any
-
-import numpy as np
-
-from converters.graph.nodes import Graph, NameScope, Node, topological
-from signatures.errors import UnsupportedOpError
+from converters.graph.editor import Editor
+from converters.graph.nn.activations import leaky_relu, prelu
+from converters.graph.nodes import Graph, Node
+from signatures.errors import GraphError, UnsupportedOpError
 
 _PLAIN = {
     "_FusedMatMul": "MatMul",
@@ -25,62 +21,49 @@ _OWN = frozenset(("fused_ops", "num_args", "epsilon", "leakyrelu_alpha"))
 
 
 def unfuse(graph: Graph) -> Graph:
-    """See the module; the last op of each keeps the fused one's name."""
-    scope = NameScope(n.name for n in graph.nodes)
-    nodes: list[Node] = []
+    """See the module; the last op of each keeps the fused one's name. Raises UnsupportedOpError."""
+    editor = Editor(graph)
     for node in graph.nodes:
-        nodes.extend(_Steps(node, scope).nodes() if node.op in _PLAIN or node.op == "Prelu" else [node])
-    return Graph(topological(nodes))
-
-
-class _Steps:
-    """The nodes that stand for one, in a row."""
-
-    def __init__(self, node: Node, scope: NameScope) -> None:
-        self.node, self.scope = node, scope
-        self.made: list[Node] = []
-
-    def add(self, op: str, inputs: Iterable[str], **attrs: Any) -> str:
-        self.made.append(Node(self.scope.fresh(f"{self.node.name}/{op}"), op, tuple(inputs), attrs))
-        return self.made[-1].name
-
-    def nodes(self) -> list[Node]:
-        node = self.node
-        if node.op == "Prelu":
-            self.prelu(node.inputs[0], node.inputs[1])
+        if node.op in _PLAIN or node.op == "Prelu":
+            editor.prefix = node.name
+            value = _product(editor, node) if node.op in _PLAIN else _prelu(editor, node)
+            editor.rename(value, node.name, node.origin)
         else:
-            self.product()
-        last = self.made[-1]
-        return [*self.made[:-1], replace(last, name=node.name, origin=node.origin)]
+            editor.keep(node)
+    return editor.graph()
 
-    def product(self) -> None:
-        node = self.node
-        steps = node.attrs.get("fused_ops") or ()
-        wanted = 2 + sum(s in ("BiasAdd", "Prelu") for s in steps)
-        if any(s != "BiasAdd" and s not in _ACTIVATIONS for s in steps) or len(node.inputs) != wanted:
-            raise UnsupportedOpError(
-                f"cannot convert {node.op} (node {node.name!r}) with {', '.join(steps) or 'nothing'} fused into it",
-                issues=[(node.name, node.op)],
-                why=f"it has {len(node.inputs)} inputs, and what is fused is not known here, or takes {wanted}",
-                fix="give the SavedModel that the TensorFlow.js model was converted from",
-            )
-        operands = list(node.inputs[2:])
-        attrs = {k: v for k, v in node.attrs.items() if k not in _OWN}
-        value = self.add(_PLAIN[node.op], node.inputs[:2], **attrs)
-        for step in steps:
-            if step == "BiasAdd":
-                layout = node.attrs.get("data_format")
-                value = self.add(step, [value, operands.pop(0)], **({"data_format": layout} if layout else {}))
-            elif step == "Prelu":
-                value = self.prelu(value, operands.pop(0))
-            elif step == "LeakyRelu":
-                value = self.add(step, [value], alpha=float(node.attrs.get("leakyrelu_alpha", 0.2)))
-            else:
-                value = self.add(step, [value])
 
-    def prelu(self, value: str, slopes: str) -> str:
-        """max(x, 0) + slopes · min(x, 0)."""
-        zero = self.scope.fresh(f"{self.node.name}/zero")
-        self.made.append(Node(zero, "Const", value=np.zeros((), np.float32)))
-        below = self.add("Mul", [slopes, self.add("Minimum", [value, zero])])
-        return self.add("Add", [self.add("Maximum", [value, zero]), below])
+def _prelu(editor: Editor, node: Node) -> str:
+    if len(node.inputs) != 2:
+        raise GraphError(
+            f"node {node.name!r} (Prelu) has {len(node.inputs)} inputs",
+            why="it takes a tensor and its slopes",
+            fix="download the model again: it is damaged",
+        )
+    return prelu(editor, node.inputs[0], node.inputs[1])
+
+
+def _product(editor: Editor, node: Node) -> str:
+    steps = node.attrs.get("fused_ops") or ()
+    wanted = 2 + sum(s in ("BiasAdd", "Prelu") for s in steps)
+    if any(s != "BiasAdd" and s not in _ACTIVATIONS for s in steps) or len(node.inputs) != wanted:
+        raise UnsupportedOpError(
+            f"cannot convert {node.op} (node {node.name!r}) with {', '.join(steps) or 'nothing'} fused into it",
+            issues=[(node.name, node.op)],
+            why=f"it has {len(node.inputs)} inputs, and what is fused is not known here, or takes {wanted}",
+            fix="give the SavedModel that the TensorFlow.js model was converted from",
+        )
+    operands = list(node.inputs[2:])
+    attrs = {k: v for k, v in node.attrs.items() if k not in _OWN}
+    layout = {k: v for k, v in attrs.items() if k == "data_format"}
+    value = editor.add(_PLAIN[node.op], node.inputs[:2], **attrs)
+    for step in steps:
+        if step == "BiasAdd":
+            value = editor.add(step, [value, operands.pop(0)], **layout)
+        elif step == "Prelu":
+            value = prelu(editor, value, operands.pop(0))
+        elif step == "LeakyRelu":
+            value = leaky_relu(editor, value, float(node.attrs.get("leakyrelu_alpha", 0.2)))
+        else:
+            value = editor.add(step, [value])
+    return value

@@ -6,13 +6,12 @@ Source: mlagents/trainers/torch_entities/{layers,encoders,distributions}.py of 1
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape, topological
+from converters.graph.builder import Builder
+from converters.graph.nn.activations import clip
+from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32
-from converters.onnx.importer.drafting import Draft
 from converters.torch_checkpoint.state import State
 
 #: Added before a logarithm (``EPSILON`` in distributions.py).
@@ -20,44 +19,36 @@ TINY = 1e-7
 _TO_NHWC, _TO_NCHW = (0, 2, 3, 1), (0, 3, 1, 2)
 
 
-class Network:
+class Network(Builder):
     """Nodes in the making; methods read the weights they need from the state dictionary."""
 
     def __init__(self, state: State) -> None:
-        self.state = state
         # Nodes are called <module>/<op>; inputs and outputs, without a slash, cannot meet them.
-        self.draft = Draft(NameScope(()))
-
-    def graph(self) -> Graph:
-        """The finished graph."""
-        return Graph(topological(self.draft.nodes))
+        super().__init__(NameScope(()))
+        self.state = state
 
     def input(self, name: str, *shape: int) -> str:
         """A float32 input [B, *shape]."""
         shape_attr = TensorShape((None, *shape))
-        return self.draft.append(Node(name, "Placeholder", attrs={"dtype": FLOAT32, "shape": shape_attr}, origin=name))
+        return self.append(Node(name, "Placeholder", attrs={"dtype": FLOAT32, "shape": shape_attr}, origin=name))
 
     def output(self, name: str, reference: str) -> None:
         """Call a tensor by the name of an output."""
-        self.draft.append(Node(name, "Identity", (reference,), origin=name))
+        self.append(Node(name, "Identity", (reference,), origin=name))
 
-    def constant(self, name: str, value: np.ndarray) -> None:
+    def fact(self, name: str, value: np.ndarray) -> None:
         """An output that is a constant."""
-        self.draft.append(Node(name, "Const", value=value.astype(np.float32), origin=name))
+        self.append(Node(name, "Const", value=value.astype(np.float32), origin=name))
 
     def at(self, module: str) -> None:
         """Name the nodes that follow after a module."""
-        self.draft.prefix = module.replace(".", "/").strip("_/")
+        self.prefix = module.replace(".", "/").strip("_/")
 
     def width(self, reference: str) -> int:
         """The last axis of a tensor."""
-        shape = self.draft.type_of(reference).shape
+        shape = self.type_of(reference).shape
         assert shape is not None and isinstance(shape[-1], int)
         return shape[-1]
-
-    def number(self, value: float) -> str:
-        """A float32 scalar."""
-        return self.draft.const(np.array(value, FLOAT32))
 
     # ------------------------------------------------------------------ layers
 
@@ -66,25 +57,17 @@ class Network:
         self.at(module)
         weight = self.state.array(f"{module}.weight", out, self.width(x))
         bias = self.state.array(f"{module}.bias", len(weight))
-        product = self.draft.add("MatMul", [x, self.draft.const(weight.T.copy(), "kernel")])
-        return self.draft.add("BiasAdd", [product, self.draft.const(bias, "bias")])
-
-    def swish(self, x: str) -> str:
-        """x·sigmoid(x), the activation of all of ML-Agents' hidden layers."""
-        return self.draft.add("Mul", [x, self.draft.add("Sigmoid", [x])])
-
-    def clip(self, x: str, low: float, high: float) -> str:
-        """``torch.clamp``."""
-        return self.draft.add("Maximum", [self.draft.add("Minimum", [x, self.number(high)]), self.number(low)])
+        product = self.add("MatMul", [x, self.const(weight.T.copy(), "kernel")])
+        return self.add("BiasAdd", [product, self.const(bias, "bias")])
 
     def normalised(self, x: str, module: str) -> str:
         """``Normalizer``: clamp((x − mean) / sqrt(variance / steps), −5, 5)."""
         self.at(module)
         mean, variance = (self.state.array(f"{module}.running_{k}", self.width(x)) for k in ("mean", "variance"))
-        steps = self.number(self.state.number(f"{module}.normalization_steps"))
-        spread = self.draft.add("RealDiv", [self.draft.const(variance, "variance"), steps])
-        centred = self.draft.add("Sub", [x, self.draft.const(mean, "mean")])
-        return self.clip(self.draft.add("RealDiv", [centred, self.draft.add("Sqrt", [spread])]), -5, 5)
+        steps = self.floats(self.state.number(f"{module}.normalization_steps"))
+        spread = self.add("RealDiv", [self.const(variance, "variance"), steps])
+        centred = self.add("Sub", [x, self.const(mean, "mean")])
+        return clip(self, self.add("RealDiv", [centred, self.add("Sqrt", [spread])]), -5, 5)
 
     def lstm(self, x: str, memory: str, module: str) -> tuple[str, str]:
         """One step of ``nn.LSTM``. ``memory`` is [B, 1, 2H], h before c. Returns the output [B, H] and the memory."""
@@ -93,58 +76,53 @@ class Network:
         inner = self.state.array(f"{module}.weight_hh_l0", 4 * hidden, hidden)
         bias = sum(self.state.array(f"{module}.bias_{k}_l0", 4 * hidden) for k in ("ih", "hh"))
         self.at(module)
-        draft = self.draft
-        flat = draft.reshape(memory, (-1, 2 * hidden))
-        h, c = draft.slice(flat, 1, 0, hidden), draft.slice(flat, 1, hidden, 2 * hidden)
-        total = draft.add(
+        flat = self.reshape(memory, (-1, 2 * hidden))
+        h, c = self.slice(flat, 1, 0, hidden), self.slice(flat, 1, hidden, 2 * hidden)
+        total = self.add(
             "Add",
             [
-                draft.add("MatMul", [x, draft.const(kernel.T.copy(), "kernel")]),
-                draft.add("MatMul", [h, draft.const(inner.T.copy(), "recurrent_kernel")]),
+                self.add("MatMul", [x, self.const(kernel.T.copy(), "kernel")]),
+                self.add("MatMul", [h, self.const(inner.T.copy(), "recurrent_kernel")]),
             ],
         )
-        total = draft.add("BiasAdd", [total, draft.const(np.asarray(bias, FLOAT32), "bias")])
-        split = draft.add("Split", [draft.ints(1, "axis"), total], num_split=4)
+        total = self.add("BiasAdd", [total, self.const(np.asarray(bias, FLOAT32), "bias")])
+        split = self.add("Split", [self.ints(1, "axis"), total], num_split=4)
         i, f, g, o = split, f"{split}:1", f"{split}:2", f"{split}:3"
-        new = draft.add("Mul", [draft.add("Sigmoid", [i]), draft.add("Tanh", [g])])
-        cell = draft.add("Add", [draft.add("Mul", [draft.add("Sigmoid", [f]), c]), new])
-        result = draft.add("Mul", [draft.add("Sigmoid", [o]), draft.add("Tanh", [cell])])
-        return result, draft.reshape(draft.concat([result, cell], 1), (-1, 1, 2 * hidden))
+        new = self.add("Mul", [self.add("Sigmoid", [i]), self.add("Tanh", [g])])
+        cell = self.add("Add", [self.add("Mul", [self.add("Sigmoid", [f]), c]), new])
+        result = self.add("Mul", [self.add("Sigmoid", [o]), self.add("Tanh", [cell])])
+        return result, self.reshape(self.concat([result, cell], 1), (-1, 1, 2 * hidden))
 
     # ------------------------------------------------------------------ images, NHWC inside
 
     def nhwc(self, image: str) -> str:
         """An image [B, C, H, W] as TensorFlow's ops want it."""
-        return self.draft.transpose(image, _TO_NHWC)
+        return self.transpose(image, _TO_NHWC)
 
     def flat(self, image: str) -> str:
         """An image [B, H, W, C] as rows, in PyTorch's order: C, H, W."""
-        shape = self.draft.type_of(image).shape
+        shape = self.type_of(image).shape
         assert shape is not None
         size = int(np.prod([int(n) for n in shape[1:]]))
-        return self.draft.reshape(self.draft.transpose(image, _TO_NCHW), (-1, size))
+        return self.reshape(self.transpose(image, _TO_NCHW), (-1, size))
 
     def convolution(self, image: str, module: str, stride: int, padding: str = "VALID") -> str:
         """``nn.Conv2d`` on [B, H, W, C]; ``SAME`` is a padding of 1 around a kernel of 3 at stride 1."""
         self.at(module)
         kernel = self.state.array(f"{module}.weight", None, self.width(image), None, None)
         bias = self.state.array(f"{module}.bias", len(kernel))
-        value = self.draft.add(
+        value = self.add(
             "Conv2D",
-            [image, self.draft.const(np.ascontiguousarray(kernel.transpose(2, 3, 1, 0)), "kernel")],
+            [image, self.const(np.ascontiguousarray(kernel.transpose(2, 3, 1, 0)), "kernel")],
             strides=(1, stride, stride, 1),
             dilations=(1, 1, 1, 1),
             padding=padding,
         )
-        return self.draft.add("BiasAdd", [value, self.draft.const(bias, "bias")])
-
-    def leaky(self, x: str) -> str:
-        """``nn.LeakyReLU()``: slope 0.01."""
-        return self.draft.add("LeakyRelu", [x], alpha=0.01)
+        return self.add("BiasAdd", [value, self.const(bias, "bias")])
 
     def max_pool(self, image: str) -> str:
         """``nn.MaxPool2d([3, 3], [2, 2])``."""
-        return self.draft.add("MaxPool", [image], ksize=(1, 3, 3, 1), strides=(1, 2, 2, 1), padding="VALID")
+        return self.add("MaxPool", [image], ksize=(1, 3, 3, 1), strides=(1, 2, 2, 1), padding="VALID")
 
     # ------------------------------------------------------------------ distributions
 
@@ -154,16 +132,16 @@ class Network:
         actions = self.width(mean)
         conditional = f"{module}.log_sigma.weight" in self.state
         if conditional:
-            log_sigma = self.clip(self.linear(x, f"{module}.log_sigma", actions), -20, 2)
+            log_sigma = clip(self, self.linear(x, f"{module}.log_sigma", actions), -20, 2)
         else:
             self.at(f"{module}.log_sigma")
-            log_sigma = self.draft.const(self.state.array(f"{module}.log_sigma", 1, actions), "log_sigma")
+            log_sigma = self.const(self.state.array(f"{module}.log_sigma", 1, actions), "log_sigma")
         self.at(module)
-        shape = self.draft.add("Shape", [mean], "shape", out_type=INT32)
-        noise = self.draft.add("RandomStandardNormal", [shape], dtype=FLOAT32)
-        self.draft.nodes[-1] = replace(self.draft.nodes[-1], origin=noise)  # which reports of lifted noise give
-        spread = self.draft.add("Mul", [noise, self.draft.add("Exp", [log_sigma])])
-        return mean, self.draft.add("Add", [mean, spread]), conditional
+        shape = self.add("Shape", [mean], "shape", out_type=INT32)
+        drawn = f"{self.prefix}/RandomStandardNormal"  # which reports of lifted noise give
+        noise = self.add("RandomStandardNormal", [shape], origin=drawn, dtype=FLOAT32)
+        spread = self.add("Mul", [noise, self.add("Exp", [log_sigma])])
+        return mean, self.add("Add", [mean, spread]), conditional
 
     def branch(self, x: str, module: str, masks: str, start: int, *, twice: bool) -> str:
         """The probabilities of one branch of ``MultiCategoricalDistribution``, [B, actions].
@@ -172,13 +150,12 @@ class Network:
         softmax again.
         """
         logits = self.linear(x, module)
-        draft = self.draft
-        mask = draft.slice(masks, 1, start, start + self.width(logits))
-        blocked = draft.add("Add", [draft.add("Mul", [mask, self.number(-1)]), self.number(1)])
-        logits = draft.add("Sub", [draft.add("Mul", [logits, mask]), draft.add("Mul", [blocked, self.number(1e8)])])
-        probs = draft.add("Softmax", [logits])
-        return draft.add("Softmax", [self.log(probs)]) if twice else probs
+        mask = self.slice(masks, 1, start, start + self.width(logits))
+        blocked = self.add("Add", [self.add("Mul", [mask, self.floats(-1)]), self.floats(1)])
+        logits = self.add("Sub", [self.add("Mul", [logits, mask]), self.add("Mul", [blocked, self.floats(1e8)])])
+        probs = self.add("Softmax", [logits])
+        return self.add("Softmax", [self.log(probs)]) if twice else probs
 
     def log(self, probs: str) -> str:
         """The logarithm of p + 1e-7, which all generations before 0.26 exported."""
-        return self.draft.add("Log", [self.draft.add("Add", [probs, self.number(TINY)])])
+        return self.add("Log", [self.add("Add", [probs, self.floats(TINY)])])

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
 from converters.graph.types import INT64
 from converters.torch_checkpoint.network import Network
@@ -32,6 +33,8 @@ from converters.understand.generations import TORCH_VERSION_3
 from signatures.errors import DamagedFileError, SourceError
 
 _BODY = "network_body"
+#: Of ``nn.LeakyReLU()``.
+LEAKY_SLOPE = 0.01
 #: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.
 _FACTS = (
     "is_continuous_int",
@@ -120,13 +123,13 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]]) -> tuple[Graph, Sour
     net = Network(state)
     x = _observed(net, generation, sensors)
     for layer in layers:
-        x = net.swish(net.linear(x, layer))
+        x = swish(net, net.linear(x, layer))
     memory = None
     if f"{_BODY}.lstm.lstm.weight_hh_l0" in state:
         size = 2 * state.shape(f"{_BODY}.lstm.lstm.weight_hh_l0")[-1]
         x, memory = net.lstm(x, net.input("recurrent_in", 1, size), f"{_BODY}.lstm.lstm")
-    net.constant("version_number", np.array([generation.version]))
-    net.constant("memory_size", np.array([0 if memory is None else net.width(memory)]))
+    net.fact("version_number", np.array([generation.version]))
+    net.fact("memory_size", np.array([0 if memory is None else net.width(memory)]))
     names, conditional = _actions(net, generation, x)
     trainer = _trainer(state, conditional)
     if memory is not None:
@@ -200,7 +203,7 @@ def _observed(net: Network, generation: _Generation, sensors: Sequence[Sensor]) 
             assert shared is not None
             net.at(sensor.module or _BODY)
             whole = len(vectors) == 1
-            x = shared if whole else net.draft.slice(shared, 1, start, start + sensor.shape[0])
+            x = shared if whole else net.slice(shared, 1, start, start + sensor.shape[0])
             start += sensor.shape[0]
         images += image
         if image and sensor.module is not None:
@@ -209,7 +212,7 @@ def _observed(net: Network, generation: _Generation, sensors: Sequence[Sensor]) 
             x = net.normalised(x, f"{sensor.module}.normalizer")
         parts.append(x)
     net.at(_BODY)
-    return net.draft.concat(parts, 1)
+    return net.concat(parts, 1)
 
 
 def _image(net: Network, x: str, module: str) -> str:
@@ -219,18 +222,18 @@ def _image(net: Network, x: str, module: str) -> str:
     assert encoder is not None
     net.at(module)
     if encoder.key == "fully_connected":
-        shape = net.draft.type_of(x).shape
+        shape = net.type_of(x).shape
         assert shape is not None
-        flat = net.draft.reshape(x, (-1, int(np.prod([int(n) for n in shape[1:]]))))
+        flat = net.reshape(x, (-1, int(np.prod([int(n) for n in shape[1:]]))))
     elif encoder.key == "resnet":
         flat = _resnet(net, net.nhwc(x), f"{module}.sequential")
-        return net.draft.add("Relu", [net.linear(flat, dense_name(state, module))])
+        return net.add("Relu", [net.linear(flat, dense_name(state, module))])
     else:
         image = net.nhwc(x)
         for index, (_, stride) in enumerate(encoder.windows):
-            image = net.leaky(net.convolution(image, f"{module}.conv_layers.{2 * index}", stride))
+            image = leaky_relu(net, net.convolution(image, f"{module}.conv_layers.{2 * index}", stride), LEAKY_SLOPE)
         flat = net.flat(image)
-    return net.leaky(net.linear(flat, dense_name(state, module)))
+    return leaky_relu(net, net.linear(flat, dense_name(state, module)), LEAKY_SLOPE)
 
 
 def _resnet(net: Network, image: str, module: str) -> str:
@@ -239,10 +242,10 @@ def _resnet(net: Network, image: str, module: str) -> str:
         first = 4 * stack
         image = net.max_pool(net.convolution(image, f"{module}.{first}", 1, "SAME"))
         for block in (first + 2, first + 3):
-            inner = net.convolution(net.swish(image), f"{module}.{block}.layers.1", 1, "SAME")
-            inner = net.convolution(net.swish(inner), f"{module}.{block}.layers.3", 1, "SAME")
-            image = net.draft.add("Add", [image, inner])
-    return net.flat(net.swish(image))
+            inner = net.convolution(swish(net, image), f"{module}.{block}.layers.1", 1, "SAME")
+            inner = net.convolution(swish(net, inner), f"{module}.{block}.layers.3", 1, "SAME")
+            image = net.add("Add", [image, inner])
+    return net.flat(swish(net, image))
 
 
 # ------------------------------------------------------------------ actions
@@ -257,15 +260,12 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
     made: dict[str, str] = {}
     if f"{generation.continuous}.mu.weight" in net.state:
         mean, draw, squashed = net.gaussian(x, generation.continuous)
-        if squashed:
-            value = net.draft.add("Tanh", [draw])
-        else:
-            value = net.draft.add("RealDiv", [net.clip(draw, -3, 3), net.number(3)])
+        value = net.add("Tanh", [draw]) if squashed else net.add("RealDiv", [clip(net, draw, -3, 3), net.floats(3)])
         made["continuous"] = value
         size = net.width(mean)
         if not generation.first:
             net.output("continuous_actions", value)
-            net.constant("continuous_action_output_shape", np.array([size]))
+            net.fact("continuous_action_output_shape", np.array([size]))
             names += ["continuous_actions", "continuous_action_output_shape"]
     branches = [f"{generation.discrete}.branches.{i}" for i in net.state.indices(f"{generation.discrete}.branches.")]
     if branches:
@@ -274,7 +274,7 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
         if not generation.first:
             net.output("discrete_actions", value)
             shape = np.array([sizes]) if generation.by_sensor else np.array([sum(sizes)])
-            net.constant("discrete_action_output_shape", shape)
+            net.fact("discrete_action_output_shape", shape)
             names += ["discrete_actions", "discrete_action_output_shape"]
     if not made:
         raise DamagedFileError(
@@ -283,8 +283,8 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
     if not generation.by_sensor and len(made) == 1:  # 0.22 to 0.25 called the one action by its old name, too
         kind, value = next(iter(made.items()))
         net.output("action", value)
-        net.constant("is_continuous_control", np.array([kind == "continuous"]))
-        net.constant("action_output_shape", np.array([net.width(value)]))
+        net.fact("is_continuous_control", np.array([kind == "continuous"]))
+        net.fact("action_output_shape", np.array([net.width(value)]))
         names = ["action", "is_continuous_control", "action_output_shape", *names]
     return names, squashed
 
@@ -298,8 +298,8 @@ def _discrete(net: Network, generation: _Generation, x: str, branches: Sequence[
         probs = net.branch(x, branch, masks, start, twice=generation.first)
         start += size
         if generation.by_sensor:
-            logs = net.draft.add("Log", [probs])
-            parts.append(net.draft.add("Multinomial", [logs, net.draft.ints(1, "count")], output_dtype=INT64))
+            logs = net.add("Log", [probs])
+            parts.append(net.add("Multinomial", [logs, net.ints(1, "count")], output_dtype=INT64))
         else:
             parts.append(net.log(probs))
-    return net.draft.concat(parts, 1), sizes
+    return net.concat(parts, 1), sizes

@@ -65,6 +65,7 @@ def _unary() -> Iterator[Case]:
                 return m.layer("y", 50, m.inputs[0].name, activation=number, alpha=alpha, beta=beta)
 
             yield _case(f"activation-{number}-{label}", build, x)
+    yield _case("leaky-steep", lambda m: m.layer("y", 50, X1, activation=7, alpha=1.5), VECTOR)
     yield _case("elu-default", lambda m: m.layer("y", 50, X1, activation=5), VECTOR)
     wide = np.array([[[[-1e30, -3e5, -1.5, -1e-4, 0, 1e-4, 1.5, 3e5, 1e30, 20]]]], np.float32).repeat(BATCH, 0)
     yield _case("atan-far", lambda m: m.layer("y", 50, X1, activation=204), wide)

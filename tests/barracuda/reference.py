@@ -140,7 +140,7 @@ def activation(number: int, x: Array, a: float, b: float) -> Array:
         4: lambda: 1 / (1 + np.exp(-x)),
         5: lambda: np.where(x <= 0, a * (np.exp(x) - 1), x),
         6: lambda: np.minimum(np.maximum(x, 0), 6),
-        7: lambda: np.maximum(x, a * x),
+        7: lambda: np.where(x < 0, a * x, x),
         8: lambda: b * np.where(x <= 0, a * np.exp(x) - a, x),
         9: lambda: x / (1 + np.exp(-x)),
         10: lambda: np.log(_softmax(x)),

@@ -28,7 +28,7 @@ def body(kind: str) -> Any:
 
 
 REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array], str]] = {
-    "an unknown op": ([node("Det", ["x"])], X, {}, r"Det \(node 'y'\): no entry of the raising table"),
+    "an unknown op": ([node("Det", ["x"])], X, {}, r"Det \(node 'y'\): no entry of the table of ONNX ops"),
     "another domain": (
         [node("Gelu", ["x"], domain="com.microsoft")], X, {}, r"Gelu of com\.microsoft \(node 'y'\): its domain",
     ),

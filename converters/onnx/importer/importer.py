@@ -1,4 +1,4 @@
-"""ONNX nodes into a draft, one by one: values get names, what cannot be converted breaks what depends on it."""
+"""ONNX nodes into a graph, one by one: values get names, what cannot be converted breaks what depends on it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape, topological
+from converters.graph.builder import Builder
+from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, TensorType
-from converters.onnx.importer.drafting import Draft
 from converters.onnx.importer.fixed_batch import FixedRows
-from converters.onnx.importer.node import STANDARD, Op, Raise
+from converters.onnx.importer.node import STANDARD, Op, Translate
 from converters.onnx.proto import array_of, attribute_of
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
@@ -28,17 +28,17 @@ def node_name(value: str) -> str:
     return name or "value"
 
 
-class Raiser(Draft):
-    """The draft of a model; see the module.
+class Importer(Builder):
+    """The builder of a model's graph; see the module.
 
     ``opsets`` is the version of each domain, ``reserved`` the values whose names are kept as they are (inputs and
     outputs). ``batch`` is the number of rows that a model was exported for, where that is fixed: its first axes are
-    freed, and shapes that hold the number are read accordingly (``fixed_rows.py``).
+    freed, and shapes that hold the number are read accordingly (``fixed_batch.py``).
     """
 
     def __init__(
         self,
-        table: Mapping[tuple[str, str], Raise],
+        table: Mapping[tuple[str, str], Translate],
         opsets: Mapping[str, int],
         reserved: Sequence[str],
         batch: int | None = None,
@@ -65,11 +65,9 @@ class Raiser(Draft):
 
     def draw(self, op: str, inputs: Sequence[str], value: str) -> str:
         """A sampler of N(0, 1), which carries the name of the ONNX value that is drawn."""
-        made = self.add(op, inputs, dtype=FLOAT32)
         if not self._scope:
             self.draws.append(value)
-            self.nodes[-1] = replace(self.nodes[-1], origin=value)
-        return made
+        return self.add(op, inputs, origin=self._origin(value), dtype=FLOAT32)
 
     def placeholder(self, value: str, dtype: np.dtype, shape: TensorShape, assumed: np.ndarray | None = None) -> str:
         """An input of the model. ``assumed`` is the value that it has in every run of a policy."""
@@ -85,7 +83,7 @@ class Raiser(Draft):
         """A constant of the model, or of a body that is being inlined."""
         self.values[value] = self.append(Node(self._name_for(value), "Const", value=array, origin=self._origin(value)))
 
-    def raise_node(self, op: Op, names: Sequence[str]) -> None:
+    def import_node(self, op: Op, names: Sequence[str]) -> None:
         """Make what an ONNX node becomes, and let its values (``names`` are the ones it reads) stand for it.
 
         A node that cannot be converted breaks its values and all that depend on them; whether that matters is decided
@@ -123,7 +121,7 @@ class Raiser(Draft):
         name, origin = self._name_for(value), self._origin(value)
         last = self.nodes[-1]
         if rename and reference == last.name and last.origin in (None, origin) and self._may_rename(last):
-            self._rename_last(name, origin)
+            self.rename(last.name, name, origin)  # the usual case
         else:
             at = self.position.get(reference)
             if at is not None and self.nodes[at].origin is None and self.nodes[at].op != "Const":
@@ -136,15 +134,6 @@ class Raiser(Draft):
         if node.op in ("Placeholder", "Const") or node.name in self._bound or node.name in self.lengths.values():
             return False
         return self.outputs(node.name) == 1
-
-    def _rename_last(self, name: str, origin: str | None) -> None:
-        """The usual case: a function's last node is the result, so it takes the value's name itself."""
-        last = self.nodes[-1]
-        self.nodes[-1] = replace(last, name=name, origin=origin)
-        self.position[name] = self.position.pop(last.name)
-        self.types[name] = self.types.pop(last.name)
-        if last.name in self.tainted:
-            self.tainted.add(name)
 
     def _name_for(self, value: str) -> str:
         if not self._scope and value in self._reserved:
@@ -173,7 +162,7 @@ class Raiser(Draft):
             self.values, self._scope, self.prefix = outer
 
     def run(self, protos: Iterable[Any]) -> None:
-        """Raise nodes in their order."""
+        """Translate nodes in their order."""
         for proto in protos:
             names = list(proto.input)
             inputs = tuple(self.values.get(n) if n else None for n in names)
@@ -185,7 +174,7 @@ class Raiser(Draft):
             except UnsupportedOpError as error:
                 self._break(op, error)
             else:
-                self.raise_node(op, names)
+                self.import_node(op, names)
 
     def _causes(self, op: Op, missing: Sequence[str]) -> list[UnsupportedOpError]:
         """Why values are missing; raises DamagedFileError where nothing makes them."""
@@ -202,10 +191,6 @@ class Raiser(Draft):
         for value in op.outputs:
             if value:
                 self.broken[value] = error
-
-    def graph(self) -> Graph:
-        """The finished graph."""
-        return Graph(topological(self.nodes))
 
 
 def joined_errors(errors: Sequence[UnsupportedOpError]) -> UnsupportedOpError:
@@ -227,7 +212,7 @@ def _unknown(op: Op) -> tuple[str, str, str]:
             "export the model without that runtime's optimisations, with ONNX's own ops (domain 'ai.onnx') only",
         )
     return (
-        "no entry of the raising table covers it",
+        "no entry of the table of ONNX ops covers it",
         "it occurs in no policy that this tool was made for",
         "if the node is not part of the policy, name the outputs you need with --output; else please open an issue",
     )

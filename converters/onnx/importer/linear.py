@@ -8,8 +8,8 @@ import numpy as np
 
 from converters.graph.types import INT64, Dim, product
 from converters.onnx.importer.elementwise import is_bias
-from converters.onnx.importer.importer import Raiser
-from converters.onnx.importer.node import Op, Raise
+from converters.onnx.importer.importer import Importer
+from converters.onnx.importer.node import Op, Translate
 
 #: Product with a matrix behind further axes is written on two axes: TF 1.x multiplies batches of equal shape only.
 _MATRIX = 2
@@ -18,60 +18,60 @@ _MATRIX = 2
 # ------------------------------------------------------------------ products
 
 
-def _gemm(op: Op, r: Raiser) -> str:
+def _gemm(op: Op, net: Importer) -> str:
     """alpha·A'·B' + beta·C; A is a matrix, or flattened to one by the exporter."""
     a, b = op.need(0), op.need(1)
     if op.integer("transA", 0):
-        a = r.transpose(a, (1, 0))
+        a = net.transpose(a, (1, 0))
     if op.integer("transB", 0):
-        b = r.transpose(b, (1, 0))
-    value = r.add("MatMul", [a, b])
+        b = net.transpose(b, (1, 0))
+    value = net.add("MatMul", [a, b])
     alpha, beta, c = op.number("alpha", 1.0), op.number("beta", 1.0), op.get(2)
     if alpha != 1:
-        value = r.add("Mul", [value, r.number(value, alpha)])
+        value = net.add("Mul", [value, net.number(value, alpha)])
     if c is None or beta == 0:
         return value
-    constant = r.constant(c)
+    constant = net.constant(c)
     if beta != 1:
         scaled = None if constant is None else (constant * constant.dtype.type(beta)).astype(constant.dtype)
-        c = r.add("Mul", [c, r.number(c, beta)]) if scaled is None else r.const(scaled, "c")
+        c = net.add("Mul", [c, net.number(c, beta)]) if scaled is None else net.const(scaled, "c")
         constant = scaled
     if constant is not None and constant.ndim == _MATRIX and constant.shape[0] == 1:
-        row = r.const(constant.reshape(-1), "bias")
-        c = row if is_bias(r, value, row) else c
-    return r.add("BiasAdd" if is_bias(r, value, c) else "Add", [value, c])
+        row = net.const(constant.reshape(-1), "bias")
+        c = row if is_bias(net, value, row) else c
+    return net.add("BiasAdd" if is_bias(net, value, c) else "Add", [value, c])
 
 
-def _matmul(op: Op, r: Raiser) -> str:
+def _matmul(op: Op, net: Importer) -> str:
     """Numpy's matmul: vectors are rows or columns, further axes broadcast."""
-    return matmul(op, r, op.need(0), op.need(1))
+    return matmul(op, net, op.need(0), op.need(1))
 
 
-def matmul(op: Op, r: Raiser, a: str, b: str) -> str:
+def matmul(op: Op, net: Importer, a: str, b: str) -> str:
     """See ``_matmul``."""
-    left, right = r.rank(op, a), r.rank(op, b)
+    left, right = net.rank(a), net.rank(b)
     if left == 1:
-        a = r.expand_dims(a, 0)
+        a = net.expand_dims(a, 0)
     if right == 1:
-        b = r.expand_dims(b, 1)
-    value = _batched(op, r, a, b)
-    rank = r.rank(op, value)
-    return r.squeeze(value, [axis for axis, gone in ((rank - 2, left == 1), (rank - 1, right == 1)) if gone])
+        b = net.expand_dims(b, 1)
+    value = _batched(op, net, a, b)
+    rank = net.rank(value)
+    return net.squeeze(value, [axis for axis, gone in ((rank - 2, left == 1), (rank - 1, right == 1)) if gone])
 
 
-def _batched(op: Op, r: Raiser, a: str, b: str) -> str:
-    x, y = r.shape(op, a), r.shape(op, b)
+def _batched(op: Op, net: Importer, a: str, b: str) -> str:
+    x, y = net.shape(a), net.shape(b)
     if len(x) == _MATRIX and len(y) == _MATRIX:
-        return r.add("MatMul", [a, b])
+        return net.add("MatMul", [a, b])
     if len(y) == _MATRIX:
-        rows = r.reshape(a, (-1, r.length(op, a, -1)))
-        return r.reshape(r.add("MatMul", [rows, b]), (*x[:-1], y[-1]))
-    batch = r.joined(op, [x[:-2], y[:-2]])
-    wide = [r.broadcast(t, (*batch, *s[-2:])) for t, s in ((a, x), (b, y))]
-    return r.add("BatchMatMul", wide)
+        rows = net.reshape(a, (-1, net.length(a, -1)))
+        return net.reshape(net.add("MatMul", [rows, b]), (*x[:-1], y[-1]))
+    batch = net.joined([x[:-2], y[:-2]])
+    wide = [net.broadcast(t, (*batch, *s[-2:])) for t, s in ((a, x), (b, y))]
+    return net.add("BatchMatMul", wide)
 
 
-def _einsum(op: Op, r: Raiser) -> str:
+def _einsum(op: Op, net: Importer) -> str:
     """Sums of products of one or two tensors, each label at most once per operand."""
     equation = op.text("equation", "").replace(" ", "")
     left, arrow, result = equation.partition("->")
@@ -89,14 +89,14 @@ def _einsum(op: Op, r: Raiser) -> str:
     lone = [[c for c in t if c not in result and not any(c in o for o in terms if o is not t)] for t in terms]
     for i, labels in enumerate(lone):
         if labels:
-            tensors[i] = r.reduce("Sum", tensors[i], [terms[i].index(c) for c in labels], keep=False)
+            tensors[i] = net.reduce("Sum", tensors[i], [terms[i].index(c) for c in labels], keep=False)
             terms[i] = "".join(c for c in terms[i] if c not in labels)
     if len(terms) == 1:
-        return r.transpose(tensors[0], [terms[0].index(c) for c in result])
-    return _contracted(op, r, tensors, terms, result)
+        return net.transpose(tensors[0], [terms[0].index(c) for c in result])
+    return _contracted(op, net, tensors, terms, result)
 
 
-def _contracted(op: Op, r: Raiser, tensors: Sequence[str], terms: Sequence[str], result: str) -> str:
+def _contracted(op: Op, net: Importer, tensors: Sequence[str], terms: Sequence[str], result: str) -> str:
     """Two operands as one batch of matrix products: [batch, rows, inner] × [batch, inner, columns]."""
     a, b = terms
     groups = {
@@ -107,21 +107,21 @@ def _contracted(op: Op, r: Raiser, tensors: Sequence[str], terms: Sequence[str],
     }
     lengths: dict[str, Dim] = {}
     for tensor, term in zip(tensors, terms, strict=True):
-        lengths.update(zip(term, r.shape(op, tensor), strict=True))
+        lengths.update(zip(term, net.shape(tensor), strict=True))
 
     def total(name: str) -> Dim:
-        return product((lengths[c] for c in groups[name]), r.symbols)
+        return product((lengths[c] for c in groups[name]), net.symbols)
 
     matrices = []
     for tensor, term, (first, second) in zip(tensors, terms, (("rows", "inner"), ("inner", "columns")), strict=True):
         order = [*groups["batch"], *groups[first], *groups[second]]
-        turned = r.transpose(tensor, [term.index(c) for c in order])
+        turned = net.transpose(tensor, [term.index(c) for c in order])
         sizes = [total("batch"), total(first), total(second)]
-        matrices.append(r.reshape(turned, _one_open(sizes)))
-    value = r.add("BatchMatMul", matrices)
+        matrices.append(net.reshape(turned, _one_open(sizes)))
+    value = net.add("BatchMatMul", matrices)
     order = [*groups["batch"], *groups["rows"], *groups["columns"]]
-    value = r.reshape(value, [lengths[c] for c in order])
-    return r.transpose(value, [order.index(c) for c in result])
+    value = net.reshape(value, [lengths[c] for c in order])
+    return net.transpose(value, [order.index(c) for c in result])
 
 
 def _one_open(sizes: Sequence[Dim]) -> list[Dim]:
@@ -133,129 +133,131 @@ def _one_open(sizes: Sequence[Dim]) -> list[Dim]:
 # ------------------------------------------------------------------ reductions
 
 
-def _axes(op: Op, r: Raiser, since: int) -> list[int] | None:
+def _axes(op: Op, net: Importer, since: int) -> list[int] | None:
     """The axes of a reduction: an attribute, from opset ``since`` on an input. None: the input is left as it is."""
     x = op.need(0)
     axes = op.integers("axes")
     operand = op.get(1)
     if op.opset >= since and operand is not None:
-        axes = tuple(int(a) for a in r.needed_constant(op, operand, "the list of axes").reshape(-1))
+        axes = tuple(int(a) for a in net.needed_constant(operand, "the list of axes").reshape(-1))
     if not axes:
         if op.integer("noop_with_empty_axes", 0):
             return None
-        return list(range(r.rank(op, x)))
-    return sorted({r.axis(op, x, a) for a in axes})
+        return list(range(net.rank(x)))
+    return sorted({net.axis(x, a) for a in axes})
 
 
-def _reduction(build: Callable[[Raiser, str, list[int], bool], str], since: int = 18) -> Raise:
-    def function(op: Op, r: Raiser) -> str:
-        axes, keep = _axes(op, r, since), bool(op.integer("keepdims", 1))
+def _reduction(build: Callable[[Importer, str, list[int], bool], str], since: int = 18) -> Translate:
+    def function(op: Op, net: Importer) -> str:
+        axes, keep = _axes(op, net, since), bool(op.integer("keepdims", 1))
         if axes is None:
             axes = []
-        return build(r, op.need(0), axes, keep)
+        return build(net, op.need(0), axes, keep)
 
     return function
 
 
-def _plain(kind: str) -> Callable[[Raiser, str, list[int], bool], str]:
-    def build(r: Raiser, x: str, axes: list[int], keep: bool) -> str:
-        return r.reduce(kind, x, axes, keep=keep) if axes else x
+def _plain(kind: str) -> Callable[[Importer, str, list[int], bool], str]:
+    def build(net: Importer, x: str, axes: list[int], keep: bool) -> str:
+        return net.reduce(kind, x, axes, keep=keep) if axes else x
 
     return build
 
 
-def _log_sum_exp(r: Raiser, x: str, axes: list[int], keep: bool) -> str:
+def _log_sum_exp(net: Importer, x: str, axes: list[int], keep: bool) -> str:
     """The logarithm of Σ exp(x), the largest element taken out first (zero where all are −∞, as onnxruntime does)."""
-    top = r.reduce("Max", x, axes, keep=True)
-    finite = r.add("Less", [r.add("Abs", [top]), r.number(top, np.inf)])
-    top = r.add("Select", [finite, top, r.add("ZerosLike", [top])])
-    total = r.reduce("Sum", r.add("Exp", [r.add("Sub", [x, top])]), axes, keep=True)
-    value = r.add("Add", [r.add("Log", [total]), top])
-    return value if keep else r.squeeze(value, axes)
+    top = net.reduce("Max", x, axes, keep=True)
+    finite = net.add("Less", [net.add("Abs", [top]), net.number(top, np.inf)])
+    top = net.add("Select", [finite, top, net.add("ZerosLike", [top])])
+    total = net.reduce("Sum", net.add("Exp", [net.add("Sub", [x, top])]), axes, keep=True)
+    value = net.add("Add", [net.add("Log", [total]), top])
+    return value if keep else net.squeeze(value, axes)
 
 
-_REDUCTIONS: Mapping[str, Callable[[Raiser, str, list[int], bool], str]] = {
+_REDUCTIONS: Mapping[str, Callable[[Importer, str, list[int], bool], str]] = {
     "ReduceMean": _plain("Mean"),
     "ReduceMax": _plain("Max"),
     "ReduceMin": _plain("Min"),
     "ReduceProd": _plain("Prod"),
-    "ReduceL1": lambda r, x, axes, keep: r.reduce("Sum", r.add("Abs", [x]), axes, keep=keep),
-    "ReduceL2": lambda r, x, axes, keep: r.add("Sqrt", [r.reduce("Sum", r.add("Square", [x]), axes, keep=keep)]),
-    "ReduceSumSquare": lambda r, x, axes, keep: r.reduce("Sum", r.add("Square", [x]), axes, keep=keep),
-    "ReduceLogSum": lambda r, x, axes, keep: r.add("Log", [r.reduce("Sum", x, axes, keep=keep)]),
+    "ReduceL1": lambda net, x, axes, keep: net.reduce("Sum", net.add("Abs", [x]), axes, keep=keep),
+    "ReduceL2": lambda net, x, axes, keep: net.add(
+        "Sqrt", [net.reduce("Sum", net.add("Square", [x]), axes, keep=keep)]
+    ),
+    "ReduceSumSquare": lambda net, x, axes, keep: net.reduce("Sum", net.add("Square", [x]), axes, keep=keep),
+    "ReduceLogSum": lambda net, x, axes, keep: net.add("Log", [net.reduce("Sum", x, axes, keep=keep)]),
     "ReduceLogSumExp": _log_sum_exp,
 }
 
 
-def _arg(kind: str) -> Raise:
-    def function(op: Op, r: Raiser) -> str:
+def _arg(kind: str) -> Translate:
+    def function(op: Op, net: Importer) -> str:
         x = op.need(0)
-        axis = r.axis(op, x, op.integer("axis", 0))
+        axis = net.axis(x, op.integer("axis", 0))
         if op.integer("select_last_index", 0):
             raise op.refused("it takes the last of equal elements", "the targets take the first")
-        best = r.add(kind, [x, r.ints(axis, "axis")], output_type=INT64)
-        return r.expand_dims(best, axis) if op.integer("keepdims", 1) else best
+        best = net.add(kind, [x, net.ints(axis, "axis")], output_type=INT64)
+        return net.expand_dims(best, axis) if op.integer("keepdims", 1) else best
 
     return function
 
 
-def _top_k(op: Op, r: Raiser) -> list[str | None]:
+def _top_k(op: Op, net: Importer) -> list[str | None]:
     """The one best element. k is an attribute before opset 10."""
     x = op.need(0)
     count = op.get(1)
-    k = op.integer("k", 0) if count is None else int(r.needed_constant(op, count, "k").reshape(-1)[0])
+    k = op.integer("k", 0) if count is None else int(net.needed_constant(count, "k").reshape(-1)[0])
     if k != 1:
         raise op.refused(f"k is {k}", "only the one best element is taken in policies")
-    axis = r.axis(op, x, op.integer("axis", -1))
+    axis = net.axis(x, op.integer("axis", -1))
     largest = op.integer("largest", 1)
-    best = r.reduce("Max" if largest else "Min", x, [axis], keep=True)
-    place = r.add("ArgMax" if largest else "ArgMin", [x, r.ints(axis, "axis")], output_type=INT64)
-    return [best, r.expand_dims(place, axis)]
+    best = net.reduce("Max" if largest else "Min", x, [axis], keep=True)
+    place = net.add("ArgMax" if largest else "ArgMin", [x, net.ints(axis, "axis")], output_type=INT64)
+    return [best, net.expand_dims(place, axis)]
 
 
 # ------------------------------------------------------------------ softmax
 
 
-def _softmax(op: Op, r: Raiser) -> str:
+def _softmax(op: Op, net: Importer) -> str:
     """Over one axis from opset 13 on; before, over everything from that axis on.
 
     Written on two axes: TF 1.x takes no others.
     """
     x = op.need(0)
-    dims = r.shape(op, x)
+    dims = net.shape(x)
     whole = op.opset < 13
-    axis = r.axis(op, x, op.integer("axis", 1 if whole else -1)) if dims else 0
+    axis = net.axis(x, op.integer("axis", 1 if whole else -1)) if dims else 0
     last = len(dims) - 1
     if whole and axis < last:
-        size = product(dims[axis:], r.symbols)
+        size = product(dims[axis:], net.symbols)
         if not isinstance(size, int):
             raise op.refused("it is taken over axes whose lengths are not known")
-        return r.reshape(r.add(op.kind, [r.reshape(x, (-1, size))]), dims)
+        return net.reshape(net.add(op.kind, [net.reshape(x, (-1, size))]), dims)
     order = [i for i in range(len(dims)) if i != axis] + [axis]
-    turned = r.transpose(x, order)
-    value = _on_rows(op, r, turned)
-    return r.transpose(value, [order.index(i) for i in range(len(dims))]) if axis != last else value
+    turned = net.transpose(x, order)
+    value = _on_rows(op, net, turned)
+    return net.transpose(value, [order.index(i) for i in range(len(dims))]) if axis != last else value
 
 
-def _on_rows(op: Op, r: Raiser, x: str) -> str:
-    dims = r.shape(op, x)
+def _on_rows(op: Op, net: Importer, x: str) -> str:
+    dims = net.shape(x)
     if len(dims) == _MATRIX:
-        return r.add(op.kind, [x])
-    return r.reshape(r.add(op.kind, [r.reshape(x, (-1, r.length(op, x, -1)))]), dims)
+        return net.add(op.kind, [x])
+    return net.reshape(net.add(op.kind, [net.reshape(x, (-1, net.length(x, -1)))]), dims)
 
 
-def _hardmax(op: Op, r: Raiser) -> str:
+def _hardmax(op: Op, net: Importer) -> str:
     """1 at the first largest element; one axis from opset 13 on."""
     x = op.need(0)
-    axis = r.axis(op, x, op.integer("axis", 1 if op.opset < 13 else -1))
-    if axis != r.rank(op, x) - 1:
+    axis = net.axis(x, op.integer("axis", 1 if op.opset < 13 else -1))
+    if axis != net.rank(x) - 1:
         raise op.refused("it is taken over an axis that is not the last")
-    best = r.add("ArgMax", [x, r.ints(axis, "axis")], output_type=INT64)
-    depth = r.ints(r.length(op, x, axis), "depth")
-    return r.add("OneHot", [best, depth, r.number(x, 1, "on"), r.number(x, 0, "off")], axis=-1)
+    best = net.add("ArgMax", [x, net.ints(axis, "axis")], output_type=INT64)
+    depth = net.ints(net.length(x, axis), "depth")
+    return net.add("OneHot", [best, depth, net.number(x, 1, "on"), net.number(x, 0, "off")], axis=-1)
 
 
-OPS: Mapping[str, Raise] = {
+OPS: Mapping[str, Translate] = {
     "Gemm": _gemm,
     "MatMul": _matmul,
     "Einsum": _einsum,

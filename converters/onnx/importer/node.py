@@ -1,4 +1,4 @@
-"""An ONNX node as the raising functions see it: inputs as tensors of the new graph, attributes as Python values."""
+"""An ONNX node as the translating functions see it: inputs as tensors of the new graph, attributes as Python values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 from signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:
-    from converters.onnx.importer.importer import Raiser
+    from converters.onnx.importer.importer import Importer
 
 #: Domains that mean ONNX's own operators.
 STANDARD = ("", "ai.onnx")
@@ -105,4 +105,4 @@ class Op:
 
 
 #: Makes the op's outputs in the new graph: the reference of the only one, or one per output (None where not made).
-Raise = Callable[[Op, "Raiser"], "str | Sequence[str | None]"]
+Translate = Callable[[Op, "Importer"], "str | Sequence[str | None]"]

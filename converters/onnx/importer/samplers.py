@@ -4,26 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
+from converters.graph.nn.activations import scaled
 from converters.graph.types import BATCH, FLOAT32, INT32
-from converters.onnx.importer.importer import Raiser
-from converters.onnx.importer.node import Op, Raise
+from converters.onnx.importer.importer import Importer
+from converters.onnx.importer.node import Op, Translate
 
 
-def _shape(op: Op, r: Raiser) -> str:
+def _shape(op: Op, net: Importer) -> str:
     """The shape to draw: an attribute, or that of an input. A fixed number of rows becomes the batch."""
     dims = op.integers("shape")
     if not op.kind.endswith("Like"):
         if dims is None:
             raise op.refused("it has no shape", "the model is damaged")
     else:
-        known = r.type_of(op.need(0)).shape
+        known = net.type_of(op.need(0)).shape
         if known is None or any(isinstance(d, str) for d in known):
-            return r.add("Shape", [op.need(0)], "shape", out_type=INT32)
+            return net.add("Shape", [op.need(0)], "shape", out_type=INT32)
         dims = tuple(int(d) for d in known)
-    rows = r.batch is not None and len(dims) > 1 and dims[0] == r.batch
-    return r.vector((BATCH, *dims[1:]) if rows else dims)
+    rows = net.batch is not None and len(dims) > 1 and dims[0] == net.batch
+    return net.vector((BATCH, *dims[1:]) if rows else dims)
 
 
 def _float(op: Op) -> None:
@@ -32,33 +31,27 @@ def _float(op: Op) -> None:
         raise op.refused("it draws numbers that are no float32")
 
 
-def _moved(op: Op, r: Raiser, value: str, factor: float, shift: float) -> str:
-    if factor != 1:
-        value = r.add("Mul", [value, r.const(np.array(factor, FLOAT32), "scale")])
-    return value if shift == 0 else r.add("Add", [value, r.const(np.array(shift, FLOAT32), "shift")])
-
-
-def _normal(op: Op, r: Raiser) -> str:
+def _normal(op: Op, net: Importer) -> str:
     """N(mean, scale²) as a draw of N(0, 1), which is what is lifted under the value's name."""
     _float(op)
-    draw = r.draw("RandomStandardNormal", [_shape(op, r)], op.outputs[0])
-    return _moved(op, r, draw, op.number("scale", 1.0), op.number("mean", 0.0))
+    draw = net.draw("RandomStandardNormal", [_shape(op, net)], op.outputs[0])
+    return scaled(net, draw, op.number("scale", 1.0), op.number("mean", 0.0))
 
 
-def _uniform(op: Op, r: Raiser) -> str:
+def _uniform(op: Op, net: Importer) -> str:
     _float(op)
     low, high = op.number("low", 0.0), op.number("high", 1.0)
-    draw = r.add("RandomUniform", [_shape(op, r)], dtype=FLOAT32)
-    return _moved(op, r, draw, high - low, low)
+    draw = net.add("RandomUniform", [_shape(op, net)], dtype=FLOAT32)
+    return scaled(net, draw, high - low, low)
 
 
-def _multinomial(op: Op, r: Raiser) -> str:
+def _multinomial(op: Op, net: Importer) -> str:
     """Classes drawn from rows of log-probabilities."""
-    count = r.ints(op.integer("sample_size", 1), "count")
-    return r.add("Multinomial", [op.need(0), count], output_dtype=op.dtype("dtype", 6))
+    count = net.ints(op.integer("sample_size", 1), "count")
+    return net.add("Multinomial", [op.need(0), count], output_dtype=op.dtype("dtype", 6))
 
 
-OPS: Mapping[str, Raise] = {
+OPS: Mapping[str, Translate] = {
     "RandomNormal": _normal,
     "RandomNormalLike": _normal,
     "RandomUniform": _uniform,

@@ -14,9 +14,9 @@ import numpy as np
 
 from converters.graph.ops.convolution import window_padding
 from converters.graph.types import FLOAT32
-from converters.onnx.importer.cutting import padded
-from converters.onnx.importer.importer import Raiser
-from converters.onnx.importer.node import Op, Raise
+from converters.onnx.importer.importer import Importer
+from converters.onnx.importer.node import Op, Translate
+from converters.onnx.importer.slicing import padded
 
 _TO_NHWC, _TO_NCHW = (0, 2, 3, 1), (0, 3, 1, 2)
 _IMAGE = 4
@@ -41,8 +41,8 @@ class _Window:
         return tuple((k - 1) * d + 1 for k, d in zip(self.size, self.dilations, strict=True))
 
 
-def _window(op: Op, r: Raiser, x: str, size: Sequence[int]) -> _Window:
-    spatial = r.rank(op, x) - 2
+def _window(op: Op, net: Importer, x: str, size: Sequence[int]) -> _Window:
+    spatial = net.rank(x) - 2
     if spatial not in (1, 2):
         raise op.refused(f"it works on {spatial} spatial axes", "policies see images and rows of pixels")
     if len(size) != spatial:
@@ -63,32 +63,32 @@ def _window(op: Op, r: Raiser, x: str, size: Sequence[int]) -> _Window:
     return _Window(tuple(size), strides, dilations, pairs if auto_pad == "NOTSET" else None, auto_pad, ceil)
 
 
-def _image(op: Op, r: Raiser, x: str) -> str:
+def _image(op: Op, net: Importer, x: str) -> str:
     """NCHW (or NCW) as NHWC."""
-    return r.transpose(r.expand_dims(x, 2) if r.rank(op, x) == _IMAGE - 1 else x, _TO_NHWC)
+    return net.transpose(net.expand_dims(x, 2) if net.rank(x) == _IMAGE - 1 else x, _TO_NHWC)
 
 
-def _back(op: Op, r: Raiser, value: str) -> str:
-    result = r.transpose(value, _TO_NCHW)
-    return r.squeeze(result, [2]) if r.rank(op, op.need(0)) == _IMAGE - 1 else result
+def _back(op: Op, net: Importer, value: str) -> str:
+    result = net.transpose(value, _TO_NCHW)
+    return net.squeeze(result, [2]) if net.rank(op.need(0)) == _IMAGE - 1 else result
 
 
-def _resolved(op: Op, r: Raiser, image: str, window: _Window) -> Pairs:
+def _resolved(op: Op, net: Importer, image: str, window: _Window) -> Pairs:
     """The paddings of height and width as numbers, for an NHWC image."""
     if window.pads is not None:
-        return window.pads if not window.ceil else _ceiled(op, r, image, window, window.pads)
+        return window.pads if not window.ceil else _ceiled(op, net, image, window, window.pads)
     pairs = []
     for axis, (span, stride) in enumerate(zip(window.span, window.strides, strict=True)):
-        _, before, after = window_padding(r.length(op, image, axis + 1), span, stride, "SAME")
+        _, before, after = window_padding(net.length(image, axis + 1), span, stride, "SAME")
         pairs.append((before, after) if window.auto_pad == "SAME_UPPER" else (after, before))
     return tuple(pairs)
 
 
-def _ceiled(op: Op, r: Raiser, image: str, window: _Window, pads: Pairs) -> Pairs:
+def _ceiled(op: Op, net: Importer, image: str, window: _Window, pads: Pairs) -> Pairs:
     """``ceil_mode`` as more padding at the end; a window that would begin in it is left out (opset 19)."""
     pairs = []
     for axis, ((before, after), span, stride) in enumerate(zip(pads, window.span, window.strides, strict=True)):
-        length = r.length(op, image, axis + 1)
+        length = net.length(image, axis + 1)
         count = -(-(length + before + after - span) // stride) + 1
         if (count - 1) * stride >= length + before:
             count -= 1
@@ -96,9 +96,9 @@ def _ceiled(op: Op, r: Raiser, image: str, window: _Window, pads: Pairs) -> Pair
     return tuple(pairs)
 
 
-def _is_same(r: Raiser, image: str, window: _Window, pairs: Pairs) -> bool:
+def _is_same(net: Importer, image: str, window: _Window, pairs: Pairs) -> bool:
     """Whether paddings are the ones of TensorFlow's SAME."""
-    shape = r.type_of(image).shape
+    shape = net.type_of(image).shape
     if window.auto_pad == "SAME_UPPER":
         return True
     if shape is None or not all(isinstance(n, int) for n in shape[1:3]):
@@ -110,41 +110,41 @@ def _is_same(r: Raiser, image: str, window: _Window, pairs: Pairs) -> bool:
     return list(pairs) == wanted
 
 
-def _framed(op: Op, r: Raiser, image: str, window: _Window, fill: str | None = None) -> tuple[str, str]:
+def _framed(op: Op, net: Importer, image: str, window: _Window, fill: str | None = None) -> tuple[str, str]:
     """(image, TensorFlow's padding): padded by a node of its own unless it is SAME or VALID."""
     if window.auto_pad == "SAME_UPPER":
         return image, "SAME"
-    pairs = _resolved(op, r, image, window)
+    pairs = _resolved(op, net, image, window)
     if not any(a or b for a, b in pairs):
         return image, "VALID"
-    if _is_same(r, image, window, pairs):
+    if _is_same(net, image, window, pairs):
         return image, "SAME"
-    return padded(op, r, image, [(0, 0), *pairs, (0, 0)], fill), "VALID"
+    return padded(op, net, image, [(0, 0), *pairs, (0, 0)], fill), "VALID"
 
 
 # ------------------------------------------------------------------ convolutions
 
 
-def _kernel(op: Op, r: Raiser) -> np.ndarray:
-    kernel = r.needed_constant(op, op.need(1), "the kernel")
+def _kernel(op: Op, net: Importer) -> np.ndarray:
+    kernel = net.needed_constant(op.need(1), "the kernel")
     return kernel[:, :, None, :] if kernel.ndim == _IMAGE - 1 else kernel
 
 
-def _conv(op: Op, r: Raiser) -> str:
-    kernel = _kernel(op, r)
-    size = r.shape(op, op.need(1))[2:]
-    window = _window(op, r, op.need(0), [int(k) for k in size])
-    image, padding = _framed(op, r, _image(op, r, op.need(0)), window)
-    value = _convolved(op, r, image, kernel, window, padding)
-    return _back(op, r, _biased(op, r, value))
+def _conv(op: Op, net: Importer) -> str:
+    kernel = _kernel(op, net)
+    size = net.shape(op.need(1))[2:]
+    window = _window(op, net, op.need(0), [int(k) for k in size])
+    image, padding = _framed(op, net, _image(op, net, op.need(0)), window)
+    value = _convolved(op, net, image, kernel, window, padding)
+    return _back(op, net, _biased(op, net, value))
 
 
-def _biased(op: Op, r: Raiser, value: str) -> str:
+def _biased(op: Op, net: Importer, value: str) -> str:
     bias = op.get(2)
-    return value if bias is None else r.add("BiasAdd", [value, bias])
+    return value if bias is None else net.add("BiasAdd", [value, bias])
 
 
-def _convolved(op: Op, r: Raiser, image: str, kernel: np.ndarray, window: _Window, padding: str) -> str:
+def _convolved(op: Op, net: Importer, image: str, kernel: np.ndarray, window: _Window, padding: str) -> str:
     """An NHWC image by a kernel [out, in per group, height, width]."""
     groups = op.integer("group", 1)
     attrs: dict[str, Any] = {
@@ -157,55 +157,55 @@ def _convolved(op: Op, r: Raiser, image: str, kernel: np.ndarray, window: _Windo
         raise op.refused(f"it has {groups} groups for {out} channels", f"up to {_MAX_GROUPS} are written")
     equal = len(set(window.strides)) == 1 and set(window.dilations) == {1}  # TensorFlow's CPU kernel takes no others
     if groups == 1:
-        return r.add("Conv2D", [image, r.const(kernel.transpose(2, 3, 1, 0), "kernel")], **attrs)
+        return net.add("Conv2D", [image, net.const(kernel.transpose(2, 3, 1, 0), "kernel")], **attrs)
     if each == 1 and equal:
         shaped = kernel.reshape(groups, out // groups, *kernel.shape[2:]).transpose(2, 3, 0, 1)
-        return r.add("DepthwiseConv2dNative", [image, r.const(shaped, "kernel")], **attrs)
+        return net.add("DepthwiseConv2dNative", [image, net.const(shaped, "kernel")], **attrs)
     parts = []
     for group in range(groups):
-        part = r.slice(image, 3, group * each, (group + 1) * each)
+        part = net.slice(image, 3, group * each, (group + 1) * each)
         chosen = kernel[group * out // groups : (group + 1) * out // groups]
-        parts.append(r.add("Conv2D", [part, r.const(chosen.transpose(2, 3, 1, 0), "kernel")], **attrs))
-    return r.concat(parts, 3)
+        parts.append(net.add("Conv2D", [part, net.const(chosen.transpose(2, 3, 1, 0), "kernel")], **attrs))
+    return net.concat(parts, 3)
 
 
-def _conv_transpose(op: Op, r: Raiser) -> str:
+def _conv_transpose(op: Op, net: Importer) -> str:
     """Zeros between the pixels, then a plain convolution with the kernel turned round: no target needs an op for it."""
-    kernel = _kernel(op, r)  # [in, out per group, height, width]
+    kernel = _kernel(op, net)  # [in, out per group, height, width]
     x = op.need(0)
-    window = _window(op, r, x, [int(k) for k in r.shape(op, op.need(1))[2:]])
+    window = _window(op, net, x, [int(k) for k in net.shape(op.need(1))[2:]])
     if window.pads is None or "output_shape" in op.attrs:
         raise op.refused("its padding follows from the size of its result", "give pads and output_padding instead")
-    image = _image(op, r, x)
-    extra = op.integers("output_padding", (0,) * (r.rank(op, x) - 2)) or ()
+    image = _image(op, net, x)
+    extra = op.integers("output_padding", (0,) * (net.rank(x) - 2)) or ()
     extra = (0,) * (2 - len(extra)) + tuple(extra)
     pairs = []
     for axis in range(2):
         stride, span, (before, after) = window.strides[axis], window.span[axis], window.pads[axis]
-        image = _spread(op, r, image, axis + 1, stride)
+        image = _spread(op, net, image, axis + 1, stride)
         # the spread image ends with stride - 1 zeros that belong to no pixel
         pairs.append((span - 1 - before, span - 1 - after + extra[axis] - (stride - 1)))
-    image = padded(op, r, image, [(0, 0), *pairs, (0, 0)])
+    image = padded(op, net, image, [(0, 0), *pairs, (0, 0)])
     groups, channels = op.integer("group", 1), kernel.shape[0]
     if groups < 1 or channels % groups:
         raise op.refused(f"it has {groups} groups for {channels} channels", "the model is damaged")
     turned = kernel[:, :, ::-1, ::-1].reshape(groups, channels // groups, *kernel.shape[1:])
     turned = turned.transpose(0, 2, 1, 3, 4).reshape(-1, channels // groups, *kernel.shape[2:])
     plain = _Window(window.size, (1, 1), window.dilations, ((0, 0), (0, 0)), "NOTSET")
-    return _back(op, r, _biased(op, r, _convolved(op, r, image, turned, plain, "VALID")))
+    return _back(op, net, _biased(op, net, _convolved(op, net, image, turned, plain, "VALID")))
 
 
-def _spread(op: Op, r: Raiser, image: str, axis: int, stride: int) -> str:
+def _spread(op: Op, net: Importer, image: str, axis: int, stride: int) -> str:
     """``stride`` - 1 zeros after each pixel of an axis, on three axes: what is before, the zeros, what is behind."""
     if stride == 1:
         return image
-    shape = r.shape(op, image)
+    shape = net.shape(image)
     behind = 1
     for i in range(axis + 1, _IMAGE):
-        behind *= r.length(op, image, i)
-    rows = r.reshape(image, (-1, 1, behind))
-    wide = padded(op, r, rows, [(0, 0), (0, stride - 1), (0, 0)])
-    return r.reshape(wide, (*shape[:axis], r.length(op, image, axis) * stride, *shape[axis + 1 :]))
+        behind *= net.length(image, i)
+    rows = net.reshape(image, (-1, 1, behind))
+    wide = padded(op, net, rows, [(0, 0), (0, stride - 1), (0, 0)])
+    return net.reshape(wide, (*shape[:axis], net.length(image, axis) * stride, *shape[axis + 1 :]))
 
 
 # ------------------------------------------------------------------ pools
@@ -215,37 +215,37 @@ def _pool_attrs(window: _Window, padding: str) -> dict[str, Any]:
     return {"ksize": (1, *window.size, 1), "strides": (1, *window.strides, 1), "padding": padding}
 
 
-def _max_pool(op: Op, r: Raiser) -> list[str | None]:
+def _max_pool(op: Op, net: Importer) -> list[str | None]:
     """The indices of the largest elements (the second output) are not made."""
     x = op.need(0)
-    window = _window(op, r, x, op.integers("kernel_shape") or ())
+    window = _window(op, net, x, op.integers("kernel_shape") or ())
     if set(window.dilations) != {1}:
         raise op.refused("its window is dilated", "no target has dilated pools")
-    image = _image(op, r, x)
-    image, padding = _framed(op, r, image, window, r.number(x, -np.inf))
-    return [_back(op, r, r.add("MaxPool", [image], **_pool_attrs(window, padding))), None]
+    image = _image(op, net, x)
+    image, padding = _framed(op, net, image, window, net.number(x, -np.inf))
+    return [_back(op, net, net.add("MaxPool", [image], **_pool_attrs(window, padding))), None]
 
 
-def _average_pool(op: Op, r: Raiser) -> str:
+def _average_pool(op: Op, net: Importer) -> str:
     """The padding counts only with ``count_include_pad``; what ceil_mode adds at the end never does."""
     x = op.need(0)
-    window = _window(op, r, x, op.integers("kernel_shape") or ())
+    window = _window(op, net, x, op.integers("kernel_shape") or ())
     if set(window.dilations) != {1}:
         raise op.refused("its window is dilated", "no target has dilated pools")
-    image = _image(op, r, x)
-    pairs = _resolved(op, r, image, window) if window.auto_pad != "SAME_UPPER" else ((0, 0), (0, 0))
+    image = _image(op, net, x)
+    pairs = _resolved(op, net, image, window) if window.auto_pad != "SAME_UPPER" else ((0, 0), (0, 0))
     counted = bool(op.integer("count_include_pad", 0))
-    plain = window.auto_pad == "SAME_UPPER" or not any(a or b for a, b in pairs) or _is_same(r, image, window, pairs)
+    plain = window.auto_pad == "SAME_UPPER" or not any(a or b for a, b in pairs) or _is_same(net, image, window, pairs)
     if plain and not (counted and any(a or b for a, b in pairs)):
-        _, padding = _framed(op, r, image, window)
-        return _back(op, r, r.add("AvgPool", [image], **_pool_attrs(window, padding)))
-    lengths = [r.length(op, image, axis) for axis in (1, 2)]
+        _, padding = _framed(op, net, image, window)
+        return _back(op, net, net.add("AvgPool", [image], **_pool_attrs(window, padding)))
+    lengths = [net.length(image, axis) for axis in (1, 2)]
     given = window.pads if counted and window.pads is not None else pairs if counted else ((0, 0), (0, 0))
     counts = _counts(lengths, window, pairs, given)
-    wide = padded(op, r, image, [(0, 0), *pairs, (0, 0)])
-    mean = r.add("AvgPool", [wide], **_pool_attrs(window, "VALID"))
+    wide = padded(op, net, image, [(0, 0), *pairs, (0, 0)])
+    mean = net.add("AvgPool", [wide], **_pool_attrs(window, "VALID"))
     factor = (window.size[0] * window.size[1] / counts).astype(FLOAT32)
-    return _back(op, r, r.add("Mul", [mean, r.const(factor[None, :, :, None], "share")]))
+    return _back(op, net, net.add("Mul", [mean, net.const(factor[None, :, :, None], "share")]))
 
 
 def _counts(lengths: Sequence[int], window: _Window, pairs: Pairs, counted: Pairs) -> np.ndarray:
@@ -260,15 +260,15 @@ def _counts(lengths: Sequence[int], window: _Window, pairs: Pairs, counted: Pair
     return np.maximum(np.outer(sums[0], sums[1]), 1)
 
 
-def _global(kind: str) -> Raise:
-    def function(op: Op, r: Raiser) -> str:
+def _global(kind: str) -> Translate:
+    def function(op: Op, net: Importer) -> str:
         x = op.need(0)
-        return r.reduce(kind, x, range(2, r.rank(op, x)), keep=True)
+        return net.reduce(kind, x, range(2, net.rank(x)), keep=True)
 
     return function
 
 
-OPS: Mapping[str, Raise] = {
+OPS: Mapping[str, Translate] = {
     "Conv": _conv,
     "ConvTranspose": _conv_transpose,
     "MaxPool": _max_pool,

@@ -8,8 +8,8 @@ import numpy as np
 
 from converters.graph.types import BOOL, INT32, INT64, Dim
 from converters.onnx.importer.arrays import MAX_ELEMENTS
-from converters.onnx.importer.importer import Raiser
-from converters.onnx.importer.node import Op, Raise
+from converters.onnx.importer.importer import Importer
+from converters.onnx.importer.node import Op, Translate
 
 #: Beyond this an index means "to the end", in the 32-bit numbers that all targets have.
 _END = 2**31 - 1
@@ -18,37 +18,37 @@ _END = 2**31 - 1
 # ------------------------------------------------------------------ joining and cutting
 
 
-def _concat(op: Op, r: Raiser) -> str:
+def _concat(op: Op, net: Importer) -> str:
     parts = [op.need(i) for i in range(len(op.inputs))]
-    return r.concat(parts, op.integer("axis", 1))
+    return net.concat(parts, op.integer("axis", 1))
 
 
-def _split(op: Op, r: Raiser) -> list[str | None]:
+def _split(op: Op, net: Importer) -> list[str | None]:
     """Lengths: an attribute before opset 13, an input from there on; without them equal parts (the last one shorter
     from opset 18 on).
     """
     x = op.need(0)
-    axis = r.axis(op, x, op.integer("axis", 0))
+    axis = net.axis(x, op.integer("axis", 0))
     operand = op.get(1)
     sizes = op.integers("split") if op.opset < 13 else None
     if operand is not None and op.opset >= 13:
-        sizes = tuple(int(s) for s in r.needed_constant(op, operand, "the list of lengths").reshape(-1))
+        sizes = tuple(int(s) for s in net.needed_constant(operand, "the list of lengths").reshape(-1))
     if sizes is None:
         count = op.integer("num_outputs", len(op.outputs))
         if not 1 <= count <= len(op.outputs):
             raise op.refused(f"it cuts into {count} parts for {len(op.outputs)} outputs", "the model is damaged")
-        length = r.length(op, x, axis)
+        length = net.length(x, axis)
         each = -(-length // count)
         sizes = tuple(min(each, length - i * each) for i in range(count))
     if min(sizes) < 0:
         raise op.refused(f"it cuts into lengths {list(sizes)}", "the model is damaged")
     if len(sizes) == 1:
         return [x]
-    split = r.add("SplitV", [x, r.ints(sizes, "sizes"), r.ints(axis, "axis")], num_split=len(sizes))
+    split = net.add("SplitV", [x, net.ints(sizes, "sizes"), net.ints(axis, "axis")], num_split=len(sizes))
     return [split if i == 0 else f"{split}:{i}" for i in range(len(sizes))]
 
 
-def _slice(op: Op, r: Raiser) -> str:
+def _slice(op: Op, net: Importer) -> str:
     """Bounds: attributes before opset 10, inputs from there on."""
     x = op.need(0)
     if op.opset < 10:
@@ -57,19 +57,19 @@ def _slice(op: Op, r: Raiser) -> str:
         steps: tuple[int, ...] = (1,) * len(starts)
     else:
         operands = [op.need(1), op.need(2), *(op.get(i) for i in (3, 4))]
-        values = [None if o is None else r.constant(o) for o in operands]
+        values = [None if o is None else net.constant(o) for o in operands]
         if any(o is not None and v is None for o, v in zip(operands, values, strict=True)):
-            return _dynamic_slice(op, r, x)
+            return _dynamic_slice(op, net, x)
         numbers = [None if v is None else tuple(int(n) for n in v.reshape(-1)) for v in values]
         starts, ends = numbers[0] or (), numbers[1] or ()
         given, steps = numbers[2], numbers[3] or (1,) * len(starts)
-    axes = [r.axis(op, x, a) for a in (range(len(starts)) if given is None else given)]
+    axes = [net.axis(x, a) for a in (range(len(starts)) if given is None else given)]
     if not len(starts) == len(ends) == len(axes) == len(steps) or 0 in steps:
         raise op.refused("its bounds do not fit together", "the model is damaged")
-    return _sliced(r, x, {a: b for a, *b in zip(axes, starts, ends, steps, strict=True)}, r.type_of(x).shape)
+    return _sliced(net, x, {a: b for a, *b in zip(axes, starts, ends, steps, strict=True)}, net.type_of(x).shape)
 
 
-def _sliced(r: Raiser, x: str, bounds: Mapping[int, Sequence[int]], shape: Sequence[Dim] | None) -> str:
+def _sliced(net: Importer, x: str, bounds: Mapping[int, Sequence[int]], shape: Sequence[Dim] | None) -> str:
     """A strided slice over the axes up to the last one that is cut; a bound at or beyond an end is left open."""
     count = max(bounds, default=-1) + 1
     begin, end, steps = [0] * count, [0] * count, [1] * count
@@ -93,150 +93,150 @@ def _sliced(r: Raiser, x: str, bounds: Mapping[int, Sequence[int]], shape: Seque
             end_mask |= 1 << axis
         else:
             end[axis] = stop
-    operands = [r.ints(v, n) for v, n in ((begin, "begin"), (end, "end"), (steps, "steps"))]
-    return r.add("StridedSlice", [x, *operands], begin_mask=begin_mask, end_mask=end_mask)
+    operands = [net.ints(v, n) for v, n in ((begin, "begin"), (end, "end"), (steps, "steps"))]
+    return net.add("StridedSlice", [x, *operands], begin_mask=begin_mask, end_mask=end_mask)
 
 
-def _dynamic_slice(op: Op, r: Raiser, x: str) -> str:
+def _dynamic_slice(op: Op, net: Importer, x: str) -> str:
     """Bounds that are computed (from shapes, as a rule): the passes fold them once the lengths are known."""
     axes_at, steps_at = op.get(3), op.get(4)
-    starts, ends = r.shape_operand(op.need(1)), r.shape_operand(op.need(2))
-    count = r.length(op, starts, 0)
-    axes = [int(a) for a in r.needed_constant(op, axes_at, "the list of axes").reshape(-1)] if axes_at else range(count)
-    steps = [int(s) for s in r.needed_constant(op, steps_at, "the steps").reshape(-1)] if steps_at else [1] * count
-    order = [r.axis(op, x, a) for a in axes]
+    starts, ends = net.shape_operand(op.need(1)), net.shape_operand(op.need(2))
+    count = net.length(starts, 0)
+    axes = [int(a) for a in net.needed_constant(axes_at, "the list of axes").reshape(-1)] if axes_at else range(count)
+    steps = [int(s) for s in net.needed_constant(steps_at, "the steps").reshape(-1)] if steps_at else [1] * count
+    order = [net.axis(x, a) for a in axes]
     width = max(order) + 1
-    zero = r.ints(0, "zero")
+    zero = net.ints(0, "zero")
 
     def spread(vector: str) -> str:
-        cells = [r.element(vector, order.index(i)) if i in order else zero for i in range(width)]
-        return r.add("Pack", cells, axis=0)
+        cells = [net.element(vector, order.index(i)) if i in order else zero for i in range(width)]
+        return net.add("Pack", cells, axis=0)
 
     mask = sum(1 << i for i in range(width) if i not in order)
-    strides = r.ints([steps[order.index(i)] if i in order else 1 for i in range(width)], "steps")
-    return r.add("StridedSlice", [x, spread(starts), spread(ends), strides], begin_mask=mask, end_mask=mask)
+    strides = net.ints([steps[order.index(i)] if i in order else 1 for i in range(width)], "steps")
+    return net.add("StridedSlice", [x, spread(starts), spread(ends), strides], begin_mask=mask, end_mask=mask)
 
 
-def _gather(op: Op, r: Raiser) -> str:
+def _gather(op: Op, net: Importer) -> str:
     """Indices may be negative, which TensorFlow's Gather does not take."""
     x, indices = op.need(0), op.need(1)
-    axis = r.axis(op, x, op.integer("axis", 0))
-    length = r.shape(op, x)[axis]
-    value = r.constant(indices)
+    axis = net.axis(x, op.integer("axis", 0))
+    length = net.shape(x)[axis]
+    value = net.constant(indices)
     if value is not None and value.ndim == 0 and (isinstance(length, int) or int(value) >= 0):
         index = int(value) % length if isinstance(length, int) else int(value)
-        return _taken(r, x, axis, index)
+        return _taken(net, x, axis, index)
     if value is not None:
         if (value < 0).any() and not isinstance(length, int):
             raise op.refused("its indices count from the end of an axis whose length is not known")
         plain = value if not isinstance(length, int) else np.where(value < 0, value + length, value)
-        indices = r.const(plain.astype(INT32), "indices")
+        indices = net.const(plain.astype(INT32), "indices")
     elif isinstance(length, int):
-        indices = r.add("FloorMod", [r.cast(indices, INT32), r.ints(length, "length")])
-    return r.add("GatherV2", [x, indices, r.ints(axis, "axis")])
+        indices = net.add("FloorMod", [net.cast(indices, INT32), net.ints(length, "length")])
+    return net.add("GatherV2", [x, indices, net.ints(axis, "axis")])
 
 
-def _taken(r: Raiser, x: str, axis: int, index: int) -> str:
+def _taken(net: Importer, x: str, axis: int, index: int) -> str:
     """One element of an axis, the axis dropped."""
     begin, end, steps = ([0] * axis + [v] for v in (index, index + 1, 1))
     steps[:axis] = [1] * axis
-    operands = [r.ints(v, n) for v, n in ((begin, "begin"), (end, "end"), (steps, "steps"))]
+    operands = [net.ints(v, n) for v, n in ((begin, "begin"), (end, "end"), (steps, "steps"))]
     mask = (1 << axis) - 1
-    return r.add("StridedSlice", [x, *operands], begin_mask=mask, end_mask=mask, shrink_axis_mask=1 << axis)
+    return net.add("StridedSlice", [x, *operands], begin_mask=mask, end_mask=mask, shrink_axis_mask=1 << axis)
 
 
-def _gather_elements(op: Op, r: Raiser) -> str:
+def _gather_elements(op: Op, net: Importer) -> str:
     """y[..., j] = x[..., index[..., j]] along the last axis: each candidate where the index says so, summed."""
     x, indices = op.need(0), op.need(1)
-    dims = r.shape(op, x)
-    axis = r.axis(op, x, op.integer("axis", 0))
-    if axis != len(dims) - 1 or r.dtype(x) == BOOL:
+    dims = net.shape(x)
+    axis = net.axis(x, op.integer("axis", 0))
+    if axis != len(dims) - 1 or net.dtype(x) == BOOL:
         raise op.refused("it gathers along an axis that is not the last")
-    depth = r.length(op, x, axis)
-    others = r.shape(op, indices)
+    depth = net.length(x, axis)
+    others = net.shape(indices)
     if any(a != b for a, b in zip(dims[:-1], others[:-1], strict=True)):
         raise op.refused("its indices leave out rows")
-    index = r.add("FloorMod", [r.cast(indices, INT32), r.ints(depth, "depth")])
-    classes = r.const(np.arange(depth, dtype=INT32), "classes")
-    chosen = r.add("Equal", [r.expand_dims(index, len(dims)), classes])
-    candidates = r.expand_dims(x, len(dims) - 1)
-    zero = r.const(np.zeros((), r.dtype(x)), "zero")
-    return r.reduce("Sum", r.where(op, chosen, candidates, zero), [len(dims)], keep=False)
+    index = net.add("FloorMod", [net.cast(indices, INT32), net.ints(depth, "depth")])
+    classes = net.const(np.arange(depth, dtype=INT32), "classes")
+    chosen = net.add("Equal", [net.expand_dims(index, len(dims)), classes])
+    candidates = net.expand_dims(x, len(dims) - 1)
+    zero = net.const(np.zeros((), net.dtype(x)), "zero")
+    return net.reduce("Sum", net.where(chosen, candidates, zero), [len(dims)], keep=False)
 
 
-def _pad(op: Op, r: Raiser) -> str:
+def _pad(op: Op, net: Importer) -> str:
     """Paddings: an attribute before opset 11, inputs from there on (with axes from 18 on)."""
     x = op.need(0)
     if op.text("mode", "constant") != "constant":
         raise op.refused(f"mode {op.text('mode', '')!r}", "only padding with a constant is written for all targets")
-    rank = r.rank(op, x)
+    rank = net.rank(x)
     fill: str | None
     if op.opset < 11:
         pads = op.integers("pads", ()) or ()
         number = op.number("value", 0.0)
-        fill = None if number == 0 else r.number(x, number)
+        fill = None if number == 0 else net.number(x, number)
         axes = list(range(rank))
     else:
-        pads = tuple(int(p) for p in r.needed_constant(op, op.need(1), "the padding").reshape(-1))
+        pads = tuple(int(p) for p in net.needed_constant(op.need(1), "the padding").reshape(-1))
         fill, operand = op.get(2), op.get(3)
         axes = list(range(rank))
         if operand is not None:
-            given = r.needed_constant(op, operand, "the list of axes").reshape(-1)
-            axes = [r.axis(op, x, int(a)) for a in given]
+            given = net.needed_constant(operand, "the list of axes").reshape(-1)
+            axes = [net.axis(x, int(a)) for a in given]
     if len(pads) != 2 * len(axes):
         raise op.refused("it does not give two paddings for each axis", "the model is damaged")
     pairs = dict(zip(axes, zip(pads[: len(axes)], pads[len(axes) :], strict=True), strict=True))
-    return padded(op, r, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
+    return padded(op, net, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
 
 
-def padded(op: Op, r: Raiser, x: str, pairs: Sequence[tuple[int, int]], fill: str | None = None) -> str:
+def padded(op: Op, net: Importer, x: str, pairs: Sequence[tuple[int, int]], fill: str | None = None) -> str:
     """Padded at both ends of each axis, with zero or ``fill``; a negative padding cuts off."""
     for axis, (before, after) in enumerate(pairs):
         if min(before, after) < 0:
-            x = r.slice(x, axis, -before if before < 0 else None, after if after < 0 else None)
+            x = net.slice(x, axis, -before if before < 0 else None, after if after < 0 else None)
     wide = [(max(a, 0), max(b, 0)) for a, b in pairs]
     if not any(a or b for a, b in wide):
         return x
-    operand = r.const(np.array(wide, INT32).reshape(-1, 2), "paddings")
-    return r.add("Pad", [x, operand]) if fill is None else r.add("PadV2", [x, operand, fill])
+    operand = net.const(np.array(wide, INT32).reshape(-1, 2), "paddings")
+    return net.add("Pad", [x, operand]) if fill is None else net.add("PadV2", [x, operand, fill])
 
 
 # ------------------------------------------------------------------ indices
 
 
-def _one_hot(op: Op, r: Raiser) -> str:
+def _one_hot(op: Op, net: Importer) -> str:
     """Indices down to -depth count from the end; TensorFlow gives them a row of off-values."""
     indices, depth_at, values = op.need(0), op.need(1), op.need(2)
-    depth = int(r.needed_constant(op, depth_at, "the depth").reshape(-1)[0])
-    index = r.cast(indices, INT32)
-    negative = r.cast(r.add("Less", [index, r.ints(0, "zero")]), INT32)
-    index = r.add("Add", [index, r.add("Mul", [negative, r.ints(depth, "depth")])])
-    off, on = (r.element(values, i) for i in range(2))
+    depth = int(net.needed_constant(depth_at, "the depth").reshape(-1)[0])
+    index = net.cast(indices, INT32)
+    negative = net.cast(net.add("Less", [index, net.ints(0, "zero")]), INT32)
+    index = net.add("Add", [index, net.add("Mul", [negative, net.ints(depth, "depth")])])
+    off, on = (net.element(values, i) for i in range(2))
     axis = op.integer("axis", -1)
-    rank = r.rank(op, indices)
+    rank = net.rank(indices)
     axis = axis + rank + 1 if axis < 0 else axis
-    return r.add("OneHot", [index, r.ints(depth, "depth"), on, off], axis=-1 if axis == rank else axis)
+    return net.add("OneHot", [index, net.ints(depth, "depth"), on, off], axis=-1 if axis == rank else axis)
 
 
-def _trilu(op: Op, r: Raiser) -> str:
+def _trilu(op: Op, net: Importer) -> str:
     """The upper or lower triangle of the last two axes."""
     x, operand = op.need(0), op.get(1)
-    k = 0 if operand is None else int(r.needed_constant(op, operand, "the diagonal").reshape(-1)[0])
-    rows, columns = r.length(op, x, -2), r.length(op, x, -1)
+    k = 0 if operand is None else int(net.needed_constant(operand, "the diagonal").reshape(-1)[0])
+    rows, columns = net.length(x, -2), net.length(x, -1)
     if rows * columns > MAX_ELEMENTS:
         raise op.refused(f"it has {rows}×{columns} elements")
     whole = np.ones((rows, columns), bool)
     mask = np.triu(whole, k) if op.integer("upper", 1) else np.tril(whole, k)
-    return r.where(op, r.const(mask, "triangle"), x, r.add("ZerosLike", [x]))
+    return net.where(net.const(mask, "triangle"), x, net.add("ZerosLike", [x]))
 
 
-def _non_zero(op: Op, r: Raiser) -> str:
+def _non_zero(op: Op, net: Importer) -> str:
     """Of a constant only (older exporters write torch.arange so): how many there are decides the shape."""
-    value = r.needed_constant(op, op.need(0), "what it looks at")
-    return r.const(np.array(np.nonzero(value), INT64), "indices")
+    value = net.needed_constant(op.need(0), "what it looks at")
+    return net.const(np.array(np.nonzero(value), INT64), "indices")
 
 
-OPS: Mapping[str, Raise] = {
+OPS: Mapping[str, Translate] = {
     "Concat": _concat,
     "Split": _split,
     "Slice": _slice,

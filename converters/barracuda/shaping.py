@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.barracuda.builder import Builder, Shape, Value, with_length
+from converters.barracuda.convolution import taken
 from converters.barracuda.format import EIGHT_AXES
+from converters.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
 from converters.barracuda.vocabulary import EIGHT, C, H, N, W
-from converters.barracuda.windows import taken
 from converters.graph.types import INT32
 
 _NAMES = "NHWC"
@@ -21,7 +21,7 @@ _NAMES = "NHWC"
 _FAR = (1 << 31) - 1
 
 
-def axis_of(b: Builder, axis: int, version: int) -> int:
+def axis_of(b: LayerBuilder, axis: int, version: int) -> int:
     """An axis of the file as a position in N, H, W, C; −1 is C."""
     if -4 <= axis < 0:
         return axis + 4
@@ -32,13 +32,13 @@ def axis_of(b: Builder, axis: int, version: int) -> int:
     raise b.unsupported(f"the axis is {axis}", "the tensors of a policy have the axes N, H, W and C")
 
 
-def flatten(b: Builder, args: Sequence[Value]) -> Value:
+def flatten(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """[N, 1, 1, H·W·C]."""
     x = args[0]
-    return x if x.rank != 4 else b.rows(b.matrix(x), x.n, x.size)
+    return x if x.rank != 4 else b.rows(b.as_matrix(x), x.n, x.size)
 
 
-def reshape(b: Builder, args: Sequence[Value]) -> Value:
+def reshape(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The elements in order in the shape ``pool``: −1 is what is left, 0 the length it had.
 
     An empty ``pool`` takes the shape of the second input, or from 2.x on (``axis`` 1) the numbers in it.
@@ -58,7 +58,7 @@ def reshape(b: Builder, args: Sequence[Value]) -> Value:
     return b.shaped(x.reference, _reshaped(b, x, target), x.integer)
 
 
-def _reshaped(b: Builder, x: Value, target: list[int]) -> Shape:
+def _reshaped(b: LayerBuilder, x: Value, target: list[int]) -> Shape:
     n, *lengths = x.shape
     wanted = [length if t == 0 else t for t, length in zip(target[1:], lengths, strict=True)]
     if [target[0], *wanted].count(-1) > 1 or min(target) < -1:
@@ -84,7 +84,7 @@ def _reshaped(b: Builder, x: Value, target: list[int]) -> Shape:
     return rows, h, w, c
 
 
-def squeeze(b: Builder, args: Sequence[Value]) -> Value:
+def squeeze(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Squeeze and Unsqueeze: no version of Barracuda runs them; where H and W are 1 nothing could move."""
     x = args[0]
     if x.rank == 4:
@@ -92,7 +92,7 @@ def squeeze(b: Builder, args: Sequence[Value]) -> Value:
     return x
 
 
-def transpose(b: Builder, args: Sequence[Value]) -> Value:
+def transpose(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Axis i of the result is axis ``pool[i]`` of the input."""
     x = args[0]
     order = tuple(b.layer.pool)
@@ -105,11 +105,11 @@ def transpose(b: Builder, args: Sequence[Value]) -> Value:
     n, h, w, c = (x.shape[i] for i in order)
     if order[0] != N and x.n is None:
         raise b.unsupported(f"the order is {list(order)}", "it would turn agents into pixels or channels")
-    turned = b.op("Transpose", [b.image(x), b.ints(list(order), "order")])
+    turned = b.add("Transpose", [b.as_image(x), b.ints(list(order), "order")])
     return b.shaped(turned, (n, int(h or 0), int(w or 0), int(c or 0)))
 
 
-def concat(b: Builder, args: Sequence[Value], version: int) -> Value:
+def concat(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     """The inputs one after the other along an axis; the other lengths are equal."""
     axis = axis_of(b, b.layer.axis, version)
     if len(args) == 1:
@@ -123,16 +123,16 @@ def concat(b: Builder, args: Sequence[Value], version: int) -> Value:
     if axis == C and all(v.shape[1:3] == (1, 1) for v in args):
         join = b.ints(1, "axis")
         integers = [v.integer for v in args if v.integer is not None]
-        integer = b.op("ConcatV2", [*integers, join], label="integers") if len(integers) == len(args) else None
-        return b.rows(b.op("ConcatV2", [*(b.matrix(v) for v in args), join]), args[0].shape[N], total, integer)
-    joined = b.op("ConcatV2", [*(b.image(v) for v in args), b.ints(axis, "axis")])
+        integer = b.add("ConcatV2", [*integers, join], name="integers") if len(integers) == len(args) else None
+        return b.rows(b.add("ConcatV2", [*(b.as_matrix(v) for v in args), join]), args[0].shape[N], total, integer)
+    joined = b.add("ConcatV2", [*(b.as_image(v) for v in args), b.ints(axis, "axis")])
     return b.shaped(joined, with_length(args[0].shape, axis, total))
 
 
 # ------------------------------------------------------------------ cutting
 
 
-def strided_slice(b: Builder, args: Sequence[Value]) -> Value:
+def strided_slice(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """``pad`` to ``pool`` in steps of ``stride``, four (or eight) entries each."""
     x = args[0]
     starts, ends, steps = (_entries(b, v, d) for v, d in ((b.layer.pad, 0), (b.layer.pool, 0), (b.layer.stride, 1)))
@@ -148,19 +148,19 @@ def strided_slice(b: Builder, args: Sequence[Value]) -> Value:
     if x.rank == 4:
         return b.shaped(_sliced(b, x.reference, cuts, "part"), shape)
     if x.rank == 1:
-        return b.shaped(_sliced(b, b.matrix(x), cuts[2:], "part"), shape)
+        return b.shaped(_sliced(b, b.as_matrix(x), cuts[2:], "part"), shape)
     integer = None if x.integer is None else _sliced(b, x.integer, cuts[2:], "integers")
     return Value(_sliced(b, x.reference, cuts[2:], "part"), shape, integer=integer)
 
 
-def _sliced(b: Builder, x: str, cuts: Sequence[tuple[int, int, int]], label: str) -> str:
+def _sliced(b: LayerBuilder, x: str, cuts: Sequence[tuple[int, int, int]], label: str) -> str:
     """``x`` with its first axis whole and the others cut."""
     columns = [(0, 0, 1), *cuts]
     operands = [b.ints([cut[i] for cut in columns], part) for i, part in enumerate(("begin", "end", "steps"))]
-    return b.op("StridedSlice", [x, *operands], label=label, begin_mask=1, end_mask=1)
+    return b.add("StridedSlice", [x, *operands], name=label, begin_mask=1, end_mask=1)
 
 
-def _entries(b: Builder, values: Sequence[int], default: int) -> list[int]:
+def _entries(b: LayerBuilder, values: Sequence[int], default: int) -> list[int]:
     if len(values) == 8 and all(values[i] in (0, 1, default) for i in (0, 1, 3, 4)):
         return [values[i] for i in EIGHT]
     if len(values) != 4:
@@ -168,7 +168,7 @@ def _entries(b: Builder, values: Sequence[int], default: int) -> list[int]:
     return list(values)
 
 
-def _cut(b: Builder, start: int, end: int, step: int, length: int, name: str) -> tuple[int, int, int]:
+def _cut(b: LayerBuilder, start: int, end: int, step: int, length: int, name: str) -> tuple[int, int, int]:
     """(first, behind the last, step) of an axis.
 
     0:0 is the whole axis, an end of 0 the end of the axis, a step of 0 the one element at the start.
@@ -194,7 +194,7 @@ def _cut(b: Builder, start: int, end: int, step: int, length: int, name: str) ->
     return first, last, step
 
 
-def gather(b: Builder, args: Sequence[Value], version: int) -> Value:
+def gather(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     """Elements along an axis: chosen by constants, or by a number per agent out of the rows of a constant table."""
     x, index = args
     axis = axis_of(b, b.layer.axis, version)
@@ -204,11 +204,11 @@ def gather(b: Builder, args: Sequence[Value], version: int) -> Value:
         chosen = b.whole(index.constant)
         if not chosen or min(chosen) < 0 or max(chosen) >= int(x.shape[axis] or 0):
             raise b.damaged(f"the indices are {chosen}", f"there are {x.shape[axis]} elements along {_NAMES[axis]}")
-        return b.shaped(taken(b, b.image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))
+        return b.shaped(taken(b, b.as_image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))
     if axis == N and x.n is not None and index.size == 1:
-        numbers = index.integer or b.op("Cast", [index.reference], DstT=INT32)
-        flat = b.op("Reshape", [numbers, b.ints([-1], "list")], label="list")
-        found = b.op("GatherV2", [b.image(x), flat, b.ints(0, "axis")])
+        numbers = index.integer or b.add("Cast", [index.reference], DstT=INT32)
+        flat = b.add("Reshape", [numbers, b.ints([-1], "list")], name="list")
+        found = b.add("GatherV2", [b.as_image(x), flat, b.ints(0, "axis")])
         return b.shaped(found, (index.n, *x.shape[1:]))
     raise b.unsupported(
         f"indices of shape {list(index.shape)} along {_NAMES[axis]} of {list(x.shape)}",
@@ -219,12 +219,12 @@ def gather(b: Builder, args: Sequence[Value], version: int) -> Value:
 # ------------------------------------------------------------------ repeating, and blocks
 
 
-def tile(b: Builder, args: Sequence[Value]) -> Value:
+def tile(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The tensor ``pool`` times along each axis."""
     return _repeated(b, args[0], b.four(b.layer.pool))
 
 
-def expand(b: Builder, args: Sequence[Value]) -> Value:
+def expand(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Axes of length 1 repeated to the lengths in ``pool``."""
     x = args[0]
     target = b.four(b.layer.pool)
@@ -236,7 +236,7 @@ def expand(b: Builder, args: Sequence[Value]) -> Value:
     return _repeated(b, x, factors)
 
 
-def _repeated(b: Builder, x: Value, factors: Sequence[int]) -> Value:
+def _repeated(b: LayerBuilder, x: Value, factors: Sequence[int]) -> Value:
     if min(factors) < 1 or (factors[N] != 1 and x.n is None):
         raise b.unsupported(f"it repeats {list(factors)} times", "a policy has one row per agent")
     n, h, w, c = x.shape
@@ -244,26 +244,26 @@ def _repeated(b: Builder, x: Value, factors: Sequence[int]) -> Value:
     if shape == x.shape:
         return x
     b.sized(*shape[1:])
-    return b.shaped(b.op("Tile", [b.image(x), b.ints(list(factors), "times")]), shape)
+    return b.shaped(b.add("Tile", [b.as_image(x), b.ints(list(factors), "times")]), shape)
 
 
-def depth_to_space(b: Builder, args: Sequence[Value]) -> Value:
+def depth_to_space(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Blocks of ``pool`` = [width, height] pixels out of the channels; ``axis`` 0: block first, 1: channel first."""
     x = args[0]
     across, down = _block(b)
     n, h, w, c = x.shape
     if c % (across * down) or b.layer.axis not in (0, 1):
         raise b.damaged(f"blocks of {across}·{down} out of {c} channels, mode {b.layer.axis}", "they do not divide")
-    deep, data = c // (across * down), b.image(x)
+    deep, data = c // (across * down), b.as_image(x)
     if b.layer.axis == 1:
         data = taken(b, data, np.arange(c).reshape(deep, -1).T.reshape(-1).tolist(), C)
     rows = -1 if n is None else n
-    split = b.op("Reshape", [data, b.ints([rows, h, w, down, across * deep], "blocks")], label="blocks")
-    turned = b.op("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])
+    split = b.add("Reshape", [data, b.ints([rows, h, w, down, across * deep], "blocks")], name="blocks")
+    turned = b.add("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])
     return b.shaped(turned, (n, h * down, w * across, deep))
 
 
-def space_to_depth(b: Builder, args: Sequence[Value]) -> Value:
+def space_to_depth(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Blocks of ``pool`` = [width, height] pixels into the channels, row by row."""
     x = args[0]
     across, down = _block(b)
@@ -272,12 +272,12 @@ def space_to_depth(b: Builder, args: Sequence[Value]) -> Value:
         raise b.damaged(f"blocks of {across}·{down} of {list(x.shape)}", "they do not divide the image")
     rows = -1 if n is None else n
     blocks = b.ints([rows, h // down, down, w // across, across * c], "blocks")
-    split = b.op("Reshape", [b.image(x), blocks], label="blocks")
-    turned = b.op("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])
+    split = b.add("Reshape", [b.as_image(x), blocks], name="blocks")
+    turned = b.add("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])
     return b.shaped(turned, (n, h // down, w // across, down * across * c))
 
 
-def _block(b: Builder) -> tuple[int, int]:
+def _block(b: LayerBuilder) -> tuple[int, int]:
     if len(b.layer.pool) != 2 or min(b.layer.pool) < 1:
         raise b.damaged(f"blocks of {list(b.layer.pool)}", "they have a width and a height")
     return b.layer.pool[0], b.layer.pool[1]

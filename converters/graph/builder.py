@@ -1,7 +1,9 @@
-"""The graph in the making: what raising functions build with.
+"""The one way to make a graph: nodes under fresh names, constants, and what is known of each tensor.
 
-Types are inferred as nodes are added (the op table's rules), so that a function can ask for ranks, lengths and known
-values: half of ONNX's ops are told apart by them.
+Every reader builds with a ``Builder`` (or a subclass that knows its format), every pass with an ``Editor``, which is
+one over an old graph; the layers of ``converters/graph/nn`` are functions of it. Types are inferred as nodes are added
+(the op table's rules), so that a function can ask for ranks, lengths and known values. What writes ONNX nodes
+(``OnnxBuilder`` in ``graph/ops/base.py``) is another thing: it makes a ModelProto, not a graph.
 """
 
 from __future__ import annotations
@@ -11,13 +13,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from converters.graph.nodes import NameScope, Node, node_of, ref
+from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE
 from converters.graph.shapes import Types, add_types
-from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast
-from converters.onnx.importer.node import Op
+from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
 from signatures.errors import UnsupportedOpError
 
 #: Ops whose result depends on shapes, not on values.
@@ -25,17 +27,25 @@ _SHAPE_OPS = frozenset(("Shape", "Size", "Rank"))
 #: A policy has some hundreds.
 MAX_NODES = 1 << 16
 _SHARED_CONSTANT = 64
+_DAMAGED = "the model is damaged"
 
 
-class Draft:
-    """Nodes and their types; see the module. ``names`` hands out the names of nodes."""
+class Builder:
+    """Nodes and their types; see the module. ``names`` hands out the names of nodes.
+
+    A function that cannot do its work raises UnsupportedOpError without ``issues``: who called it knows the node or
+    layer of the source, and names it.
+    """
+
+    #: Whether types are inferred; without them every tensor is taken for float32 and nothing else is known.
+    typed = True
 
     def __init__(self, names: NameScope) -> None:
         self.nodes: list[Node] = []
         self.types: Types = {}
         self.symbols = Symbols()
         self.names = names
-        #: what the names of new nodes begin with
+        #: what the names of new nodes begin with; empty: a name is what ``add`` is given
         self.prefix = ""
         #: tensors whose value depends on what is assumed of an input
         self.tainted: set[str] = set()
@@ -45,24 +55,36 @@ class Draft:
 
     # ------------------------------------------------------------------ new nodes
 
-    def add(self, op: str, inputs: Sequence[str], name: str = "", **attrs: Any) -> str:
+    def add(
+        self,
+        op: str,
+        inputs: Sequence[str],
+        name: str = "",
+        origin: str | tuple[str, ...] | None = None,
+        **attrs: Any,
+    ) -> str:
         """A new node with the op's default attributes; returns its output 0."""
         defaults = {a.name: a.default for a in TABLE[op].attrs if a.derive is None and a.default is not REQUIRED}
-        fresh = self.names.fresh(f"{self.prefix}/{name or op}" if self.prefix else name or op)
-        return self.append(Node(fresh, op, tuple(inputs), {**defaults, **attrs}))
+        return self.append(Node(self._fresh(name or op), op, tuple(inputs), {**defaults, **attrs}, origin=origin))
 
-    def const(self, array: np.ndarray, name: str = "const") -> str:
-        """A constant; equal small ones of one ONNX node share a node."""
+    def const(self, array: npt.ArrayLike, name: str = "const") -> str:
+        """A constant; equal small ones under one prefix share a node."""
         array = np.asarray(array)
-        key = (self.prefix, array.dtype.str, array.shape, array.tobytes()) if array.size <= _SHARED_CONSTANT else None
-        if key is not None and key in self._constants:
-            return self._constants[key]
-        made = self.append(Node(self.names.fresh(f"{self.prefix}/{name}"), "Const", value=array))
+        key = None
+        if self.prefix and array.size <= _SHARED_CONSTANT:
+            key = (self.prefix, array.dtype.str, array.shape, array.tobytes())
+            if key in self._constants:
+                return self._constants[key]
+        made = self.append(Node(self._fresh(name), "Const", value=array))
         if key is not None:
             self._constants[key] = made
         return made
 
-    def ints(self, numbers: Sequence[int] | int, name: str = "const") -> str:
+    def floats(self, numbers: npt.ArrayLike, name: str = "const") -> str:
+        """A float32 constant."""
+        return self.const(np.asarray(numbers, FLOAT32), name)
+
+    def ints(self, numbers: npt.ArrayLike, name: str = "const") -> str:
         """An int32 constant: a vector, or a scalar."""
         return self.const(np.array(numbers, INT32), name)
 
@@ -72,18 +94,39 @@ class Draft:
 
     def append(self, node: Node) -> str:
         """Take a node in, and infer what it gives; returns its output 0."""
-        if len(self.nodes) > MAX_NODES:
+        if self.typed and len(self.nodes) > MAX_NODES:
             raise UnsupportedOpError(
                 f"the model unfolds to more than {MAX_NODES} nodes",
                 why="a policy has some hundreds",
                 fix="give the policy alone, without the training part",
             )
-        add_types(self.types, node, self.symbols)
-        if node.op not in _SHAPE_OPS and any(r in self.tainted for r in node.inputs):
-            self.tainted.update(ref(node.name, i) for i in range(self.outputs(node.name)))
+        if self.typed:
+            add_types(self.types, node, self.symbols)
+            if node.op not in _SHAPE_OPS and any(r in self.tainted for r in node.inputs):
+                self.tainted.update(ref(node.name, i) for i in range(self.outputs(node.name)))
         self.position[node.name] = len(self.nodes)
         self.nodes.append(node)
         return node.name
+
+    def rename(self, node: str, name: str, origin: str | tuple[str, ...] | None) -> str:
+        """Call a node of one output, which no other reads, by a name that is its own; returns it."""
+        at = self.position.pop(node)
+        self.nodes[at] = replace(self.nodes[at], name=name, origin=origin)
+        self.position[name] = at
+        if node in self.types:
+            self.types[name] = self.types.pop(node)
+        if node in self.tainted:
+            self.tainted.add(name)
+        return name
+
+    def graph(self) -> Graph:
+        """The finished graph."""
+        return Graph(topological(self.nodes))
+
+    def _fresh(self, name: str) -> str:
+        return self.names.fresh(f"{self.prefix}/{name}" if self.prefix else name)
+
+    # ------------------------------------------------------------------ what is known of a tensor
 
     def outputs(self, name: str) -> int:
         """How many outputs a node has."""
@@ -92,19 +135,17 @@ class Draft:
             count += 1
         return count
 
-    # ------------------------------------------------------------------ what is known of a tensor
-
     def type_of(self, reference: str) -> TensorType:
         """dtype, shape and value as far as they are known."""
         return self.types[reference]
 
     def dtype(self, reference: str) -> np.dtype:
         """The dtype of a tensor."""
-        return self.types[reference].dtype
+        return self.types[reference].dtype if self.typed else FLOAT32
 
     def is_float(self, reference: str) -> bool:
         """Whether a tensor holds floats."""
-        return self.types[reference].dtype.kind == "f"
+        return self.dtype(reference).kind == "f"
 
     def constant(self, reference: str) -> np.ndarray | None:
         """The value of a tensor that is the same in every run."""
@@ -114,6 +155,18 @@ class Draft:
         """The value of a tensor under what is assumed of the inputs (``sequence_length`` is 1)."""
         return self.types[reference].constant
 
+    def needed_constant(self, reference: str, meaning: str) -> np.ndarray:
+        """The value of an operand that must be known; raises UnsupportedOpError."""
+        value = self.known(reference)
+        if value is None:
+            raise UnsupportedOpError(
+                f"{meaning} is computed while the graph runs",
+                why=f"{meaning} must be known before, in every target",
+                fix="if it depends on an input with one value, give it: --set NAME=VALUE; else export the model with "
+                "fixed sizes",
+            )
+        return value
+
     def producer(self, reference: str) -> Node:
         """The node that makes a tensor, looked for behind identities."""
         node = self.nodes[self.position[node_of(reference)]]
@@ -121,44 +174,45 @@ class Draft:
             node = self.nodes[self.position[node_of(node.inputs[0])]]
         return node
 
-    def needed_constant(self, op: Op, reference: str, meaning: str) -> np.ndarray:
-        """The value of an operand that must be known; raises UnsupportedOpError."""
-        value = self.known(reference)
-        if value is None:
-            raise op.refused(
-                f"{meaning} is computed while the graph runs",
-                f"{meaning} must be known before, in every target",
-                "if it depends on an input with one value, give it: --set NAME=VALUE; else export the model with "
-                "fixed sizes",
-            )
-        return value
-
-    def shape(self, op: Op, reference: str) -> tuple[Dim, ...]:
+    def shape(self, reference: str) -> tuple[Dim, ...]:
         """The shape of a tensor; raises UnsupportedOpError where not even its rank is known."""
         shape = self.types[reference].shape
         if shape is None:
-            raise op.refused("the rank of an input is not known", "its meaning depends on the rank")
+            raise UnsupportedOpError("the rank of an input is not known", why="its meaning depends on the rank")
         return shape
 
-    def rank(self, op: Op, reference: str) -> int:
+    def rank(self, reference: str) -> int:
         """The number of axes of a tensor; raises UnsupportedOpError."""
-        return len(self.shape(op, reference))
+        return len(self.shape(reference))
 
-    def length(self, op: Op, reference: str, axis: int) -> int:
+    def length(self, reference: str, axis: int) -> int:
         """The length of an axis that must be a number; raises UnsupportedOpError."""
-        size = self.shape(op, reference)[axis]
+        size = self.shape(reference)[axis]
         if not isinstance(size, int):
-            raise op.refused(f"the length of axis {axis} is not known", "it must be a number before the graph runs")
+            raise UnsupportedOpError(
+                f"the length of axis {axis} is not known", why="it must be a number before the graph runs"
+            )
         return size
 
-    def axis(self, op: Op, reference: str, axis: int) -> int:
+    def axis(self, reference: str, axis: int) -> int:
         """A possibly negative axis as a positive one; raises UnsupportedOpError."""
-        rank = self.rank(op, reference)
+        rank = self.rank(reference)
         if not -rank <= axis < max(rank, 1):
-            raise op.refused(f"axis {axis} is outside of {rank} axes", "the model is damaged")
+            raise UnsupportedOpError(f"axis {axis} is outside of {rank} axes", why=_DAMAGED)
         return axis % max(rank, 1)
 
-    # ------------------------------------------------------------------ small building blocks
+    def joined(self, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
+        """The shape that several broadcast to; raises UnsupportedOpError where they do not."""
+        dims: tuple[Dim, ...] | None = ()
+        for shape in shapes:
+            try:
+                dims = broadcast(dims, shape, self.symbols)
+            except ValueError as error:
+                raise UnsupportedOpError(str(error), why=_DAMAGED) from error
+        assert dims is not None
+        return dims
+
+    # ------------------------------------------------------------------ shapes as tensors
 
     def vector(self, dims: Sequence[Dim], *, open_axis: bool = False) -> str:
         """An int32 shape vector. With ``open_axis`` a single symbol is written -1, for Reshape."""
@@ -177,8 +231,17 @@ class Draft:
                     self.lengths[symbol] = self.element(shape, kind.shape.index(symbol))
                     break
             else:
-                raise UnsupportedOpError(f"the length {symbol} is not known before the graph runs", issues=[])
+                raise UnsupportedOpError(f"the length {symbol} is not known before the graph runs")
         return self.lengths[symbol]
+
+    def shape_operand(self, reference: str) -> str:
+        """A shape or index vector as int32: a constant where it is one (TensorFlow.js has no int64)."""
+        value = self.constant(reference)
+        if value is not None:
+            return self.const(np.clip(value, -(2**31), 2**31 - 1).astype(INT32), "operand")
+        return self.cast(reference, INT32)
+
+    # ------------------------------------------------------------------ the same elements, or some of them
 
     def element(self, vector: str, index: int) -> str:
         """``vector[index]`` as a scalar."""
@@ -217,13 +280,6 @@ class Draft:
         """The tensor in another dtype."""
         return reference if self.dtype(reference) == dtype else self.add("Cast", [reference], DstT=np.dtype(dtype))
 
-    def shape_operand(self, reference: str) -> str:
-        """A shape or index vector as int32: a constant where it is one (TensorFlow.js has no int64)."""
-        value = self.constant(reference)
-        if value is not None:
-            return self.const(np.clip(value, -(2**31), 2**31 - 1).astype(INT32), "operand")
-        return self.cast(reference, INT32)
-
     def slice(self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1) -> str:
         """``x[..., start:stop:step]`` at one axis."""
         begin, end, steps = [0] * (axis + 1), [0] * (axis + 1), [1] * (axis + 1)
@@ -235,6 +291,11 @@ class Draft:
             begin_mask=masks | (1 << axis if start is None else 0),
             end_mask=masks | (1 << axis if stop is None else 0),
         )
+
+    def split(self, reference: str, count: int) -> list[str]:
+        """A matrix [rows, count·n] cut into ``count`` matrices [rows, n]."""
+        made = self.add("Split", [self.ints(1, "axis"), reference], num_split=count)
+        return [ref(made, i) for i in range(count)]
 
     def concat(self, parts: Sequence[str], axis: int) -> str:
         """Joined along an axis."""
@@ -254,23 +315,12 @@ class Draft:
         counts: list[Dim] = [d if s == 1 else 1 for s, d in zip(shape, dims, strict=True)]
         return reference if all(c == 1 for c in counts) else self.add("Tile", [reference, self.vector(counts)])
 
-    def where(self, op: Op, condition: str, a: str, b: str) -> str:
+    def where(self, condition: str, a: str, b: str) -> str:
         """``condition ? a : b``, broadcast."""
-        shapes = [self.shape(op, r) for r in (condition, a, b)]
+        shapes = [self.shape(r) for r in (condition, a, b)]
         if shapes[0] == shapes[1] == shapes[2]:
             return self.add("Select", [condition, a, b])
         if self.is_float(a):
             return self.add("SelectV2", [condition, a, b])
-        dims = self.joined(op, shapes)
+        dims = self.joined(shapes)
         return self.add("Select", [self.broadcast(r, dims) for r in (condition, a, b)])
-
-    def joined(self, op: Op, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
-        """The shape that several broadcast to; raises UnsupportedOpError where they do not."""
-        dims: tuple[Dim, ...] | None = ()
-        for shape in shapes:
-            try:
-                dims = broadcast(dims, shape, self.symbols)
-            except ValueError as error:
-                raise op.refused(str(error), "the model is damaged") from error
-        assert dims is not None
-        return dims

@@ -9,17 +9,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from converters.barracuda.format import Layer, four_axes
 from converters.barracuda.vocabulary import layer_label
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.types import FLOAT32, INT32
+from converters.graph.builder import Builder
+from converters.graph.nodes import NameScope, Node
 from signatures.errors import GraphError, UnsupportedOpError
 
 #: N, H, W, C; N is None where it is the batch.
@@ -86,24 +84,21 @@ class Value:
         return self.h * self.w * self.c
 
 
-class Builder:
-    """Collects the nodes of the graph; ``notes`` are what the user should know of how it was read."""
+class LayerBuilder(Builder):
+    """The builder of a ``.nn``'s graph, at a layer of it; ``notes`` are what the user should know of how it was read.
+
+    ``reserved`` are the names of the nodes that stand for layers, inputs and outputs.
+    """
 
     def __init__(self, reserved: Iterable[str]) -> None:
-        # The editor keeps off the names of a graph's nodes: those that stand for layers, inputs and outputs.
-        self._editor = Editor(Graph(tuple(Node(name, "NoOp") for name in sorted(set(reserved)))))
+        super().__init__(NameScope(reserved))
         self.notes: list[str] = []
         self.layer = Layer("", 0)
-        self._label = ""
 
     def start(self, layer: Layer, name: str) -> int:
         """Begin a layer whose node will be called ``name``; returns the number of nodes before it."""
-        self.layer, self._label = layer, name
-        return len(self._editor.nodes)
-
-    def graph(self) -> Graph:
-        """The nodes in topological order."""
-        return self._editor.graph()
+        self.layer, self.prefix = layer, name
+        return len(self.nodes)
 
     def note(self, text: str) -> None:
         """Say something once."""
@@ -112,82 +107,57 @@ class Builder:
 
     # ------------------------------------------------------------------ nodes
 
-    def op(self, op: str, inputs: Sequence[str], *, label: str | None = None, **attrs: Any) -> str:
-        """A node of the current layer."""
-        return self._editor.add(op, inputs, f"{self._label}/{label or op}", **attrs)
-
-    def sample(self, op: str, size: str) -> str:
-        """A sampler of normals; it carries the layer's name, which reports of lifted noise give."""
-        return self._editor.add(op, [size], f"{self._label}/{op}", self.layer.name, dtype=FLOAT32)
-
-    def const(self, array: npt.ArrayLike, label: str, dtype: np.dtype = FLOAT32) -> str:
-        """A Const of the current layer."""
-        return self._editor.const(np.asarray(array, dtype), f"{self._label}/{label}")
-
-    def ints(self, values: npt.ArrayLike, label: str) -> str:
-        """An int32 Const: a shape, axes, bounds."""
-        return self.const(values, label, INT32)
-
-    def constant(self, name: str, array: npt.NDArray[np.float32], node: str | None = None) -> Value:
+    def dataset(self, name: str, array: npt.NDArray[np.float32], node: str | None = None) -> Value:
         """A dataset [N, H, W, C] as a Const (``node``: its reserved name), in the form that its shape asks for."""
         n, h, w, c = array.shape
         form = array if (h, w) != (1, 1) else array.reshape(c) if n == 1 else array.reshape(n, c)
-        if node is None:
-            reference = self._editor.const(form, node_name(name))
-        else:
-            reference = self.place(Node(node, "Const", value=form, origin=name))
-        return Value(reference, (n, h, w, c), array)
-
-    def place(self, node: Node) -> str:
-        """A node whose name was reserved."""
-        self._editor.nodes.append(node)
-        return node.name
+        made = Node(
+            node or self.names.fresh(node_name(name)), "Const", value=form, origin=None if node is None else name
+        )
+        return Value(self.append(made), (n, h, w, c), array)
 
     def finish(self, value: str, started: int, name: str, origin: str | tuple[str, ...]) -> str:
         """Call the node behind ``value`` ``name``; one from before ``started``, or a constant, gets an Identity."""
-        nodes = self._editor.nodes
-        for index in range(len(nodes) - 1, started - 1, -1):
-            if nodes[index].name == value and nodes[index].op != "Const":
-                if any(value in n.inputs for n in nodes[started:]):
-                    break
-                nodes[index] = replace(nodes[index], name=name, origin=origin)
-                return name
-        return self.place(Node(name, "Identity", (value,), origin=origin))
+        at = self.position.get(value, -1)
+        new = at >= started and self.nodes[at].op != "Const"
+        if new and not any(value in n.inputs for n in self.nodes[started:]):
+            return self.rename(value, name, origin)
+        return self.append(Node(name, "Identity", (value,), origin=origin))
 
     # ------------------------------------------------------------------ forms of a tensor
 
-    def image(self, value: Value) -> str:
+    def as_image(self, value: Value) -> str:
         """The tensor as [N, H, W, C]."""
         if value.rank == 4:
             return value.reference
         if value.constant is not None:
-            return self.const(value.constant, "nhwc")
+            return self.floats(value.constant, "nhwc")
         n, h, w, c = value.shape
-        return self.op("Reshape", [value.reference, self.ints([-1 if n is None else n, h, w, c], "nhwc")])
+        return self.add("Reshape", [value.reference, self.ints([-1 if n is None else n, h, w, c], "nhwc")])
 
-    def matrix(self, value: Value) -> str:
+    def as_matrix(self, value: Value) -> str:
         """The tensor as [N, H·W·C], rows flattened in the order H, W, C."""
         if value.rank == 2:
             return value.reference
         if value.constant is not None:
-            return self.const(value.constant.reshape(len(value.constant), -1), "matrix")
-        return self.op("Reshape", [value.reference, self.ints([-1, value.size], "flat")], label="flatten")
+            return self.floats(value.constant.reshape(len(value.constant), -1), "matrix")
+        return self.add("Reshape", [value.reference, self.ints([-1, value.size], "flat")], name="flatten")
 
-    def vector(self, value: Value) -> str:
+    def as_vector(self, value: Value) -> str:
         """The tensor as a vector: a bias, slopes, indices."""
         if value.rank == 1:
             return value.reference
         if value.constant is not None:
-            return self.const(value.constant.reshape(-1), "vector")
-        return self.op("Reshape", [value.reference, self.ints([-1], "vector")], label="list")
+            return self.floats(value.constant.reshape(-1), "vector")
+        return self.add("Reshape", [value.reference, self.ints([-1], "vector")], name="list")
 
     def shaped(self, reference: str, shape: Shape, integer: str | None = None) -> Value:
         """A tensor that has ``shape``'s elements in order, brought to the form that ``shape`` asks for."""
         n, *rest = shape
         rows = [] if shape[:3] == (1, 1, 1) else [-1 if n is None else n]
         to = self.ints([*rows, *(rest if shape[1:3] != (1, 1) else rest[2:])], "shape")
-        made = None if integer is None else self.op("Reshape", [integer, to], label="integer")
-        return Value(self.op("Reshape", [reference, to]), shape, integer=made)
+        made = None if integer is None else self.add("Reshape", [integer, to], name="integer")
+        return Value(self.add("Reshape", [reference, to]), shape, integer=made)
 
     def rows(self, matrix: str, n: int | None, width: int, integer: str | None = None) -> Value:
         """A matrix [N, width] as a tensor."""
@@ -196,13 +166,13 @@ class Builder:
 
     def operands(self, values: Sequence[Value]) -> tuple[list[str], Shape]:
         """References that broadcast against each other as the ``.nn`` means it, and the shape of the result."""
-        shape = self.broadcast(values)
+        shape = self.broadcast_shape(values)
         if shape[1:3] == (1, 1):
             return [v.reference for v in values], shape
         # Beside an image, [B, C] would be taken for [W, C]; a vector is right as it is.
-        return [self.image(v) if v.rank == 2 else v.reference for v in values], shape
+        return [self.as_image(v) if v.rank == 2 else v.reference for v in values], shape
 
-    def broadcast(self, values: Sequence[Value]) -> Shape:
+    def broadcast_shape(self, values: Sequence[Value]) -> Shape:
         """The shape of an elementwise result: on each axis the lengths are equal or 1."""
         dims: list[int | None] = [1, 1, 1, 1]
         for value in values:
@@ -221,7 +191,7 @@ class Builder:
     def four(self, values: Sequence[int]) -> tuple[int, int, int, int]:
         """A shape among the layer's fields as N, H, W, C."""
         if len(values) in (4, 8):
-            return four_axes(tuple(values), self.where)
+            return four_axes(tuple(values), self.location)
         raise self.damaged(f"it holds {list(values)}", "that is no shape of four or eight axes")
 
     def whole(self, array: npt.NDArray[np.float32]) -> list[int]:
@@ -238,14 +208,14 @@ class Builder:
             raise self.unsupported(f"a tensor of {list(lengths)}", f"more than {MAX_ELEMENTS} numbers are not read")
 
     @property
-    def where(self) -> str:
+    def location(self) -> str:
         """The layer that is being read."""
         return f"layer {self.layer.name!r} ({layer_label(self.layer.type)})"
 
     def damaged(self, what: str, why: str) -> GraphError:
         """The error for a layer that contradicts itself."""
         return GraphError(
-            f"{self.where}: {what}",
+            f"{self.location}: {what}",
             why=why,
             fix="convert the model again: the frozen_graph_def.pb beside the .nn is exported in its place",
         )
@@ -253,7 +223,7 @@ class Builder:
     def unsupported(self, what: str, why: str) -> UnsupportedOpError:
         """The error for a layer, or a variant of one, that is not translated."""
         return UnsupportedOpError(
-            f"{self.where}: {what}",
+            f"{self.location}: {what}",
             issues=[(self.layer.name, layer_label(self.layer.type))],
             why=why,
             fix="export the frozen_graph_def.pb or the .onnx that the model was converted from",

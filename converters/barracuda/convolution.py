@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from converters.barracuda.builder import Builder, Value
 from converters.barracuda.dense import biased
+from converters.barracuda.layer_builder import LayerBuilder, Value
 from converters.barracuda.vocabulary import LayerType
 from converters.graph.ops.convolution import window_padding
 
@@ -38,7 +38,7 @@ class _Window:
         return (length + self.before[axis] + self.after[axis] - self.size[axis]) // self.stride[axis] + 1
 
 
-def _window(b: Builder, x: Value, size: tuple[int, int], stride: Sequence[int]) -> _Window:
+def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[int]) -> _Window:
     """The window of the current layer over an image; ``size`` is (height, width). Raises GraphError."""
     if len(stride) != 2 or min(stride) < 1 or min(size) < 1:
         raise b.damaged(f"a window of {list(size)} with strides {list(stride)}", "both have two numbers above 0")
@@ -65,39 +65,39 @@ def _window(b: Builder, x: Value, size: tuple[int, int], stride: Sequence[int]) 
     return window
 
 
-def _slide(b: Builder, op: str, x: Value, window: _Window, kernel: str | None, fill: float) -> str:
+def _slide(b: LayerBuilder, op: str, x: Value, window: _Window, kernel: str | None, fill: float) -> str:
     """A window op: SAME where it is, else VALID over an image that is padded with ``fill`` first."""
-    data, padding = b.image(x), "SAME" if window.same else "VALID"
+    data, padding = b.as_image(x), "SAME" if window.same else "VALID"
     if not window.same and any(window.before + window.after):
         pads = [[0, 0], *([lo, hi] for lo, hi in zip(window.before, window.after, strict=True)), [0, 0]]
         data = padded(b, data, pads, fill)
     strides = (1, *window.stride, 1)
     if kernel is None:
-        return b.op(op, [data], ksize=(1, *window.size, 1), strides=strides, padding=padding)
-    return b.op(op, [data, kernel], strides=strides, padding=padding)
+        return b.add(op, [data], ksize=(1, *window.size, 1), strides=strides, padding=padding)
+    return b.add(op, [data, kernel], strides=strides, padding=padding)
 
 
-def padded(b: Builder, x: str, pads: Sequence[Sequence[int]], fill: float) -> str:
+def padded(b: LayerBuilder, x: str, pads: Sequence[Sequence[int]], fill: float) -> str:
     """``x`` with ``pads`` (a pair per axis) of ``fill`` around it."""
     operand = b.ints(pads, "pads")
-    return b.op("Pad", [x, operand]) if fill == 0 else b.op("PadV2", [x, operand, b.const(fill, "fill")])
+    return b.add("Pad", [x, operand]) if fill == 0 else b.add("PadV2", [x, operand, b.floats(fill, "fill")])
 
 
 # ------------------------------------------------------------------ convolutions
 
 
-def conv2d(b: Builder, args: Sequence[Value]) -> Value:
+def conv2d(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """K [height, width, in, out] over an image, plus a bias of out."""
     x, kernel, bias = args
     array = _kernel(b, kernel)
     if array.shape[2] != x.c or bias.size != array.shape[3]:
         raise _channels(b, x, kernel, bias)
     window = _window(b, x, array.shape[:2], b.layer.stride)
-    product = _slide(b, "Conv2D", x, window, b.image(kernel), 0)
+    product = _slide(b, "Conv2D", x, window, b.as_image(kernel), 0)
     return _image_of(b, x, window, biased(b, product, bias), array.shape[3])
 
 
-def depthwise(b: Builder, args: Sequence[Value]) -> Value:
+def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """A kernel [height, width, 1, C] that keeps the channels apart; TensorFlow's is [height, width, C, 1]."""
     x, kernel, bias = args
     array = _kernel(b, kernel)
@@ -106,12 +106,12 @@ def depthwise(b: Builder, args: Sequence[Value]) -> Value:
     if array.shape[3] != x.c or bias.size != array.shape[3]:
         raise _channels(b, x, kernel, bias)
     window = _window(b, x, array.shape[:2], b.layer.stride)
-    turned = b.const(array.transpose(0, 1, 3, 2), "kernel")
+    turned = b.floats(array.transpose(0, 1, 3, 2), "kernel")
     product = _slide(b, "DepthwiseConv2dNative", x, window, turned, 0)
     return _image_of(b, x, window, biased(b, product, bias), array.shape[3])
 
 
-def conv2d_trans(b: Builder, args: Sequence[Value]) -> Value:
+def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """A transposed convolution: zeros between the pixels, a border, and a plain convolution with K turned round.
 
     ``pool`` is the output adjustment [width, height]; where it is empty, Unity takes (in + pads − kernel) mod stride.
@@ -151,51 +151,51 @@ def conv2d_trans(b: Builder, args: Sequence[Value]) -> Value:
     )
     spread = _spread(b, x, step)
     framed = _framed(b, spread, [1 + (length - 1) * step for length in x.shape[1:3]], borders)
-    turned = b.const(array[::-1, ::-1], "kernel")
-    product = b.op("Conv2D", [framed, turned], strides=(1, 1, 1, 1), padding="VALID")
+    turned = b.floats(array[::-1, ::-1], "kernel")
+    product = b.add("Conv2D", [framed, turned], strides=(1, 1, 1, 1), padding="VALID")
     shape = (x.n, lengths[0], lengths[1], int(array.shape[3]))
     return b.shaped(biased(b, product, bias), shape) if shape[1:3] == (1, 1) else Value(biased(b, product, bias), shape)
 
 
-def _spread(b: Builder, x: Value, step: int) -> str:
+def _spread(b: LayerBuilder, x: Value, step: int) -> str:
     """The image with ``step`` − 1 zeros after every pixel of both axes, as [N, H·step, W·step, C]."""
-    data = b.image(x)
+    data = b.as_image(x)
     if step == 1:
         return data
     n, h, w, c = x.shape
     rows = -1 if n is None else n
     gaps = [[0, 0], [0, 0], [0, step - 1], [0, 0]]
-    data = b.op("Reshape", [data, b.ints([rows, h, 1, w * c], "lines")], label="lines")
+    data = b.add("Reshape", [data, b.ints([rows, h, 1, w * c], "lines")], name="lines")
     data = padded(b, data, gaps, 0)
-    data = b.op("Reshape", [data, b.ints([rows, h * step * w, 1, c], "pixels")], label="pixels")
+    data = b.add("Reshape", [data, b.ints([rows, h * step * w, 1, c], "pixels")], name="pixels")
     data = padded(b, data, gaps, 0)
-    return b.op("Reshape", [data, b.ints([rows, h * step, w * step, c], "spread")], label="spread")
+    return b.add("Reshape", [data, b.ints([rows, h * step, w * step, c], "spread")], name="spread")
 
 
-def _framed(b: Builder, x: str, lengths: Sequence[int], borders: Sequence[tuple[int, int]]) -> str:
+def _framed(b: LayerBuilder, x: str, lengths: Sequence[int], borders: Sequence[tuple[int, int]]) -> str:
     """An image cut to ``lengths``, and then given borders of zeros; a negative border cuts more off."""
     begin = [0, *(max(-low, 0) for low, _ in borders), 0]
     end = [0, *(length - max(-high, 0) for length, (_, high) in zip(lengths, borders, strict=True)), 0]
     operands = [b.ints(begin, "begin"), b.ints(end, "end"), b.ints([1, 1, 1, 1], "steps")]
-    cut = b.op("StridedSlice", [x, *operands], begin_mask=0b1001, end_mask=0b1001)
+    cut = b.add("StridedSlice", [x, *operands], begin_mask=0b1001, end_mask=0b1001)
     pads = [[0, 0], *([max(low, 0), max(high, 0)] for low, high in borders), [0, 0]]
     return padded(b, cut, pads, 0) if any(map(any, pads)) else cut
 
 
-def _kernel(b: Builder, kernel: Value) -> np.ndarray:
+def _kernel(b: LayerBuilder, kernel: Value) -> np.ndarray:
     if kernel.constant is None:
         raise b.unsupported("its kernel is computed", "kernels are constants in every target")
     return kernel.constant
 
 
-def _channels(b: Builder, x: Value, kernel: Value, bias: Value) -> Exception:
+def _channels(b: LayerBuilder, x: Value, kernel: Value, bias: Value) -> Exception:
     return b.damaged(
         f"{x.c} channels, a kernel of shape {list(kernel.shape)}, a bias of {bias.size}",
         "the kernel [height, width, in, out] does not fit to them",
     )
 
 
-def _image_of(b: Builder, x: Value, window: _Window, reference: str, channels: int) -> Value:
+def _image_of(b: LayerBuilder, x: Value, window: _Window, reference: str, channels: int) -> Value:
     shape = (x.n, window.length(0, x.h), window.length(1, x.w), channels)
     return b.shaped(reference, shape) if shape[1:3] == (1, 1) else Value(reference, shape)
 
@@ -203,7 +203,7 @@ def _image_of(b: Builder, x: Value, window: _Window, reference: str, channels: i
 # ------------------------------------------------------------------ pools
 
 
-def pool(b: Builder, args: Sequence[Value]) -> Value:
+def pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The maximum or the mean of each window; what is padded does not count."""
     (x,) = args
     if len(b.layer.pool) != 2:
@@ -216,7 +216,7 @@ def pool(b: Builder, args: Sequence[Value]) -> Value:
     counts = [_counts(window, i, length) for i, length in enumerate(x.shape[1:3])]
     if not window.same and any((c != size[i]).any() for i, c in enumerate(counts)):
         factor = size[0] * size[1] / np.outer(*counts)
-        mean = b.op("Mul", [mean, b.const(factor[None, :, :, None], "share")])
+        mean = b.add("Mul", [mean, b.floats(factor[None, :, :, None], "share")])
     return _image_of(b, x, window, mean, x.c)
 
 
@@ -227,20 +227,20 @@ def _counts(window: _Window, axis: int, length: int) -> np.ndarray:
     return np.asarray(np.maximum(stop - np.maximum(start, 0), 1))
 
 
-def global_pool(b: Builder, args: Sequence[Value]) -> Value:
+def global_pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The maximum or the mean of all pixels, per channel: [N, 1, 1, C]."""
     (x,) = args
     if x.rank != 4:
         return x
     op = "Max" if b.layer.type == LayerType.GLOBAL_MAX_POOL2D else "Mean"
-    reduced = b.op(op, [x.reference, b.ints([1, 2], "axes")], keep_dims=False)
+    reduced = b.add(op, [x.reference, b.ints([1, 2], "axes")], keep_dims=False)
     return b.rows(reduced, x.n, x.c)
 
 
 # ------------------------------------------------------------------ borders and sizes
 
 
-def border(b: Builder, args: Sequence[Value]) -> Value:
+def border(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """A border around the image: of ``beta``, or made of its own pixels; a negative one cuts pixels off."""
     (x,) = args
     pad = tuple(b.layer.pad)
@@ -254,7 +254,7 @@ def border(b: Builder, args: Sequence[Value]) -> Value:
     if min(h, w, c) < 1:
         raise b.damaged(f"a border of {list(pad)} around {list(x.shape)}", "nothing is left of the image")
     b.sized(h, w, c)
-    data = b.image(x)
+    data = b.as_image(x)
     for axis, (low, high) in enumerate(pairs):
         if (low, high) == (0, 0):
             continue
@@ -282,12 +282,12 @@ def _mirrored(kind: int, index: np.ndarray, length: int) -> np.ndarray:
     return np.asarray(np.clip(index, 0, last))
 
 
-def taken(b: Builder, x: str, index: Sequence[int], axis: int) -> str:
+def taken(b: LayerBuilder, x: str, index: Sequence[int], axis: int) -> str:
     """Elements ``index`` of an axis."""
-    return b.op("GatherV2", [x, b.ints(list(index), "index"), b.ints(axis, "axis")])
+    return b.add("GatherV2", [x, b.ints(list(index), "index"), b.ints(axis, "axis")])
 
 
-def upsample(b: Builder, args: Sequence[Value]) -> Value:
+def upsample(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Every pixel ``pool`` = [width, height] times; the factors may come as a constant [N, H, W, C] instead."""
     factors: Sequence[int] = b.layer.pool
     if not factors and len(args) == 2 and args[1].constant is not None and args[1].constant.size == 4:
@@ -303,24 +303,24 @@ def upsample(b: Builder, args: Sequence[Value]) -> Value:
     x = args[0]
     n, h, w, c = x.shape
     b.sized(h, factors[1], w, factors[0], c)
-    data = b.image(x)
+    data = b.as_image(x)
     for axis, (length, factor) in enumerate(((h, factors[1]), (w, factors[0])), start=1):
         if factor > 1:
             data = taken(b, data, np.arange(length).repeat(factor).tolist(), axis)
     return b.shaped(data, (n, h * factors[1], w * factors[0], c))
 
 
-def normalization(b: Builder, args: Sequence[Value]) -> Value:
+def normalization(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Instance normalisation: (x − mean) / √(variance + beta)·S + B, mean and variance over each channel's pixels."""
     x, scale, bias = args
     if b.layer.axis not in (-1, 3, 7):
         raise b.unsupported(f"the axis is {b.layer.axis}", "only the channels' axis is known")
     if scale.size != x.c or bias.size != x.c:
         raise b.damaged(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
-    data, axes = b.image(x), b.ints([1, 2], "axes")
-    mean = b.op("Mean", [data, axes], keep_dims=True)
-    centred = b.op("Sub", [data, mean])
-    variance = b.op("Mean", [b.op("Square", [centred]), axes], keep_dims=True)
-    deviation = b.op("Sqrt", [b.op("Add", [variance, b.const(b.layer.beta or _TINY, "epsilon")])])
-    scaled = b.op("Mul", [b.op("RealDiv", [centred, deviation]), b.image(scale)])
-    return b.shaped(b.op("Add", [scaled, b.image(bias)]), x.shape)
+    data, axes = b.as_image(x), b.ints([1, 2], "axes")
+    mean = b.add("Mean", [data, axes], keep_dims=True)
+    centred = b.add("Sub", [data, mean])
+    variance = b.add("Mean", [b.add("Square", [centred]), axes], keep_dims=True)
+    deviation = b.add("Sqrt", [b.add("Add", [variance, b.floats(b.layer.beta or _TINY, "epsilon")])])
+    scaled = b.add("Mul", [b.add("RealDiv", [centred, deviation]), b.as_image(scale)])
+    return b.shaped(b.add("Add", [scaled, b.as_image(bias)]), x.shape)

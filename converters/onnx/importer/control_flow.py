@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.onnx.importer.importer import Raiser
-from converters.onnx.importer.node import Op, Raise
+from converters.onnx.importer.importer import Importer
+from converters.onnx.importer.node import Op, Translate
 
 
-def _if(op: Op, r: Raiser) -> list[str | None]:
-    condition = r.known(op.need(0))
+def _if(op: Op, net: Importer) -> list[str | None]:
+    condition = net.known(op.need(0))
     if condition is None:
         raise op.refused(
             "its condition is not known before the graph runs",
@@ -17,10 +17,10 @@ def _if(op: Op, r: Raiser) -> list[str | None]:
             "if an input decides it, give it a value: --set NAME=VALUE; else export the model with fixed shapes",
         )
     body = op.attrs["then_branch" if bool(condition.reshape(-1)[0]) else "else_branch"]
-    return [*r.inline(op, body, {})]
+    return [*net.inline(op, body, {})]
 
 
-def _scan(op: Op, r: Raiser) -> list[str | None]:
+def _scan(op: Op, net: Importer) -> list[str | None]:
     """tf2onnx's form of an LSTM loop: states go in and out, an axis is walked along. Here it has one step.
 
     Opset 8 had a batch axis and sequence lengths of its own; nobody writes that.
@@ -37,24 +37,24 @@ def _scan(op: Op, r: Raiser) -> list[str | None]:
     for position, value in enumerate(body.input):
         tensor = op.need(position)
         if position >= states:
-            axis = r.axis(op, tensor, given[position - states])
-            if r.shape(op, tensor)[axis] != 1:
+            axis = net.axis(tensor, given[position - states])
+            if net.shape(tensor)[axis] != 1:
                 raise op.refused(
-                    f"it runs over {r.shape(op, tensor)[axis]} steps",
+                    f"it runs over {net.shape(tensor)[axis]} steps",
                     "a policy is run for one step, its memory fed back by the caller",
                     "if an input gives the number of steps, fix it: --set NAME=1",
                 )
-            tensor = r.squeeze(tensor, [axis])
+            tensor = net.squeeze(tensor, [axis])
         bindings[value.name] = tensor
-    results = r.inline(op, body, bindings)
+    results = net.inline(op, body, bindings)
     ends: list[str | None] = [*results[:states]]
     for value, axis in zip(results[states:], stacked, strict=True):
-        rank = r.rank(op, value) + 1
-        ends.append(r.expand_dims(value, axis % rank))
+        rank = net.rank(value) + 1
+        ends.append(net.expand_dims(value, axis % rank))
     return ends
 
 
-def _loop(op: Op, r: Raiser) -> list[str | None]:
+def _loop(op: Op, net: Importer) -> list[str | None]:
     """Refused: no exporter of policies writes one (tf2onnx writes Scan, PyTorch LSTM)."""
     raise op.refused(
         "it is a loop",
@@ -63,4 +63,4 @@ def _loop(op: Op, r: Raiser) -> list[str | None]:
     )
 
 
-OPS: Mapping[str, Raise] = {"If": _if, "Scan": _scan, "Loop": _loop}
+OPS: Mapping[str, Translate] = {"If": _if, "Scan": _scan, "Loop": _loop}
