@@ -2,9 +2,9 @@
 
 Only the fields that are needed, by the numbers of TensorFlow's public .proto files (graph.proto, node_def.proto,
 attr_value.proto, tensor.proto, tensor_shape.proto, versions.proto, saved_model.proto, meta_graph.proto,
-tensor_bundle.proto, tensor_slice.proto, event.proto). Fields that are not listed survive as unknown fields. A private
-pool, so that a real ``tensorflow`` in the same process does not clash, and so that no generated code has to match the
-installed protobuf.
+function.proto, op_def.proto, saver.proto, tensor_bundle.proto, tensor_slice.proto, event.proto). Fields that are not
+listed survive as unknown fields. A private pool, so that a real ``tensorflow`` in the same process does not clash, and
+so that no generated code has to match the installed protobuf.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SCALARS = {
 }
 _MESSAGE_KIND, _OPTIONAL, _REPEATED = 11, 1, 3
 
-#: message → fields, each "number name kind", kind with * for repeated and <K for a map from string to message K.
+#: message → fields, each "number name kind", kind with * for repeated and <K for a map from string to K.
 _MESSAGES = {
     "Dim": "1 size int64, 2 name string",
     "TensorShapeProto": "2 dim Dim*, 3 unknown_rank bool",
@@ -50,14 +50,18 @@ _MESSAGES = {
     ),
     "NodeDef": "1 name string, 2 op string, 3 input string*, 4 device string, 5 attr <AttrValue",
     "VersionDef": "1 producer int32, 2 min_consumer int32, 3 bad_consumers int32*",
-    "FunctionSignature": "1 name string",
-    "FunctionDef": "1 signature FunctionSignature",
+    "ArgDef": "1 name string, 3 type int32",
+    "OpDef": "1 name string, 2 input_arg ArgDef*, 3 output_arg ArgDef*",
+    "FunctionDef": "1 signature OpDef, 3 node_def NodeDef*, 4 ret <string, 6 control_ret <string",
     "FunctionDefLibrary": "1 function FunctionDef*",
     "GraphDef": "1 node NodeDef*, 2 library FunctionDefLibrary, 4 versions VersionDef",
     "TensorInfo": "1 name string, 2 dtype int32, 3 tensor_shape TensorShapeProto",
     "SignatureDef": "1 inputs <TensorInfo, 2 outputs <TensorInfo, 3 method_name string",
     "MetaInfoDef": "1 meta_graph_version string, 4 tags string*, 5 tensorflow_version string",
-    "MetaGraphDef": "1 meta_info_def MetaInfoDef, 2 graph_def GraphDef, 5 signature_def <SignatureDef",
+    "SaverDef": "3 restore_op_name string",
+    "MetaGraphDef": (
+        "1 meta_info_def MetaInfoDef, 2 graph_def GraphDef, 3 saver_def SaverDef, 5 signature_def <SignatureDef"
+    ),
     "SavedModel": "1 saved_model_schema_version int64, 2 meta_graphs MetaGraphDef*",
     # tensor_bundle.proto, tensor_slice.proto
     "Extent": "1 start int64, 2 length int64",
@@ -87,9 +91,11 @@ def _add_message(file: Any, name: str, fields: str) -> None:
             entry = message.nested_type.add(name=entry_name)
             entry.options.map_entry = True
             entry.field.add(name="key", number=1, type=9, label=_OPTIONAL)
-            entry.field.add(
-                name="value", number=2, type=_MESSAGE_KIND, label=_OPTIONAL, type_name=f".export_model.{kind[1:]}"
-            )
+            value = entry.field.add(name="value", number=2, label=_OPTIONAL)
+            if kind[1:] in _SCALARS:
+                value.type = _SCALARS[kind[1:]]
+            else:
+                value.type, value.type_name = _MESSAGE_KIND, f".export_model.{kind[1:]}"
             field.type, field.type_name = _MESSAGE_KIND, f".export_model.{name}.{entry_name}"
         elif kind.rstrip("*") in _SCALARS:
             field.type = _SCALARS[kind.rstrip("*")]

@@ -61,7 +61,7 @@ def read_training_graph(path: Path) -> TrainingGraph:
 
 def training_graph(graph_def: Any) -> TrainingGraph:
     """The same of a GraphDef message."""
-    saved = _saved(graph_def)
+    saved = saved_places(graph_def)
     rest = SimpleNamespace(
         node=_without_initial_values(graph_def), library=graph_def.library, versions=graph_def.versions
     )
@@ -90,7 +90,7 @@ def _without_initial_values(graph_def: Any) -> list[Any]:
 # ------------------------------------------------------------------ the graph's saver
 
 
-def _saved(graph_def: Any) -> dict[str, Saved]:
+def saved_places(graph_def: Any) -> dict[str, Saved]:
     """Variable's node → its place in a checkpoint, by the first saver that restores it."""
     nodes = {proto.name: proto for proto in graph_def.node}
     found: dict[str, Saved] = {}

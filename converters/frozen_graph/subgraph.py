@@ -23,9 +23,9 @@ from signatures.errors import GraphError
 #: Ops that compute a value from their inputs (or draw one) and do nothing else.
 COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *RENAMED, *DECOMPOSED))
 #: Ops that may hang behind a control input, where they are left out: they compute nothing that anyone reads.
-_ORDERING = frozenset(("NoOp", "Assert"))
+ORDERING = frozenset(("NoOp", "Assert"))
 #: What a constant in a while loop or a branch is pinned to by a control input.
-_PIVOTS = frozenset(("Identity", "Switch", "Merge"))
+PIVOTS = frozenset(("Identity", "Switch", "Merge"))
 #: Ops that take references to variables, which frozen graphs do not have, and those that take values.
 _OF_VALUES: Mapping[str, str] = MappingProxyType(
     {"RefEnter": "Enter", "RefExit": "Exit", "RefMerge": "Merge", "RefSwitch": "Switch",
@@ -76,9 +76,9 @@ def _check(nodes: Mapping[str, Any], roots: Iterable[str]) -> None:
                 why="it is read, or asked for, and no node makes it",
                 fix="freeze the graph again from its checkpoint",
             )
-        if node.op not in COMPUTING and node.op not in _OF_VALUES and not (ordering and node.op in _ORDERING):
+        if node.op not in COMPUTING and node.op not in _OF_VALUES and not (ordering and node.op in ORDERING):
             refused.append(node)
-        ordered = node.op in _ORDERING
+        ordered = node.op in ORDERING
         stack.extend((node_of(i.removeprefix("^")), ordered or i.startswith("^")) for i in node.input)
     if refused:
         refused.sort(key=lambda n: n.name)
@@ -87,7 +87,7 @@ def _check(nodes: Mapping[str, Any], roots: Iterable[str]) -> None:
 
 def _inputs(nodes: Mapping[str, Any], node: Any, looping: bool) -> list[str]:
     """A node's inputs without control inputs, those apart that say in which frame of a loop it is."""
-    return [i for i in node.input if not i.startswith("^") or (looping and nodes[i[1:]].op in _PIVOTS)]
+    return [i for i in node.input if not i.startswith("^") or (looping and nodes[i[1:]].op in PIVOTS)]
 
 
 def _bare(node: Any, inputs: Iterable[str]) -> Any:

@@ -1,7 +1,7 @@
 """SavedModel files (saved_model.proto, meta_graph.proto) without TensorFlow.
 
-A SavedModel of TensorFlow 1 holds a flat graph, signatures, and in ``variables/`` a checkpoint. One of TensorFlow 2 is
-a tree of Python objects whose functions call one another; only TensorFlow itself can flatten it.
+A SavedModel of TensorFlow 1 holds a flat graph, signatures, and in ``variables/`` a checkpoint. In one of TensorFlow 2
+the signatures call functions of the graph's library (converters/saved_model/inlining.py).
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any
 
 from converters import schema
 from converters.graph.nodes import TensorShape, node_of
+from converters.saved_model.inlining import CALLING
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 SERVING = "serving_default"
 _INIT = "__saved_model_"
-_CALLS = frozenset(("PartitionedCall", "StatefulPartitionedCall", "TPUPartitionedCall"))
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Saved:
     keys: tuple[str, ...]
     #: whether what the signature computes is in functions
     calls: bool
+    #: the node that restores the variables, empty where there is none
+    restore: str = ""
 
 
 def read_saved_model(data: bytes) -> Saved:
@@ -45,9 +47,9 @@ def read_saved_model(data: bytes) -> Saved:
     if key is not None:
         definition = meta.signature_def[key]
         signature = ModelSignature(_tensors(definition.inputs), _tensors(definition.outputs), key)
-    return Saved(
-        meta.graph_def, tuple(meta.meta_info_def.tags), signature, keys, _calls_functions(meta.graph_def, signature)
-    )
+    calls = _calls_functions(meta.graph_def, signature)
+    restore = meta.saver_def.restore_op_name
+    return Saved(meta.graph_def, tuple(meta.meta_info_def.tags), signature, keys, calls, restore)
 
 
 def _tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -64,7 +66,7 @@ def _tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
 
 def _calls_functions(graph_def: Any, signature: ModelSignature) -> bool:
     """Whether a node upstream of the signature (of anything, where there is none) calls a function."""
-    functions = {f.signature.name for f in graph_def.library.function} | _CALLS
+    functions = {f.signature.name for f in graph_def.library.function} | CALLING
     calling = {n.name for n in graph_def.node if n.op in functions}
     if not calling or not signature.outputs:
         return bool(calling)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 
 from converters.bundle.source import facts_of, recalled
 from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
-from converters.checkpoint.training_graph import training_graph
+from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
 from converters.fetch import Fetched
-from converters.frozen_graph.reader import read_graph
-from converters.saved_model.functions import frozen_by_tensorflow
+from converters.graph.nodes import node_of
+from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
-from converters.saved_model.signature import expose, fed_by_signature
+from converters.saved_model.signature import ModelSignature, expose, fed_by_signature
 from converters.source import OriginalRun, SourceModel
 from converters.understand.facts import SourceFacts
+from signatures.errors import NotAPolicyError
 
 FILE = "saved_model.pb"
 
@@ -26,32 +27,46 @@ def read(given: Fetched) -> list[SourceModel]:
     folder = path if path.is_dir() else path.parent
     file = folder / FILE if path.is_dir() else path
     saved = read_saved_model(given.bytes_of(file))
-    values = sorted(p for p in folder.glob("variables/variables.*") if p.is_file())
-    if saved.calls:
-        return [_of_functions(folder, (file, *values), saved)]
     prefix = folder / "variables" / "variables"
     checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
-    training = training_graph(saved.graph_def)
-    frozen = freeze(training, checkpoint, saved.signature.roots or None)
+    training, signature = _inlined(saved) if saved.calls else (training_graph(saved.graph_def), saved.signature)
+    frozen = freeze(training, checkpoint, signature.roots or None)
     graph, contract = recalled(frozen.graph)
     facts = facts_of(graph, contract)
     if contract is None:
-        graph, roles = expose(frozen.graph, saved.signature)
+        graph, roles = expose(frozen.graph, signature)
         facts = SourceFacts(roles=roles, notes=_notes(saved))
     files = (file, *(() if checkpoint is None else checkpoint.files))
-    definition = fed_by_signature(with_values(training.definition, frozen.values), saved.signature)
+    definition = fed_by_signature(with_values(training.definition, frozen.values), signature)
     original = OriginalRun("tensorflow", folder, definition=definition)
     return [SourceModel(graph, files, facts, None if contract is None else contract.name, original)]
 
 
-def _of_functions(folder: Path, files: tuple[Path, ...], saved: Saved) -> SourceModel:
-    """A SavedModel of TensorFlow 2: frozen by TensorFlow, then read as any graph."""
-    data, signature = frozen_by_tensorflow(folder, "saved_model", saved.signature.key)
-    graph, roles = expose(read_graph(data), signature)
-    original = OriginalRun(
-        "tensorflow", folder, {"kind": "function", "form": "saved_model", "signature": signature.key}
+def _inlined(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
+    """The graph that the signature's functions are, and the signature on it; its inputs are called as their keys.
+
+    Which tensor of ``variables/`` is a variable's value is said by the function that restores them.
+    """
+    signature = saved.signature
+    if not signature.outputs:
+        raise NotAPolicyError(
+            "the SavedModel has functions and no signature",
+            why="which of them is the policy is not said",
+            fix="save it with signatures={'serving_default': …}",
+        )
+    keys = {node_of(t.name): key for key, t in signature.inputs.items()}
+    tensors = [t.name for t in (*signature.inputs.values(), *signature.outputs.values())]
+    flattened = flat(saved.graph_def, tensors, keys)
+    inputs, outputs = (
+        {key: replace(t, name=flattened.tensor(t.name)) for key, t in side.items()}
+        for side in (signature.inputs, signature.outputs)
     )
-    return SourceModel(graph, files, SourceFacts(roles=roles, notes=_notes(saved)), None, original)
+    restored = {}
+    if saved.restore:
+        restoring = flat(saved.graph_def, [saved.restore], restoring=True)
+        restored = saved_places(restoring.definition)
+    training = replace(training_graph(flattened.definition), saved=restored)
+    return training, ModelSignature(inputs, outputs, signature.key)
 
 
 def _notes(saved: Saved) -> tuple[str, ...]:

@@ -155,6 +155,36 @@ class Policy(tf.Module):
         return {"action": tf.math.log(kept / tf.reduce_sum(kept, 1, keepdims=True) + 1e-7)}
 
 
+class Winding(tf.Module):
+    """A loop, a branch, nested functions, an op with several results, a variable that is passed through a loop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kernel = tf.Variable(draw(5, 4))
+        self.bias = tf.Variable(draw(4))
+
+    @tf.function
+    def turn(self, hidden: tf.Tensor) -> tf.Tensor:
+        return tf.tanh(hidden * 0.5 + self.bias)
+
+    def __call__(self, vector_observation: tf.Tensor) -> dict[str, tf.Tensor]:
+        hidden = tf.cond(
+            tf.constant(True), lambda: vector_observation @ self.kernel, lambda: self.bias * tf.ones([1, 4])
+        )
+        start = tf.constant(0)
+        _, hidden = tf.while_loop(lambda i, _: i < 3, lambda i, x: (i + 1, self.turn(x)), (start, hidden))
+        left, right = tf.split(hidden, 2, axis=1)
+        return {"action": tf.concat([right, self.turn(hidden)[:, :2], left], 1)}
+
+
+def winding(folder: Path) -> None:
+    policy = Winding()
+    call = tf.function(policy.__call__).get_concrete_function(vector_observation=tf.TensorSpec([None, 5]))
+    observation = draw(4, 5)
+    tf.saved_model.save(policy, str(folder / "winding"), signatures=call)
+    keep(folder, "winding", {"vector_observation": observation}, call(tf.constant(observation)))
+
+
 def tf2(folder: Path) -> None:
     policy = Policy()
     feeds = {"vector_observation": draw(4, 5), "action_masks": masks(4, 3)}
@@ -184,6 +214,8 @@ def keras(folder: Path) -> None:
 
 
 def main(folder: Path) -> None:
+    tf2(folder)
+    winding(folder)
     v1.disable_control_flow_v2()
     tf1(folder, "references", resource=False)
     tf1(folder, "resources", resource=True)
@@ -192,7 +224,6 @@ def main(folder: Path) -> None:
     discrete_keys(folder)
     partitioned(folder)
     version_1(folder)
-    tf2(folder)
     keras(folder)
 
 

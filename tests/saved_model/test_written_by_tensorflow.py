@@ -19,17 +19,18 @@ from tests.saved_model.models import assert_agrees, roles, sources
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("written_by_tensorflow")]
 
 FLAT = {name: name for name in ("references", "resources", "bare", "bare-resources", "keys", "partitioned")}
-THROUGH_TENSORFLOW = {"function": "function", "exported": "keras", "policy.keras": "keras", "policy.h5": "keras"}
+OF_FUNCTIONS = {"function": "function", "winding": "winding", "exported": "keras"}
+THROUGH_TENSORFLOW = {"policy.keras": "keras", "policy.h5": "keras"}
 
 
-@pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *THROUGH_TENSORFLOW.items()])
+@pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *OF_FUNCTIONS.items(), *THROUGH_TENSORFLOW.items()])
 def test_reads_what_tensorflow_computes(models: Path, name: str, archive: str) -> None:
     (policy,) = read_source(models / name).policies()
     assert policy.name == Path(name).stem
     assert_agrees(policy, models / f"{archive}.npz")
 
 
-@pytest.mark.parametrize("name", [*FLAT, *THROUGH_TENSORFLOW])
+@pytest.mark.parametrize("name", [*FLAT, *OF_FUNCTIONS, *THROUGH_TENSORFLOW])
 def test_agrees_in_all_runtimes_with_the_original(models: Path, name: str, tmp_path: Path, pool: RuntimePool) -> None:
     (result,) = export([models / name], ExportOptions(tmp_path), pool=pool)
     assert result.report is not None

@@ -1,0 +1,322 @@
+"""Functions written out where they are called: the flat graph of a SavedModel of TensorFlow 2 (function.proto).
+
+A function's nodes read its arguments by name (``x``) and one another's results by the op's own names for them
+(``split:output:1``). Each call becomes a copy of the nodes that its results need, called ``<call>/<node>`` (those that
+a signature calls keep their names); ``While`` and ``If`` become the Switch and Merge of TensorFlow 1. Nothing is run
+for it, and a function that does more than compute is refused wherever in it that hangs: TensorFlow runs all of a
+function that has effects, whether its result needs them or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+from converters import schema
+from converters.frozen_graph.subgraph import COMPUTING, ORDERING, PIVOTS
+from converters.graph.nodes import NameScope, Node, ref, split_ref
+from converters.graph.ops.table import unsupported
+from signatures.errors import DamagedFileError, NotAPolicyError
+
+#: Ops that call the function which their attribute ``f`` names.
+CALLS = frozenset(("PartitionedCall", "StatefulPartitionedCall", "TPUPartitionedCall"))
+_WHILE = frozenset(("While", "StatelessWhile"))
+_IF = frozenset(("If", "StatelessIf"))
+#: Every op that calls functions.
+CALLING = CALLS | _WHILE | _IF
+#: What reads a variable; freezing replaces it.
+_READING = frozenset(("VarHandleOp", "ReadVariableOp", "ResourceGather", "VariableShape"))
+_ALLOWED = COMPUTING | _READING | ORDERING | CALLING
+#: Ops with several results of different names, in their order (the registry of TensorFlow 2.21).
+_RESULTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        **dict.fromkeys(
+            ("FusedBatchNorm", "FusedBatchNormV2", "FusedBatchNormV3"),
+            ("y", "batch_mean", "batch_variance", "reserve_space_1", "reserve_space_2", "reserve_space_3"),
+        ),
+        "Switch": ("output_false", "output_true"),
+        "Merge": ("output", "value_index"),
+        "TensorArrayV3": ("handle", "flow"),
+    }
+)
+_BOOL = 10  # DataType
+#: Copies of a graph's functions may hold this many nodes, and bytes: a small file could unfold to any size otherwise.
+MAX_NODES = 1 << 17
+_BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
+_MAX_DEPTH = 64
+
+
+class Flat:
+    """A graph without calls: ``definition`` is its GraphDef, ``tensor`` gives the name of what the caller named."""
+
+    def __init__(self, definition: Any, places: Mapping[str, str]) -> None:
+        self.definition = definition
+        self._places = places
+
+    def tensor(self, reference: str) -> str:
+        """What a tensor of the original graph is called here."""
+        name, index = split_ref(reference)
+        return self._places.get(ref(name, index), ref(name, index))
+
+
+def flat(
+    graph_def: Any, roots: Iterable[str], names: Mapping[str, str] | None = None, *, restoring: bool = False
+) -> Flat:
+    """What the tensors ``roots`` depend on, its functions inlined; ``names`` are other names for nodes.
+
+    Raises UnsupportedOpError where an op does more than compute, unless ``restoring`` (the result is then only read:
+    which variable is restored from what); DamagedFileError, NotAPolicyError.
+    """
+    return _Flattening(graph_def, names or {}, restoring=restoring).run(list(roots))
+
+
+class _Flattening:
+    def __init__(self, graph_def: Any, names: Mapping[str, str], *, restoring: bool) -> None:
+        self.graph_def = graph_def
+        self.functions = {f.signature.name: f for f in graph_def.library.function}
+        self.restoring = restoring
+        self.scope = NameScope(n.name for n in graph_def.node if not self._calls(n))
+        self.names = {old: self.scope.fresh(new) for old, new in names.items() if old != new}
+        self.result = schema.GraphDef()
+        self.result.versions.CopyFrom(graph_def.versions)
+        #: a call's result → the tensor that it is
+        self.aliases: dict[str, str] = {}
+        self.places_left = MAX_NODES
+        self.bytes_left = _BYTES_FREE + _BYTES_FACTOR * int(graph_def.ByteSize())
+
+    def run(self, roots: Sequence[str]) -> Flat:
+        nodes = _upstream({n.name: n for n in self.graph_def.node}, roots)
+        # The functions of a signature have nodes called as the call is: its results are told apart by a NUL.
+        placed = {n.name: self.names.get(n.name, f"\0{n.name}" if self._calls(n) else n.name) for n in nodes}
+
+        def tensor(reference: str) -> str:
+            name, index = split_ref(reference)
+            return ref(placed.get(name, name), index)
+
+        self._check(nodes)
+        pinned = {n.name for n in nodes if n.op in PIVOTS}
+        for node in nodes:
+            self._place(node, placed[node.name], [tensor(i) for i in node.input if not i.startswith("^")], "", 0)
+            if not self._calls(node):  # which frame of a while loop of TensorFlow 1 it is in
+                controls = [i[1:] for i in node.input if i.startswith("^") and i[1:] in pinned]
+                self.result.node[-1].input.extend(f"^{placed[c]}" for c in controls)
+        for node in self.result.node:
+            for i, reference in enumerate(node.input):
+                if not reference.startswith("^"):
+                    node.input[i] = self._resolved(reference)
+        outer = {r: tensor(r) for r in [*self.aliases, *map(_normal, roots), *placed]}
+        return Flat(self.result, {r: self._resolved(t) for r, t in outer.items()})
+
+    def _calls(self, node: Any) -> bool:
+        return node.op in CALLING or node.op in self.functions
+
+    def _check(self, nodes: Iterable[Any]) -> None:
+        refused = [n for n in nodes if n.op not in _ALLOWED and n.op not in self.functions]
+        if refused and not self.restoring:
+            raise unsupported(Node(n.name, n.op) for n in refused)
+
+    def _resolved(self, reference: str) -> str:
+        """The tensor behind the results of calls, which is noted for all that were passed on the way."""
+        passed: dict[str, None] = {}
+        while reference in self.aliases:
+            if reference in passed:
+                raise _damaged(f"the call's result {reference!r} is made of itself")
+            passed[reference] = None
+            reference = self.aliases[reference]
+        self.aliases.update(dict.fromkeys(passed, reference))
+        return reference
+
+    # ---- nodes
+
+    def _place(self, node: Any, name: str, inputs: Sequence[str], pivot: str, depth: int) -> None:
+        """A node, or in place of a call what it calls. ``pivot`` pins what has no inputs to the frame of a loop."""
+        if not self._calls(node):
+            copy = schema.NodeDef(name=name, op=node.op)
+            copy.input.extend(inputs)
+            if pivot and not inputs:
+                copy.input.append(f"^{pivot}")
+            for key, value in node.attr.items():
+                if value.WhichOneof("value") == "placeholder":
+                    raise NotAPolicyError(
+                        f"the function's node {node.name!r} takes its attribute {key!r} from the caller",
+                        why="functions of TensorFlow 2 are of one type each; this one was written by another tool",
+                        fix="save the model again (tf.saved_model.save), or freeze it to a GraphDef",
+                    )
+                copy.attr[key].CopyFrom(value)
+            self._add(copy)
+        elif node.op in _WHILE:
+            self._loop(node, name, inputs, depth)
+        elif node.op in _IF:
+            self._branch(node, name, inputs, depth)
+        else:
+            called = node.op if node.op in self.functions else node.attr["f"].func.name
+            for index, result in enumerate(self._body(called, name if depth else "", inputs, pivot, depth)):
+                self.aliases[ref(name, index)] = result
+
+    def _add(self, node: Any) -> None:
+        self._count(node.ByteSize())
+        self.result.node.append(node)
+
+    def _count(self, size: int) -> None:
+        """Count a node or a call; raises NotAPolicyError when that is too much."""
+        self.places_left -= 1
+        self.bytes_left -= size
+        if self.places_left < 0 or self.bytes_left < 0:
+            raise NotAPolicyError(
+                "the SavedModel's functions unfold to more nodes or constants than a policy has",
+                why=f"more than {MAX_NODES} nodes, or more than {_BYTES_FACTOR} times the size of the graph",
+                fix="save the policy alone, without the training part",
+            )
+
+    # ---- functions
+
+    def _body(self, called: str, prefix: str, arguments: Sequence[str], pivot: str, depth: int) -> list[str]:
+        """The results of a function, its nodes placed."""
+        self._count(0)
+        function = self.functions.get(called)
+        if function is None:
+            raise _damaged(f"the function {called!r} is called and is not there")
+        signature = function.signature
+        if depth >= _MAX_DEPTH:
+            raise _damaged(f"the function {called!r} is called {depth} functions deep, or calls itself")
+        if len(arguments) != len(signature.input_arg):
+            taken = len(signature.input_arg)
+            raise _damaged(f"the function {called!r} takes {taken} tensors and is given {len(arguments)}")
+        given = dict(zip((a.name for a in signature.input_arg), arguments, strict=True))
+        own = {n.name: n for n in function.node_def}
+        wanted = [r.partition(":")[0] for r in function.ret.values()] + list(function.control_ret.values())
+        nodes = _upstream(own, [w for w in wanted if w not in given], set(given))
+        self._check(nodes)
+        placed = {n.name: self.scope.fresh(f"{prefix}/{n.name}" if prefix else n.name) for n in nodes}
+
+        def tensor(reference: str) -> str:
+            name, _, rest = reference.partition(":")
+            if name in given:
+                return str(given[name])
+            if name not in placed:
+                raise _damaged(f"a node of the function {called!r} reads {reference!r}, which is not there")
+            result, _, position = rest.rpartition(":")
+            return ref(placed[name], _index(own[name].op, result, position))
+
+        for node in nodes:
+            inputs = [tensor(i) for i in node.input if not i.startswith("^")]
+            self._place(node, placed[node.name], inputs, pivot, depth + 1)
+        results = []
+        for argument in signature.output_arg:
+            if argument.name not in function.ret:
+                raise _damaged(f"the function {called!r} does not say what its result {argument.name!r} is")
+            results.append(tensor(function.ret[argument.name]))
+        return results
+
+    def _loop(self, node: Any, name: str, inputs: Sequence[str], depth: int) -> None:
+        """``While`` as TensorFlow 1 writes it: Enter, Merge, LoopCond, Switch, NextIteration, Exit."""
+        base = name.removeprefix("\0")
+        types = list(node.attr["T"].list.type)
+        if len(types) != len(inputs) or not inputs:
+            raise _damaged(f"the loop {node.name!r} says {len(types)} types for {len(inputs)} variables")
+
+        def part(kind: str, op: str, *sources: str, dtype: int | None = None) -> Any:
+            made = schema.NodeDef(name=self.scope.fresh(f"{base}/{kind}"), op=op)
+            made.input.extend(sources)
+            if dtype is not None:
+                made.attr["T"].type = dtype
+            return made
+
+        merges = []
+        for source, dtype in zip(inputs, types, strict=True):
+            enter = part("Enter", "Enter", source, dtype=dtype)
+            enter.attr["frame_name"].s = base.encode()
+            enter.attr["is_constant"].b = False
+            enter.attr["parallel_iterations"].i = 1
+            self._add(enter)
+            merge = part("Merge", "Merge", enter.name, dtype=dtype)
+            merge.attr["N"].i = 2
+            merges.append(merge)
+        heads = [m.name for m in merges]
+        condition = self._one(node.attr["cond"].func.name, f"{base}/cond", heads, heads[0], depth)
+        decided = part("LoopCond", "LoopCond", condition)
+        self._add(decided)
+        switches = [part("Switch", "Switch", h, decided.name, dtype=t) for h, t in zip(heads, types, strict=True)]
+        turns = [part("Identity", "Identity", ref(s.name, 1), dtype=t) for s, t in zip(switches, types, strict=True)]
+        for made in (*switches, *turns):
+            self._add(made)
+        carried = self._body(node.attr["body"].func.name, f"{base}/body", [t.name for t in turns], turns[0].name, depth)
+        if len(carried) != len(inputs):
+            raise _damaged(f"the body of the loop {node.name!r} gives {len(carried)} of {len(inputs)} variables")
+        for index, (merge, switch, result, dtype) in enumerate(zip(merges, switches, carried, types, strict=True)):
+            following = part("NextIteration", "NextIteration", result, dtype=dtype)
+            merge.input.append(following.name)
+            leaving = part("Exit", "Exit", switch.name, dtype=dtype)
+            for made in (following, merge, leaving):
+                self._add(made)
+            self.aliases[ref(name, index)] = leaving.name
+
+    def _branch(self, node: Any, name: str, inputs: Sequence[str], depth: int) -> None:
+        """``If`` as TensorFlow 1 writes it: Switch before both sides, Merge behind them."""
+        base = name.removeprefix("\0")
+        types = [node.attr["Tcond"].type, *node.attr["Tin"].list.type]
+        if len(types) != len(inputs) or types[0] != _BOOL:
+            raise _damaged(f"the branch {node.name!r} takes no bool, or other inputs than it says")
+        switches = []
+        for source, dtype in zip(inputs, types, strict=True):
+            made = schema.NodeDef(name=self.scope.fresh(f"{base}/Switch"), op="Switch")
+            made.input.extend((source, inputs[0]))
+            made.attr["T"].type = dtype
+            switches.append(made)
+            self._add(made)
+        sides = []
+        for index, key in ((0, "else_branch"), (1, "then_branch")):
+            pivot = schema.NodeDef(name=self.scope.fresh(f"{base}/pivot"), op="Identity")
+            pivot.input.append(ref(switches[0].name, index))
+            pivot.attr["T"].type = _BOOL
+            self._add(pivot)
+            given = [ref(s.name, index) for s in switches[1:]]
+            sides.append(self._body(node.attr[key].func.name, f"{base}/{key}", given, pivot.name, depth))
+        results = list(node.attr["Tout"].list.type)
+        if not len(sides[0]) == len(sides[1]) == len(results):
+            raise _damaged(f"the two sides of the branch {node.name!r} give different numbers of results")
+        for index, (no, yes, dtype) in enumerate(zip(*sides, results, strict=True)):
+            made = schema.NodeDef(name=self.scope.fresh(f"{base}/Merge"), op="Merge")
+            made.input.extend((no, yes))
+            made.attr["T"].type = dtype
+            made.attr["N"].i = 2
+            self._add(made)
+            self.aliases[ref(name, index)] = made.name
+
+    def _one(self, called: str, prefix: str, arguments: Sequence[str], pivot: str, depth: int) -> str:
+        results = self._body(called, prefix, arguments, pivot, depth)
+        if len(results) != 1:
+            raise _damaged(f"the function {called!r} has {len(results)} results where a loop wants one")
+        return results[0]
+
+
+def _index(op: str, result: str, position: str) -> int:
+    """The number of an output of an op, of ``<name of the result>:<position in it>``."""
+    if not position.isascii() or not position.isdigit() or len(position) > 9:
+        return 0
+    named = _RESULTS.get(op, ())
+    return int(position) + (named.index(result) if result in named else 0)
+
+
+def _upstream(nodes: Mapping[str, Any], roots: Iterable[str], given: Collection[str] = ()) -> list[Any]:
+    """The nodes that ``roots`` depend on, control inputs counted, in the order of ``nodes``."""
+    seen: set[str] = set()
+    stack = [r.removeprefix("^").partition(":")[0] for r in roots]
+    while stack:
+        name = stack.pop()
+        if name in seen or name in given:
+            continue
+        if name not in nodes:
+            raise _damaged(f"{name!r} is read and is not in the graph")
+        seen.add(name)
+        stack.extend(i.removeprefix("^").partition(":")[0] for i in nodes[name].input)
+    return [n for n in nodes.values() if n.name in seen]
+
+
+def _normal(reference: str) -> str:
+    return ref(*split_ref(reference))
+
+
+def _damaged(what: str) -> DamagedFileError:
+    return DamagedFileError(what, why="the SavedModel's functions do not fit together", fix="save the model again")
