@@ -86,7 +86,11 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class Trailer:
-    """What only Unity's own writer adds after the weights. ``metadata`` came with version 18."""
+    """What only Unity's own writer adds after the weights.
+
+    ``metadata`` came with version 18. Unity's loaders stop before it in an older file, so that what is there is for
+    other readers alone: ours keeps a policy's contract in it.
+    """
 
     ir_source: str
     ir_version: str
@@ -107,6 +111,10 @@ class NnModel:
     weights: npt.NDArray[np.float32] = field(repr=False)
     half: bool = False
     trailer: Trailer | None = None
+
+    def metadata(self, key: str) -> str | None:
+        """The metadata called ``key``, None where there is none."""
+        return None if self.trailer is None else dict(self.trailer.metadata).get(key)
 
     @property
     def from_python(self) -> bool:
@@ -236,7 +244,7 @@ class _Parser:
         source, ir_version, producer = self._text(), self._text(), self._text()
         warnings = self._list("importer's warnings", 8, lambda: (self._text(), self._text()))
         metadata: tuple[tuple[str, str], ...] = ()
-        if version >= METADATA:
+        if version >= METADATA or self._at < len(self._data):
             metadata = self._list("metadata", 8, lambda: (self._text(), self._text()))
         return Trailer(source, ir_version, producer, warnings, metadata)
 

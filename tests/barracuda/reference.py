@@ -18,13 +18,13 @@ Array = np.ndarray
 _erf = np.vectorize(math.erf)
 
 
-def evaluate(model: NnModel, feeds: Mapping[str, Array]) -> dict[str, Array]:
+def evaluate(model: NnModel, feeds: Mapping[str, Array], dtype: type = np.float64) -> dict[str, Array]:
     """Every tensor by name; samplers' results must be among ``feeds`` (by the layer's name)."""
-    values = {name: np.asarray(array, np.float64) for name, array in feeds.items()}
+    values = {name: np.asarray(array, dtype) for name, array in feeds.items()}
     for layer in model.layers:
         if layer.name in values:
             continue
-        data = [model.array(d).astype(np.float64) for d in layer.datasets]
+        data = [model.array(d).astype(dtype) for d in layer.datasets]
         if layer.type == 255:
             for dataset, array in zip(layer.datasets, data, strict=True):
                 values[dataset.name] = array
@@ -34,7 +34,7 @@ def evaluate(model: NnModel, feeds: Mapping[str, Array]) -> dict[str, Array]:
             result = compute(layer, args, model.version)
             if layer.type != 50 and layer.activation:
                 result = activation(layer.activation, result, 1.0, 0.0)
-        values[layer.name] = result
+        values[layer.name] = result.astype(dtype)
     return values
 
 

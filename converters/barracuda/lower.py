@@ -1,0 +1,412 @@
+"""A policy as ML-Agents of the ``.nn`` years (0.7 to release 16) expects it: names, memories, constants, layers.
+
+=====================  ============================================================================================
+``vector_observation``  all vectors of the policy, one after the other
+``visual_observation_i``  images as [H, W, C], in the policy's order
+``action_masks``        where a discrete policy has none, one is put in front of its scores
+``prev_action``         as floats
+``epsilon``             the first noise input; further ones are drawn by the model, since nobody feeds them
+memories                each part of the state [1, 1, 1, size]: ``recurrent_in_c``, ``recurrent_out_c``, …
+``action``              continuous: the action; discrete: the log-probabilities of all branches, from which ML-Agents
+                        draws (hybrid: ``continuous_actions`` and ``discrete_actions``)
+constants               ``version_number`` 2, ``memory_size``, ``is_continuous_control``, ``action_output_shape``
+=====================  ============================================================================================
+
+Source: ``BarracudaModelParamLoader`` and ``TensorGenerator`` of ML-Agents 0.7 to release 20. What such a policy gives
+besides (``value_estimate``, ``action_probs``) is written too. The action without chance is not: the largest score of
+each branch, or the action at ``epsilon`` 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from converters.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
+from converters.barracuda.lower_arrays import joined, reshaped, written
+from converters.barracuda.lower_base import FREE, Axes, Dims, Draft, NnBuilder, Piece, Value
+from converters.barracuda.lower_linear import FORBIDDEN, best_score, noise
+from converters.barracuda.lower_table import lower_graph
+from converters.barracuda.vocabulary import Activation, C, LayerType, N
+from converters.graph.nodes import Graph, Node, node_of
+from converters.graph.passes.fuse import fuse
+from converters.graph.shapes import infer_types
+from converters.graph.types import BATCH, Dim
+from converters.policy import Policy
+from signatures.errors import SignatureError
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+#: Every Barracuda from 1.0 to 3.0 reads it, and none of the later ones is read by all.
+VERSION = 16
+#: What ML-Agents calls the layout of names and constants that is written here.
+API_VERSION = 2
+
+_IMAGE: Axes = (0, 1, 2, 3)
+_IMAGE_NCHW: Axes = (0, 3, 1, 2)
+_NAMES = {Role.MASKS: "action_masks", Role.PREV_ACTION: "prev_action", Role.NOISE: "epsilon"}
+_EXTRA = {Role.VALUE: "value_estimate", Role.ACTION_PROBS: "action_probs"}
+#: What an action is called: alone, or by its kind.
+HEADS = ("action", "continuous_actions", "discrete_actions")
+#: The parts of a memory that does not say of how many it is made; ML-Agents asks for a ``_c`` and a ``_h``.
+_PARTS = ("c", "h")
+
+
+def policy_model(policy: Policy) -> NnModel:
+    """The policy as a model of version 16. Raises UnsupportedOpError, SignatureError."""
+    return _Lowering(policy).model()
+
+
+def base_name(spec: TensorSpec) -> str:
+    """An output's name without the scope of its brain, which names of the source have."""
+    return spec.name.rpartition("/")[2]
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A part of the recurrent state: its names and its size."""
+
+    taken: str
+    given: str
+    size: int
+
+
+class _Lowering:
+    def __init__(self, policy: Policy) -> None:
+        self.policy, self.signature = policy, policy.signature
+        self.graph: Graph = fuse(policy.graph, policy.fetches.values(), activations=())
+        self.inputs: list[NnInput] = []
+        self.parts = self._memory_parts()
+        self.heads = [s for s in self.signature.outputs if base_name(s) in HEADS]
+        taken = [*HEADS, *_NAMES.values(), *_EXTRA.values(), *_CONSTANTS, "vector_observation", "recurrent_in"]
+        taken += [f"visual_observation_{i}" for i in range(len(self.signature.inputs))]
+        taken += [name for part in self.parts for name in (part.taken, part.given)]
+        self.b = NnBuilder(infer_types(self.graph), taken)
+        self.outputs: list[str] = []
+
+    def model(self) -> NnModel:
+        given = self._given()
+        results = {spec.name: self._result(spec) for spec in self.signature.outputs}
+        wanted = [r for r in results.values() if r is not None]
+        memory = self.signature.memory
+        if memory is not None and memory.output is not None:
+            wanted.append(self.policy.fetches[memory.output])
+        scores = self._scores()
+        values = lower_graph(self.b, self.graph, given, [*wanted, *scores])
+        for spec in self.signature.outputs:
+            reference = results[spec.name]
+            if spec in self.heads:
+                self._action(spec, [values[r] for r in scores] if reference is None else [values[reference]])
+            elif reference is not None and spec.role in _EXTRA:
+                self._output(_EXTRA[spec.role], self._row(values[reference]))
+        if memory is not None and memory.output is not None:
+            self._memories_out(self._row(values[self.policy.fetches[memory.output]]))
+        return self._assembled()
+
+    # ------------------------------------------------------------------ inputs
+
+    def _given(self) -> dict[str, Value]:
+        """Placeholder → the input of the file that it is, or is a part of."""
+        given: dict[str, Value] = {}
+        self._vectors(given)
+        cameras = [s for s in self.signature.inputs if s.role is Role.VISUAL]
+        for number, spec in enumerate(cameras):
+            self._camera(given, number, spec)
+        for role, name in _NAMES.items():
+            for number, spec in enumerate(s for s in self.signature.inputs if s.role is role):
+                if number == 0:
+                    given[self._feed(spec)] = self._input(name, self._lengths(spec))
+                elif role is Role.NOISE:
+                    self.b.node = Node(spec.name, "Placeholder")
+                    given[self._feed(spec)] = noise(self.b, self._shape(spec))
+        self._memories_in(given)
+        return given
+
+    def _vectors(self, given: dict[str, Value]) -> None:
+        vectors = [s for s in self.signature.inputs if s.role is Role.VECTOR]
+        if not vectors:
+            return
+        widths = [self._width(s) for s in vectors]
+        whole = self._input("vector_observation", (FREE, 1, 1, sum(widths)))
+        start = 0
+        for spec, width in zip(vectors, widths, strict=True):
+            shape = self._shape(spec)
+            part = self.b.cut(whole, start, start + width, (BATCH, width))
+            given[self._feed(spec)] = reshaped(self.b, part, shape)
+            start += width
+
+    def _camera(self, given: dict[str, Value], number: int, spec: TensorSpec) -> None:
+        shape = self._shape(spec)
+        axes = _IMAGE_NCHW if self.signature.preprocess.get(spec.name, {}).get("layout") == "NCHW" else _IMAGE
+        dims = Value(shape, axes).dims
+        name = f"visual_observation_{number}"
+        self._input(name, dims)
+        given[self._feed(spec)] = self.b.made(name, shape, axes)
+
+    def _input(self, name: str, dims: Dims) -> Value:
+        """An input of the file as a tensor [B, …] whose axes lie as they do in the file."""
+        self.inputs.append(NnInput(name, dims))
+        self.b.given(name, dims)
+        return Value((BATCH, dims[C]), (N, C), (Piece(name, dims[C], 0, dims[C]),))
+
+    def _feed(self, spec: TensorSpec) -> str:
+        return node_of(self.policy.feeds[spec.name])
+
+    def _shape(self, spec: TensorSpec) -> tuple[Dim, ...]:
+        shape: list[Dim] = [BATCH if d is None and i == 0 else d or 0 for i, d in enumerate(spec.shape)]
+        if not shape or shape[0] != BATCH or 0 in shape:
+            raise self._refused(
+                spec, f"it has the shape {list(spec.shape)}", "an input has a row per agent, of a known length"
+            )
+        return tuple(shape)
+
+    def _lengths(self, spec: TensorSpec) -> Dims:
+        return FREE, 1, 1, self._width(spec)
+
+    def _width(self, spec: TensorSpec) -> int:
+        return Value(self._shape(spec)).size
+
+    def _refused(self, spec: TensorSpec, what: str, why: str) -> SignatureError:
+        return SignatureError(
+            f"{spec.name!r} ({spec.role.value}) cannot be written to a .nn: {what}",
+            why=why,
+            fix="leave nn out of --to: the other formats hold it",
+        )
+
+    # ------------------------------------------------------------------ memories
+
+    def _memory_parts(self) -> list[_Part]:
+        """The parts of the state: those that the policy names, else two halves."""
+        memory = self.signature.memory
+        if memory is None or memory.input is None:
+            return []
+        if memory.output is None:
+            raise SignatureError(
+                "the policy takes a memory and gives none, which a .nn cannot say",
+                where=self.policy.name,
+                why="the file that it was read from has lost the memory's output",
+                fix="export the file that has it, or leave nn out of --to",
+            )
+        layout = memory.layout
+        if len(layout) < 2 or memory.size % len(layout):
+            if memory.size < 2:
+                raise SignatureError(
+                    "a memory of one number cannot be written to a .nn",
+                    where=self.policy.name,
+                    why="ML-Agents asks for a memory in two parts",
+                    fix="leave nn out of --to: the other formats hold it",
+                )
+            sizes = [memory.size - memory.size // 2, memory.size // 2]
+            layout = _PARTS
+        else:
+            sizes = [memory.size // len(layout)] * len(layout)
+        parts = []
+        for number, (part, size) in enumerate(zip(layout, sizes, strict=True)):
+            group = sum(p == part for p in layout[:number])
+            suffix = f"_{group}_{part}" if group else f"_{part}"
+            parts.append(_Part(f"recurrent_in{suffix}", f"recurrent_out{suffix}", size))
+        return parts
+
+    def _memories_in(self, given: dict[str, Value]) -> None:
+        memory = self.signature.memory
+        if memory is None or memory.input is None:
+            return
+        pieces = []
+        for part in self.parts:
+            self.b.given(part.taken, (FREE, 1, 1, part.size))
+            pieces.append(Piece(part.taken, part.size, 0, part.size))
+        spec = self.signature.input(memory.input)
+        whole = Value((BATCH, memory.size), (N, C), tuple(pieces))
+        given[self._feed(spec)] = reshaped(self.b, whole, self._shape(spec))
+
+    def _memories_out(self, state: Value) -> None:
+        start = 0
+        for part in self.parts:
+            piece = self.b.cut(state, start, start + part.size, (BATCH, part.size))
+            self._name(part.given, self.b.stored(piece))
+            start += part.size
+
+    # ------------------------------------------------------------------ outputs
+
+    def _result(self, spec: TensorSpec) -> str | None:
+        """The tensor of the graph that an output of the file is made from; None: it is not written, or by scores."""
+        if spec in self.heads and spec.role is Role.SAMPLED:
+            return next(self.policy.fetches[s.name] for s in self.signature.outputs if s.role is Role.LOG_PROBS)
+        if spec in self.heads and spec.role is Role.DETERMINISTIC and self._discrete(spec):
+            return None
+        if spec in self.heads or spec.role in _EXTRA:
+            return self.policy.fetches[spec.name]
+        return None
+
+    def _discrete(self, spec: TensorSpec) -> bool:
+        name = base_name(spec)
+        return name == "discrete_actions" or (name == "action" and self.signature.action_space == "discrete")
+
+    def _scores(self) -> list[str]:
+        """Where the discrete action is the best class: the scores of each branch."""
+        for spec in self.heads:
+            if spec.role is Role.DETERMINISTIC and self._discrete(spec):
+                return _scores_behind(self.graph, self.policy.fetches[spec.name], self.b)
+        return []
+
+    def _row(self, value: Value) -> Value:
+        """A tensor as [B, size]."""
+        if value.array is not None:
+            shape: tuple[Dim, ...] = (BATCH, value.size)
+            return written(self.b, Value(shape, array=value.array.reshape(1, -1)), (N, C))
+        value = self.b.settled(value)
+        flat = reshaped(self.b, value, (BATCH, value.size)) if value.shape != (BATCH, value.size) else value
+        return self.b.settled(flat)
+
+    def _action(self, spec: TensorSpec, values: Sequence[Value]) -> None:
+        b = self.b
+        b.node = Node(base_name(spec), "Identity")
+        rows = [self._row(v) for v in values]
+        if not self._discrete(spec):
+            self._output(base_name(spec), rows[0])
+            return
+        if spec.role is Role.DETERMINISTIC:
+            best = [best_score(b, b.stored(r), r.size, f"branch_{i}") for i, r in enumerate(rows)]
+            rows = [b.made(name, r.shape, r.axes) for name, r in zip(best, rows, strict=True)]
+        width = sum(r.size for r in rows)
+        row = joined(b, rows, 1, (BATCH, width))
+        if spec.role is Role.PROBS:
+            row = b.made(b.activation(Activation.LOG, b.stored(row), label="log"), row.shape, row.axes)
+        if not any(s.role is Role.MASKS for s in self.signature.inputs):
+            masks = b.stored(self._input("action_masks", (FREE, 1, 1, width)))
+            forbidden = b.scaled(b.shifted(masks, -1, "masks/forbidden"), -FORBIDDEN, "masks/scores")
+            row = b.made(b.two(LayerType.ADD, b.stored(row), forbidden, "masked"), row.shape, row.axes)
+        self._output(base_name(spec), row)
+
+    def _output(self, name: str, row: Value) -> None:
+        self._name(name, self.b.stored(row))
+        self.outputs.append(name)
+
+    def _name(self, name: str, tensor: str) -> None:
+        """A linear activation called ``name``, as the trainers' converter ends an output."""
+        b = self.b
+        b.drafts.append(Draft(name, LayerType.ACTIVATION, (tensor,)))
+
+    # ------------------------------------------------------------------ the file
+
+    def _constants(self) -> dict[str, float]:
+        """What ML-Agents reads before it runs the model."""
+        widths = {base_name(s): self._head_width(s) for s in self.heads}
+        constants: dict[str, float] = {
+            "version_number": API_VERSION,
+            "memory_size": sum(p.size for p in self.parts),
+        }
+        if self.signature.action_space == "hybrid":
+            constants["continuous_action_output_shape"] = widths["continuous_actions"]
+            constants["discrete_action_output_shape"] = widths["discrete_actions"]
+        else:
+            constants["is_continuous_control"] = float(self.signature.action_space == "continuous")
+            constants["action_output_shape"] = widths[base_name(self.heads[0])]
+        return constants
+
+    def _head_width(self, spec: TensorSpec) -> int:
+        draft = next(d for d in self.b.drafts if d.name == base_name(spec))
+        return self.b.dims_of(draft.inputs[0])[C]
+
+    def _assembled(self) -> NnModel:
+        for name, number in self._constants().items():
+            self.b.constant(np.full((1, 1, 1, 1), number, np.float32), name)
+        ends = {*self.outputs, *(p.given for p in self.parts)}
+        drafts = _needed(self.b.drafts, ends | set(_CONSTANTS))
+        drafts = _renamed(drafts, ends)
+        drafts.sort(key=lambda d: d.type != LayerType.LOAD)  # constants first; sorting keeps the order otherwise
+        layers, weights, offset = [], [], 0
+        for draft in drafts:
+            datasets = []
+            for name, array in draft.data:
+                datasets.append(Dataset(name, tuple(array.shape), offset, 4, array.size))
+                weights.append(array.reshape(-1))
+                offset += array.size
+            layers.append(
+                Layer(
+                    draft.name, int(draft.type), int(draft.activation), draft.pad, draft.stride, draft.pool, draft.axis,
+                    draft.alpha, draft.beta, draft.inputs, tuple(datasets),
+                )
+            )  # fmt: skip
+        used = {name for layer in layers for name in layer.inputs}
+        return NnModel(
+            VERSION,
+            tuple(i for i in self.inputs if i.name in used),
+            tuple(self.outputs),
+            tuple(NnMemory((1, 1, 1, p.size), p.taken, p.given) for p in self.parts),
+            tuple(layers),
+            np.concatenate(weights) if weights else np.zeros(0, np.float32),
+        )
+
+
+_CONSTANTS = (
+    "version_number",
+    "memory_size",
+    "is_continuous_control",
+    "action_output_shape",
+    "continuous_action_output_shape",
+    "discrete_action_output_shape",
+)
+
+
+def _needed(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
+    """The layers that something in ``roots`` depends on, in their order."""
+    needed = set(roots)
+    kept = []
+    for draft in reversed(drafts):
+        if draft.name in needed:
+            needed.update(draft.inputs)
+            kept.append(draft)
+    return kept[::-1]
+
+
+def _renamed(drafts: Sequence[Draft], ends: set[str]) -> list[Draft]:
+    """Linear activations at the end give their name to the layer before them, where nothing else reads that."""
+    readers: dict[str, int] = {}
+    for draft in drafts:
+        for name in draft.inputs:
+            readers[name] = readers.get(name, 0) + 1
+    made = {d.name: d for d in drafts}
+    names: dict[str, str] = {}
+    for draft in drafts:
+        if draft.name not in ends or draft.type != LayerType.ACTIVATION or draft.activation != Activation.NONE:
+            continue
+        before = made.get(draft.inputs[0])
+        if (
+            before is not None
+            and before.type != LayerType.LOAD
+            and before.name not in ends
+            and before.name not in names
+        ):
+            names[before.name] = draft.name
+    swallowed = set(names.values())
+    return [
+        replace(d, name=names.get(d.name, d.name), inputs=tuple(names.get(i, i) for i in d.inputs))
+        for d in drafts
+        if d.name not in swallowed
+    ]
+
+
+_PASSED = ("Reshape", "Cast", "Identity", "ExpandDims", "Squeeze")
+
+
+def _scores_behind(graph: Graph, reference: str, b: NnBuilder) -> list[str]:
+    """The scores that an action is the ArgMax of, branch by branch.
+
+    Raises UnsupportedOpError where it is computed some other way.
+    """
+    node = graph.producer(reference)
+    if node.op in _PASSED:
+        return _scores_behind(graph, node.inputs[0], b)
+    if node.op in ("ConcatV2", "Pack"):
+        branches = node.inputs[:-1] if node.op == "ConcatV2" else node.inputs
+        return [scores for branch in branches for scores in _scores_behind(graph, branch, b)]
+    if node.op == "ArgMax" and len(b.type_of(node.inputs[0]).shape or ()) == 2:
+        return [node.inputs[0]]
+    b.node = node
+    raise b.refused(
+        "the action is a class, and is not the largest of some scores",
+        "ML-Agents of these years takes a score for every class and chooses by itself",
+    )

@@ -1,0 +1,139 @@
+"""Every op of the table as layers: what they compute by the format's rules, and what cannot be written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from converters.barracuda.lower import policy_model
+from converters.graph.nodes import Graph, TensorShape
+from converters.graph.ops.table import TABLE
+from converters.graph.run import run_graph
+from converters.policy import Policy
+from signatures.errors import UnsupportedOpError
+from signatures.roles import Role
+from signatures.spec import PolicySignature, TensorSpec
+from tests.barracuda.cases import Case, all_cases
+from tests.barracuda.nn_running import answered, some, wanted
+from tests.barracuda.nn_safety import assert_safe
+from tests.barracuda.test_layers import feeds_of, policy_of
+from tests.graph.samples import SAMPLES, Sample
+
+CLOSE = {"atol": 3e-5, "rtol": 3e-5}
+
+
+# ------------------------------------------------------------------ the table of ops
+
+
+def as_policy(sample: Sample) -> Policy | None:
+    """A sample's graph as a policy; None where it is none: a batch is missing, or an input has no fixed width.
+
+    Vectors are fed to ``vector_observation``, images to cameras; its results, flattened, are the action.
+    """
+    specs = []
+    nodes = []
+    for node in sample.graph.nodes:
+        if node.op != "Placeholder":
+            nodes.append(node)
+            continue
+        array = sample.feeds[node.name]
+        dims: TensorShape = node.attrs["shape"]
+        if dims.dims is None or not dims.dims or dims.dims[0] is not None or None in dims.dims[1:] or array.ndim > 4:
+            return None
+        role = Role.VISUAL if array.ndim == 4 else Role.VECTOR
+        specs.append(TensorSpec(node.name, role, array.dtype.name, dims.dims))
+        nodes.append(node)
+    if not specs:
+        return None
+    types = run_graph(sample.graph, sample.feeds, sample.fetches)
+    outputs, fetches = [], {}
+    for number, name in enumerate(sample.fetches):
+        array = types[name]
+        if array.ndim == 0 or len(array) != len(next(iter(sample.feeds.values()))):
+            return None
+        output = "action" if number == 0 else f"extra_{number}"
+        outputs.append(
+            TensorSpec(
+                output, Role.CONTINUOUS if number == 0 else Role.OTHER, array.dtype.name, (None, *array.shape[1:])
+            )
+        )
+        fetches[output] = name
+    signature = PolicySignature(tuple(specs), tuple(outputs), "test", "continuous")
+    return Policy("sample", Graph(tuple(nodes)), signature, {s.name: s.name for s in specs}, fetches)
+
+
+#: Op → the titles of its samples that version 16 cannot hold, or that not every Barracuda computes.
+REFUSALS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("Sin", "Cos", "Tan"), ("matrix", "rank 4")),
+    **dict.fromkeys(("ArgMax", "ArgMin"), ("last axis", "negative axis, int32", "ties", "int32 scores")),
+    **dict.fromkeys(("Prod", "Min"), ("vector of an axis", "scalar axis, kept")),
+    **dict.fromkeys(("Softmax", "LogSoftmax"), ("rank 3",)),
+    "BatchMatMul": ("rank 3", "adj_x", "adj_y, rank 4"),
+    "Shape": ("int64",),
+    "StridedSlice": ("x[:, 2:2]",),
+    "Gather": ("int64 matrix of indices",),
+    "GatherV2": ("negative axis",),
+    "OneHot": ("axis 1 of 3",),
+}
+
+#: (op, title) → why the layers give something else: the rules are float64 here, and numbers of no policy are fed.
+DIFFERS: Mapping[tuple[str, str], str] = {
+    ("FloorDiv", "float32, near an integer"): "1 / 0.1 is 10 in float32 and a little less in the test's float64",
+    ("LogSoftmax", "large"): "the rules take the logarithm of the softmax, whose smallest numbers are 0",
+    ("ZerosLike", "float32"): "a row of constants is an input times 0, and NaN is fed",
+    ("OnesLike", "float32"): "as ZerosLike",
+}
+
+
+@pytest.mark.parametrize("op", TABLE)
+def test_an_op_computes_the_same_as_layers_or_is_refused_by_name(op: str) -> None:
+    refused = []
+    for sample in (s for s in SAMPLES if s.op == op and not s.drawn):
+        policy = as_policy(sample)
+        if policy is None:
+            continue
+        try:
+            model = policy_model(policy)
+        except UnsupportedOpError as error:
+            assert list(error.issues) == [("op", op)]
+            assert error.why
+            assert error.fix
+            refused.append(sample.title)
+            continue
+        reference = policy.fetches["action"]
+        expected = run_graph(sample.graph, sample.feeds, [reference])[reference]
+        with np.errstate(all="ignore"):
+            got = answered(policy, model, sample.feeds)["action"].astype(np.float32)
+            same = np.allclose(got, expected.astype(np.float32).reshape(got.shape), **CLOSE, equal_nan=True)
+        assert same != ((op, sample.title) in DIFFERS), f"{sample.title}: {got} for {expected}"
+    assert tuple(refused) == REFUSALS.get(op, ())
+
+
+# ------------------------------------------------------------------ the layers that are read
+
+
+#: Cases that are not written again: their layers (or what becomes of them in a graph) are none of every Barracuda's,
+#: or they have an input that ML-Agents does not feed.
+UNWRITTEN = (
+    "Sin", "Cos", "Tan", "ArgMax", "ArgMin", "BatchMatMul", "MatMul", "Prod", "Min", "Reshape", "GatherV2",
+    "Placeholder",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, id=c.name) for c in all_cases()])
+def test_a_layer_that_is_read_is_written_again_as_what_it_computes(case: Case) -> None:
+    policy = policy_of(case)
+    try:
+        model = policy_model(policy)
+    except UnsupportedOpError as error:
+        assert error.issues[0][1] in UNWRITTEN, str(error)
+        return
+    assert_safe(model)
+    for rows in (1, 3):
+        feeds = some(policy, rows)
+        feeds = {n: np.resize(feeds_of(case, policy)[n], a.shape).astype(a.dtype) for n, a in feeds.items()}
+        expected = wanted(policy, run_graph(policy.graph, feeds, ["action", "deterministic_action"]))
+        got = answered(policy, model, feeds)
+        np.testing.assert_allclose(got["action"], expected["action"], **CLOSE)
