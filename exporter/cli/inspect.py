@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from exporter.cli.options import shapes, understanding
+from signatures.errors import UsageError
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
@@ -20,18 +22,38 @@ if TYPE_CHECKING:
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
 @click.option("--svg", type=click.Path(path_type=Path), metavar="FILE", help="Write a picture of the policy.")
-@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
+@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,3x84x84.")
+@click.option(
+    "--unity", "releases", multiple=True, metavar="RELEASE", help="What Unity says to it: R20, R22, R23, R23-2.4, all."
+)
+@click.option("--actions", default="", metavar="KINDS", help="With --unity: continuous:2, discrete:3,2, or both by +.")
+@click.option(
+    "--brain-parameters",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="With --unity: the agent's sensors and actions, as JSON.",
+)
 @understanding
 def inspect_command(
     source: Path,
     step: int | None,
     sensors: str,
+    releases: tuple[str, ...],
+    actions: str,
+    brain_parameters: Path | None,
     as_json: bool,
     logdir: Path | None,
     svg: Path | None,
     compiling: CompileOptions,
 ) -> None:
-    """Show what is in a file: generation, brains, inputs and what to feed, outputs, ops, targets."""
+    """Show what is in a file: generation, brains, inputs and what to feed, outputs, ops, targets.
+
+    With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
+    """
+    if releases:
+        sys.exit(_unity(source, releases, sensors, actions, brain_parameters, as_json))
+    if actions or brain_parameters is not None:
+        raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
     from converters.source import ReadOptions
     from exporter.inspect.inspection import inspect_source, inspection_text
 
@@ -49,3 +71,13 @@ def inspect_command(
     for path in written:
         click.echo(f"wrote {path}")
     click.echo(f"next: export-model {source}{'' if step is None else f' --step {step}'} -o exported")
+
+
+def _unity(
+    source: Path, releases: tuple[str, ...], sensors: str, actions: str, parameters: Path | None, as_json: bool
+) -> int:
+    from exporter.inspect.unity import accepted, check_for_unity, unity_report, unity_text
+
+    verdicts = check_for_unity(source, releases, sensors, actions, parameters)
+    click.echo(json.dumps(unity_report(verdicts), indent=1) if as_json else unity_text(verdicts))
+    return 0 if accepted(verdicts) else 1

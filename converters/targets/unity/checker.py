@@ -11,10 +11,12 @@ from converters.barracuda import format as nn_format
 from converters.fetch import Fetched, read_bytes
 from converters.recognise import recognised
 from converters.targets.unity import barracuda_model, importing, rules, sentis_model, trial_run
+from converters.targets.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
 from converters.targets.unity.consumers import Consumer, Engine
 from converters.targets.unity.findings import Finding, Thrown, UnityThrows
 from converters.targets.unity.model import CheckedModel
 from converters.targets.unity.onnx_file import OnnxFile, read_onnx_file
+from converters.targets.unity.overlooked import overlooked
 from converters.targets.unity.settings import Brain
 from signatures.errors import SourceError
 
@@ -57,13 +59,19 @@ class ModeVerdict:
 
 @dataclass(frozen=True, slots=True)
 class UnityVerdict:
-    """What one release says to one file with one set of Behavior Parameters."""
+    """What one release says to one file with one set of Behavior Parameters.
+
+    ``refused`` is what the import throws; ``modes`` is empty then. ``overlooked`` is what Unity does not say and a
+    player trips over. ``assumed``: nobody gave the parameters, they were taken from the file.
+    """
 
     path: Path
     consumer: Consumer
     brain: Brain
     refused: Thrown | None
     modes: Mapping[str, ModeVerdict] = field(default_factory=dict)
+    overlooked: tuple[Finding, ...] = ()
+    assumed: bool = False
 
     @property
     def accepted(self) -> Mapping[str, bool]:
@@ -77,14 +85,19 @@ class UnityVerdict:
             "package": self.consumer.package,
             "runtime": self.consumer.runtime,
             "brain": self.brain.to_dict(),
+            "brain_assumed": self.assumed,
             "accepted": dict(self.accepted),
             "import": None if self.refused is None else self.refused.to_dict(),
             **{mode: verdict.to_dict() for mode, verdict in self.modes.items()},
+            "overlooked": [f.to_dict() for f in self.overlooked],
         }
 
 
-def check_file(path: Path, consumer: Consumer, brain: Brain) -> UnityVerdict:
-    """Hold a file against the rules of a release. Raises SourceError, DamagedFileError for a file that is neither."""
+def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> UnityVerdict:
+    """Hold a file against the rules of a release; without ``brain``, with the agent that it seems made for.
+
+    Raises SourceError for a file that is neither ONNX nor ``.nn``, DamagedFileError for one that cannot be read.
+    """
     kind = recognised(Fetched(path)).key
     if kind == "nn" or (path.suffix.lower() == ".nn" and kind != "onnx"):
         return _check_nn(path, consumer, brain)
@@ -98,40 +111,45 @@ def check_file(path: Path, consumer: Consumer, brain: Brain) -> UnityVerdict:
     file = read_onnx_file(path)
     refused = importing.refusal(file, consumer)
     if refused is not None:
-        return UnityVerdict(path, consumer, brain, refused)
+        return UnityVerdict(path, consumer, brain or Brain(), refused, assumed=brain is None)
+    model: CheckedModel
     if consumer.engine is Engine.BARRACUDA:
-        return _verdict(path, consumer, brain, barracuda_model.of_onnx(file))
-    return _verdict(path, consumer, brain, sentis_model.of_onnx(file, consumer), file)
+        model = barracuda_model.of_onnx(file)
+    else:
+        model = sentis_model.of_onnx(file, consumer)
+    agent = brain or assumed_brain(model, onnx_ranks(file, model))
+    modes = {name: _mode(model, consumer, agent, deterministic, file) for name, deterministic in MODES.items()}
+    unsaid = overlooked(model, agent, _fetched(modes), _silent(modes), consumer, file)
+    return UnityVerdict(path, consumer, agent, None, modes, unsaid, brain is None)
 
 
-def _check_nn(path: Path, consumer: Consumer, brain: Brain) -> UnityVerdict:
-    if consumer.engine is not Engine.BARRACUDA:
-        thrown = Thrown(
-            "no importer",
-            f"{consumer.runtime} does not read .nn",
-            str(path),
-            f"export it with --for {consumer.profile}",
-            worded=False,
-        )
-        return UnityVerdict(path, consumer, brain, thrown)
+def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:
     data = read_bytes(path)
     version = int.from_bytes(data[:8], "little", signed=True) % _MAGIC
-    if version not in _NN_FORMATS:
-        thrown = Thrown(
-            "NotSupportedException",
-            f"Format version not supported: {version}",
-            str(path),
-            "export it with --to nn, or with --for barracuda-3: both write a version that is read",
-        )
-        return UnityVerdict(path, consumer, brain, thrown)
-    return _verdict(path, consumer, brain, barracuda_model.of_nn(nn_format.parse(data)))
+    refused = None
+    if consumer.engine is not Engine.BARRACUDA:
+        text, fix = f"{consumer.runtime} does not read .nn", f"export it with --for {consumer.profile}"
+        refused = Thrown("no importer", text, str(path), fix, worded=False)
+    elif version not in _NN_FORMATS:
+        fix = "export it with --to nn, or with --for barracuda-3: both write a version that is read"
+        refused = Thrown("NotSupportedException", f"Format version not supported: {version}", str(path), fix)
+    if refused is not None:
+        return UnityVerdict(path, consumer, brain or Brain(), refused, assumed=brain is None)
+    parsed = nn_format.parse(data)
+    model = barracuda_model.of_nn(parsed)
+    agent = brain or assumed_brain(model, nn_ranks(parsed))
+    modes = {name: _mode(model, consumer, agent, deterministic, None) for name, deterministic in MODES.items()}
+    unsaid = overlooked(model, agent, _fetched(modes), _silent(modes), consumer)
+    return UnityVerdict(path, consumer, agent, None, modes, unsaid, brain is None)
 
 
-def _verdict(
-    path: Path, consumer: Consumer, brain: Brain, model: CheckedModel, file: OnnxFile | None = None
-) -> UnityVerdict:
-    modes = {name: _mode(model, consumer, brain, deterministic, file) for name, deterministic in MODES.items()}
-    return UnityVerdict(path, consumer, brain, None, modes)
+def _fetched(modes: Mapping[str, ModeVerdict]) -> dict[str, tuple[str, ...] | Thrown]:
+    """What a player fetches, of the modes in which it gets so far: past loading."""
+    return {name: mode.fetched for name, mode in modes.items() if mode.load is None}
+
+
+def _silent(modes: Mapping[str, ModeVerdict]) -> list[str]:
+    return [name for name, mode in modes.items() if mode.accepted]
 
 
 def _mode(

@@ -93,6 +93,18 @@ def sensors_of(shapes: Sequence[Sequence[int]]) -> tuple[Sensor, ...]:
     return tuple(found)
 
 
+def parse_sensors(text: str) -> tuple[Sensor, ...]:
+    """``"8,20x4,3x84x84"`` as a vector, a BufferSensor and a camera (C, H, W). Raises UsageError."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    for part in parts:
+        if not re.fullmatch("[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}){0,2}", part):
+            raise UsageError(
+                f"--sensors {text}: {part} is no shape of a sensor",
+                fix="one shape per sensor: 8 for a vector, 20x4 for a BufferSensor, 3x84x84 (C, H, W) for a camera",
+            )
+    return sensors_of([[int(n) for n in part.split("x")] for part in parts])
+
+
 def parse_actions(text: str) -> tuple[int, tuple[int, ...]]:
     """``"continuous:2+discrete:3,2"`` as (continuous actions, branch sizes). Raises UsageError."""
     continuous = 0

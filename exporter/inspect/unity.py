@@ -1,0 +1,154 @@
+"""``inspect --unity``: what Unity would say to a file, for the terminal."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from converters.targets.unity.checker import ModeVerdict, UnityVerdict, check_file
+from converters.targets.unity.consumers import CONSUMERS, consumer
+from converters.targets.unity.findings import Finding, Thrown
+from converters.targets.unity.settings import Brain, parse_actions, parse_sensors, read_brain
+from signatures.errors import UsageError
+
+_MODES = {"stochastic": "Deterministic Inference off", "deterministic": "Deterministic Inference on"}
+_READ = (".onnx", ".nn")
+_WIDTH = 110
+
+
+def check_for_unity(
+    source: Path, releases: Sequence[str], sensors: str = "", actions: str = "", brain: Path | None = None
+) -> list[UnityVerdict]:
+    """Hold a file (or the ``.onnx`` and ``.nn`` of a folder) against every release that is named, or ``all``.
+
+    Raises UsageError for options that contradict each other, SourceError for what is no model of Unity's.
+    """
+    names = [name.strip() for given in releases for name in given.split(",") if name.strip()]
+    wanted = list(CONSUMERS.values()) if "all" in names else [consumer(name) for name in names]
+    agent = _agent(sensors, actions, brain)
+    return [check_file(path, release, agent) for path in _files(source) for release in dict.fromkeys(wanted)]
+
+
+def accepted(verdicts: Sequence[UnityVerdict]) -> bool:
+    """Whether every file is accepted by every release with Deterministic Inference off."""
+    return all(verdict.accepted["stochastic"] for verdict in verdicts)
+
+
+def unity_report(verdicts: Sequence[UnityVerdict]) -> dict[str, Any]:
+    """For ``--json``."""
+    return {
+        "schema": 1,
+        "accepted": accepted(verdicts),
+        "verdicts": [{"path": str(verdict.path), **verdict.to_dict()} for verdict in verdicts],
+    }
+
+
+def unity_text(verdicts: Sequence[UnityVerdict]) -> str:
+    """For the terminal."""
+    return "\n\n".join(_verdict_text(verdict) for verdict in verdicts)
+
+
+def _agent(sensors: str, actions: str, brain: Path | None) -> Brain | None:
+    if brain is not None and (sensors or actions):
+        raise UsageError(
+            "--brain-parameters says what --sensors and --actions say", fix="give the file, or the two options"
+        )
+    if brain is not None:
+        return read_brain(brain)
+    if not sensors and not actions:
+        return None
+    if not sensors or not actions:
+        raise UsageError(
+            "--sensors and --actions are given together",
+            why="the checks compare both",
+            fix="for example --sensors 8,3x84x84 --actions continuous:2; without either, the file's own are taken",
+        )
+    continuous, branches = parse_actions(actions)
+    sensed = parse_sensors(sensors)
+    size = sum(sensor.shape[0] for sensor in sensed if len(sensor.shape) == 1)
+    return Brain(continuous, branches, size, 1, sensed)
+
+
+def _files(source: Path) -> list[Path]:
+    found = sorted(p for p in source.iterdir() if p.suffix.lower() in _READ) if source.is_dir() else [source]
+    if not found:
+        raise UsageError(f"{source} holds no .onnx and no .nn", fix="export one with --for unity6")
+    return found
+
+
+# ------------------------------------------------------------------ text
+
+
+def _verdict_text(verdict: UnityVerdict) -> str:
+    lines = [f"{verdict.path}: {_summary(verdict)} by {verdict.consumer.title}"]
+    if verdict.refused is not None:
+        lines += ["  importing it:", *_thrown_lines(verdict.refused)]
+    else:
+        lines += [f"  the agent{' (assumed from the file)' if verdict.assumed else ''}: {_agent_text(verdict.brain)}"]
+        same = len({_outcome(m) for m in verdict.modes.values()}) == 1
+        for mode, found in list(verdict.modes.items())[: 1 if same else None]:
+            lines += _mode_lines("" if same else f", {_MODES[mode]}", found)
+    if verdict.overlooked:
+        lines.append("  what Unity does not say:")
+        lines += [line for finding in verdict.overlooked for line in _finding_lines(finding, "in play")]
+    return "\n".join(lines)
+
+
+def _summary(verdict: UnityVerdict) -> str:
+    yes = [_MODES[mode] for mode, said in verdict.accepted.items() if said]
+    return "accepted" if len(yes) == len(_MODES) else f"accepted with {yes[0]} only" if yes else "not accepted"
+
+
+def _outcome(found: ModeVerdict) -> tuple[Any, ...]:
+    return found.load, found.checks, found.check_throws
+
+
+def _mode_lines(title: str, found: ModeVerdict) -> list[str]:
+    lines = [f"  loading for running{title}: {'ok' if found.load is None else ''}".rstrip()]
+    if found.load is not None:
+        lines += _thrown_lines(found.load)
+    if found.check_throws is not None and found.check_throws == found.load:
+        return [*lines, f"  the Inspector{title}: the same exception in place of a list"]
+    listed = [line for finding in found.checks for line in _finding_lines(finding, finding.severity.value)]
+    if found.check_throws is not None:
+        listed = _thrown_lines(found.check_throws)
+    return [*lines, f"  the Inspector{title}: {'' if listed else 'nothing to say'}".rstrip(), *listed]
+
+
+def _finding_lines(finding: Finding, kind: str) -> list[str]:
+    return [
+        *_wrapped(f"{kind}: ", finding.message),
+        *_wrapped("  where: ", finding.where),
+        *_wrapped("  fix: ", finding.fix),
+    ]
+
+
+def _thrown_lines(thrown: Thrown) -> list[str]:
+    return [
+        *_wrapped(f"throws {thrown.exception}: ", thrown.message),
+        *_wrapped("  where: ", thrown.where),
+        *_wrapped("  fix: ", thrown.fix),
+    ]
+
+
+def _wrapped(head: str, text: str) -> list[str]:
+    lines = []
+    for number, part in enumerate(text.rstrip("\n").split("\n")):
+        lines += textwrap.wrap(
+            (head if number == 0 else " " * 4) + part,
+            _WIDTH,
+            initial_indent="    ",
+            subsequent_indent=" " * 8,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    return lines
+
+
+def _agent_text(brain: Brain) -> str:
+    actions = [f"{brain.continuous} continuous"] if brain.continuous else []
+    actions += [f"branches {', '.join(map(str, brain.branches))}"] if brain.branches else []
+    sensors = [f"{s.name} {'x'.join(map(str, s.shape))}" for s in brain.sensors]
+    return f"actions {' and '.join(actions) or 'none'}; sensors {', '.join(sensors) or 'none'}"

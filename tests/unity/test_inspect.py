@@ -1,0 +1,152 @@
+"""``inspect --unity`` at the command line: text, JSON, exit status, the agent from options, a file or the model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from onnx import TensorProto, helper
+
+from converters.targets.unity.checker import check_file
+from converters.targets.unity.consumers import CONSUMERS
+from converters.targets.unity.settings import Brain, sensors_of
+from exporter.cli.app import app
+from signatures.errors import UsageError
+from tests.unity.policies import Draft
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["inspect", *map(str, arguments)])
+
+
+def in_play(path: Path, release: str = "R22", brain: Brain | None = None) -> list[str]:
+    return [finding.message for finding in check_file(path, CONSUMERS[release], brain).overlooked]
+
+
+def test_an_accepted_policy_has_status_0_and_nothing_to_say(tmp_path: Path) -> None:
+    result = run(Draft().write(tmp_path), "--unity", "all")
+    assert result.exit_code == 0
+    assert result.output.count("the Inspector: nothing to say") == len(CONSUMERS)
+    assert "the agent (assumed from the file): actions 2 continuous; sensors VectorSensor_size5 5" in result.output
+
+
+def test_a_message_is_shown_with_its_place_and_what_mends_it(tmp_path: Path) -> None:
+    result = run(Draft().write(tmp_path), "--unity", "r20", "--sensors", "7", "--actions", "continuous:2")
+    assert result.exit_code == 1
+    assert "was expecting\n        [?x5] for the VectorSensor_size7 Sensor." in result.output
+    assert "where: input obs_0" in result.output and "fix: the sensor gives 7" in result.output
+
+
+def test_the_two_modes_are_shown_apart_where_they_differ(tmp_path: Path) -> None:
+    result = run(Draft(actions={"continuous_actions": 2}).write(tmp_path), "--unity", "R22,R23")
+    assert result.exit_code == 0
+    assert result.output.count("accepted with Deterministic Inference off only") == 2
+    assert "the Inspector, Deterministic Inference on:" in result.output
+
+
+def test_json_has_the_list_and_the_exceptions(tmp_path: Path) -> None:
+    path = Draft(types={"version_number": np.int64}).write(tmp_path)
+    result = run(path, "--unity", "R20", "--unity", "R22", "--json")
+    found: dict[str, Any] = json.loads(result.output)
+    assert (found["schema"], found["accepted"], result.exit_code) == (1, False, 1)
+    first, second = found["verdicts"]
+    assert first["accepted"] == {"stochastic": True, "deterministic": True} and first["import"] is None
+    assert second["stochastic"]["load"]["exception"] == "InvalidCastException"
+    assert second["stochastic"]["check_throws"] == second["stochastic"]["load"]
+    assert first["brain"]["sensors"] == [{"type": "VectorSensor", "name": "VectorSensor_size5", "shape": [5]}]
+
+
+def test_behavior_parameters_come_from_a_file_too(tmp_path: Path) -> None:
+    parameters = tmp_path / "brain.json"
+    parameters.write_text(json.dumps({"continuous": 2, "sensors": [{"type": "Eyes", "name": "Left", "shape": [6]}]}))
+    result = run(Draft().write(tmp_path), "--unity", "R22", "--brain-parameters", parameters)
+    assert "for the Left Sensor" in result.output and "the agent: actions 2 continuous; sensors Left 6" in result.output
+
+
+def test_a_folder_is_checked_file_by_file(tmp_path: Path) -> None:
+    Draft().write(tmp_path, "one.onnx")
+    Draft(constants={}).write(tmp_path, "two.onnx")
+    found = json.loads(run(tmp_path, "--unity", "R22", "--json").output)
+    assert [v["accepted"]["stochastic"] for v in found["verdicts"]] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--unity", "R19"],
+        ["--unity", "R22", "--sensors", "8"],
+        ["--unity", "R22", "--sensors", "1x2x3x4", "--actions", "continuous:1"],
+        ["--unity", "R22", "--sensors", "8", "--actions", "2"],
+        ["--actions", "continuous:2"],
+    ],
+)
+def test_options_that_say_nothing_are_refused(tmp_path: Path, options: list[str]) -> None:
+    result = run(Draft().write(tmp_path), *options)
+    assert isinstance(result.exception, UsageError)
+
+
+# ------------------------------------------------------------------ what Unity does not say
+
+
+def test_an_output_that_only_resembles_the_name_is_missed_in_play(tmp_path: Path) -> None:
+    path = Draft(actions={"Brain/continuous_actions": 2}).write(tmp_path)
+    assert check_file(path, CONSUMERS["R22"]).accepted["stochastic"]
+    assert in_play(path) == ["a player fetches the output continuous_actions, which the file does not have"]
+
+
+def test_a_memory_without_its_output_is_missed_in_play(tmp_path: Path) -> None:
+    draft = Draft()
+    draft.inputs["recurrent_in"] = (TensorProto.FLOAT, ["N", 1, 8])
+    draft.constants["memory_size"] = 16.0
+    found = in_play(draft.write(tmp_path))
+    assert "a player fetches the output recurrent_out, which the file does not have" in found
+    assert "recurrent_in is [N, 1, 8], and a memory of memory_size 16 is carried as [N, 1, 16]" in found
+
+
+def test_widths_are_compared_with_the_constants(tmp_path: Path) -> None:
+    path = Draft(actions={"continuous_actions": 3, "deterministic_continuous_actions": 2}).write(tmp_path)
+    assert check_file(path, CONSUMERS["R20"]).accepted["stochastic"]
+    assert in_play(path, "R20") == ["the output continuous_actions has 3 columns, and the file's constant says 2"]
+
+
+def test_a_mask_of_another_width_and_a_fixed_batch_are_told(tmp_path: Path) -> None:
+    draft = Draft(
+        {"obs_0": (TensorProto.FLOAT, [4, 5]), "action_masks": (TensorProto.FLOAT, ["N", 6])},
+        {"discrete_actions": 2},
+        {"version_number": 3.0, "memory_size": 0.0, "discrete_action_output_shape": [3.0, 2.0]},
+    )
+    found = in_play(draft.write(tmp_path), brain=Brain(0, (3, 2), sensors=sensors_of([[5]])))
+    assert "action_masks has 6 columns, and the branches together 5" in found
+    assert "obs_0 is declared for 4 agents, and a player feeds as many as decide at once" in found
+    assert any(text.startswith("the output discrete_actions is given out as floats") for text in found)
+
+
+def test_actions_of_a_kind_that_is_not_fetched_are_told(tmp_path: Path) -> None:
+    draft = Draft(
+        {"obs_0": (TensorProto.FLOAT, ["N", 5])},
+        {"discrete_actions": 1},
+        {
+            "version_number": 3.0,
+            "memory_size": 0.0,
+            "discrete_action_output_shape": [3.0],
+            "continuous_action_output_shape": 2.0,
+        },
+    )
+    draft.inputs["action_masks"] = (TensorProto.FLOAT, ["N", 3])
+    path = draft.write(tmp_path)
+    assert check_file(path, CONSUMERS["R20"]).accepted["stochastic"]
+    told = "no continuous_actions are fetched (stochastic inference), and the agent has some: they stay 0"
+    assert told in in_play(path, "R20")
+
+
+def test_a_square_camera_in_tensorflows_order_is_taken_for_a_camera(tmp_path: Path) -> None:
+    draft = Draft(inputs={"obs_1": (TensorProto.FLOAT, ["N", 5]), "obs_0": (TensorProto.FLOAT, ["N", 24, 24, 3])})
+    node = helper.make_node("Transpose", ["obs_0"], ["nchw"], perm=[0, 3, 1, 2])
+    draft.extra.append(node)
+    verdict = check_file(draft.write(tmp_path), CONSUMERS["R22"])
+    assert [s.shape for s in verdict.brain.sensors] == [(3, 24, 24), (5,)]
+    assert not verdict.accepted["stochastic"]
