@@ -68,8 +68,9 @@ class SourceModel:
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
     """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
-    order, images C, H, W (empty: as far as the source tells).
+    order, images C, H, W (empty: as far as the source tells); whether a source may be loaded that runs what it says.
     """
 
     step: int | None = None
     sensors: tuple[tuple[int, ...], ...] = ()
+    trust_source: bool = False

@@ -75,6 +75,7 @@ def export_model(
     values: Mapping[str, float] | None = None,
     step: int | None = None,
     sensors: Sequence[Sequence[int]] = (),
+    trust_source: bool = False,
     opset: int = 15,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
@@ -96,7 +97,7 @@ def export_model(
         tuple(t for t in to.split(",") if t) if isinstance(to, str) else tuple(to),
         name,
         _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
-        ReadOptions(step, tuple(tuple(s) for s in sensors)),
+        ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source),
         opset,
         verify,
         parity or VerifyOptions(),
@@ -146,6 +147,7 @@ def inspect_model(
     values: Mapping[str, float] | None = None,
     step: int | None = None,
     sensors: Sequence[Sequence[int]] = (),
+    trust_source: bool = False,
 ) -> Inspection:
     """What is in a source: its policies with their signatures. Raises ExportModelError.
 
@@ -153,7 +155,7 @@ def inspect_model(
     shapes that a ``.pt`` does not tell.
     """
     options = _compile_options("canonical", "lift", False, brain, inputs, outputs, values)
-    return inspect_source(source, options, ReadOptions(step, tuple(tuple(s) for s in sensors)))
+    return inspect_source(source, options, ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source))
 
 
 def verify_bundle(
@@ -161,6 +163,7 @@ def verify_bundle(
     *,
     source: Path | str | None = None,
     step: int | None = None,
+    trust_source: bool = False,
     runtimes: str | Sequence[str] = "auto",
     options: VerifyOptions | None = None,
     allow_unverified: bool = False,
@@ -173,6 +176,7 @@ def verify_bundle(
         Path(bundle),
         source=None if source is None else Path(source),
         step=step,
+        trust_source=trust_source,
         runtimes=runtimes,
         options=options,
         allow_unverified=allow_unverified,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     from converters.keras.source import read
 
-    return read(given)
+    return read(given, options)
 
 
 FORMATS = (

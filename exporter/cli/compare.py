@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.options import comparing, pairs, understanding
+from exporter.cli.options import comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 @click.argument("reference", type=click.Path(path_type=Path))
 @click.argument("candidates", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CANDIDATE...")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call a name.")
+@trusting
 @click.option(
     "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
 )
@@ -31,6 +32,7 @@ def compare_command(
     reference: Path,
     candidates: tuple[Path, ...],
     mapped: tuple[str, ...],
+    trust_source: bool,
     runtimes: str,
     allow_unverified: bool,
     compiling: CompileOptions,
@@ -38,6 +40,7 @@ def compare_command(
     options: VerifyOptions,
 ) -> None:
     """Hold artefacts that any tool made against a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    from converters.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
     from exporter.reports.entry import Entry
 
@@ -50,6 +53,7 @@ def compare_command(
             runtimes=runtimes,
             options=options,
             understanding=compiling,
+            read=ReadOptions(trust_source=trust_source),
             allow_unverified=allow_unverified,
             progress=progress,
         )

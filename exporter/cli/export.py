@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.options import comparing, shapes, understanding
+from exporter.cli.options import comparing, shapes, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
@@ -69,6 +69,7 @@ def _formats() -> str:
 )
 @click.option("--deterministic", is_flag=True, help="Make 'action' the one without chance.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
+@trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
 @click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, default=15, show_default=True, help="ONNX opset.")
@@ -92,6 +93,7 @@ def export_command(
     runtimes: str,
     step: int | None,
     sensors: str,
+    trust_source: bool,
     labels: Path | None,
     compiling: CompileOptions,
     console: Console,
@@ -107,7 +109,7 @@ def export_command(
         [t for t in targets.split(",") if t],
         name,
         compiling,
-        ReadOptions(step, shapes(sensors)),
+        ReadOptions(step, shapes(sensors), trust_source),
         opset,
         runtimes,
         options,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from exporter.cli.options import shapes, understanding
+from exporter.cli.options import shapes, trusting, understanding
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
 @click.option("--svg", type=click.Path(path_type=Path), metavar="FILE", help="Write a picture of the policy.")
+@trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,3x84x84.")
 @click.option(
     "--unity", "releases", multiple=True, metavar="RELEASE", help="What Unity says to it: R20, R22, R23, R23-2.4, all."
@@ -41,6 +42,7 @@ def inspect_command(
     releases: tuple[str, ...],
     actions: str,
     brain_parameters: Path | None,
+    trust_source: bool,
     as_json: bool,
     logdir: Path | None,
     svg: Path | None,
@@ -57,7 +59,7 @@ def inspect_command(
     from converters.source import ReadOptions
     from exporter.inspect.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, compiling, ReadOptions(step, shapes(sensors)))
+    found = inspect_source(source, compiling, ReadOptions(step, shapes(sensors), trust_source))
     written: list[Path] = []
     if logdir is not None or svg is not None:
         from exporter.inspect.pictures import write_pictures

@@ -48,6 +48,12 @@ def _numbers(values: Sequence[str]) -> dict[str, float]:
     return numbers
 
 
+def trusting(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The option for sources that only a loader of their own can read, which runs what they say."""
+    said = "Load a Keras model, which can run code: you know where it comes from."
+    return click.option("--trust-source", is_flag=True, help=said)(command)
+
+
 def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that decide what inference cannot; the command gets them as ``compiling``, a CompileOptions.
 

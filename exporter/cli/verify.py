@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.options import comparing
+from exporter.cli.options import comparing, trusting
 
 if TYPE_CHECKING:
     from exporter.reports.entry import Entry
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @click.argument("bundles", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="BUNDLE...")
 @click.option("--source", type=click.Path(path_type=Path), help="The file the bundle was exported from.")
 @click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
+@trusting
 @click.option(
     "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
 )
@@ -32,6 +33,7 @@ def verify_command(
     bundles: tuple[Path, ...],
     source: Path | None,
     step: int | None,
+    trust_source: bool,
     runtimes: str,
     allow_unverified: bool,
     console: Console,
@@ -48,6 +50,7 @@ def verify_command(
                 folder,
                 source=source,
                 step=step,
+                trust_source=trust_source,
                 runtimes=runtimes,
                 options=options,
                 allow_unverified=allow_unverified,

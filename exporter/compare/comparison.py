@@ -23,7 +23,7 @@ from converters.policy import Policy
 from converters.read import ports_of
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
-from converters.source import OriginalRun
+from converters.source import OriginalRun, ReadOptions
 from exporter.export.bundle import POLICY, read_policy_json
 from exporter.export.sources import read_source
 from exporter.verify.difference import compare
@@ -82,6 +82,7 @@ def compare_artefacts(
     runtimes: str | Sequence[str] = "auto",
     options: VerifyOptions | None = None,
     understanding: CompileOptions | None = None,
+    read: ReadOptions | None = None,
     allow_unverified: bool = False,
     progress: Progress = lambda text: None,
     pool: RuntimePool | None = None,
@@ -91,7 +92,7 @@ def compare_artefacts(
     ``names`` maps a name of the reference to the candidates' name for it. Raises ExportModelError where a file cannot
     be read, UsageError where a name of ``names`` is none, RuntimeUnavailableError where no runtime could run any.
     """
-    policy, source = _reference(reference, understanding)
+    policy, source = _reference(reference, understanding, read)
     artefacts = [(path, *found) for path in candidates for found in ports_of(path)]
     if not artefacts:
         raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
@@ -138,8 +139,10 @@ def _opened(pool: RuntimePool | None) -> AbstractContextManager[RuntimePool]:
     return RuntimePool() if pool is None else nullcontext(pool)
 
 
-def _reference(path: Path, understanding: CompileOptions | None) -> tuple[Policy, OriginalRun | None]:
-    found = list(read_source(path).compiled(understanding))
+def _reference(
+    path: Path, understanding: CompileOptions | None, read: ReadOptions | None
+) -> tuple[Policy, OriginalRun | None]:
+    found = list(read_source(path, read).compiled(understanding))
     if len(found) > 1:
         raise UsageError(
             f"the reference holds {len(found)} policies",

@@ -184,6 +184,7 @@ def verify_folder(
     *,
     source: Path | None = None,
     step: int | None = None,
+    trust_source: bool = False,
     runtimes: str | Sequence[str] = "auto",
     options: VerifyOptions | None = None,
     allow_unverified: bool = False,
@@ -208,7 +209,7 @@ def verify_folder(
             fix="export the policy again with bytes among --to",
         )
     signature, source_map = bundle.signature_of(content)
-    original = None if source is None else _original_of(source, content, step, source_map)
+    original = None if source is None else _original_of(source, content, step, source_map, trust_source)
     embedding = _checked_graph(folder, graph_file, content)
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
     graph = _whole_graph(embedding, names, artefacts)
@@ -281,7 +282,7 @@ def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _original_of(
-    source: Path, content: Mapping[str, Any], step: int | None, source_map: SourceMap
+    source: Path, content: Mapping[str, Any], step: int | None, source_map: SourceMap, trust_source: bool
 ) -> OriginalRun | None:
     """How to run the source of a bundle; raises BundleError where ``source`` is another file.
 
@@ -289,7 +290,7 @@ def _original_of(
     """
     asked = content["source"].get("step")
     sensors = tuple(tuple(shape) for shape in content["source"].get("sensors", ()))
-    read = ReadOptions(step if step is not None or not isinstance(asked, int) else asked, sensors)
+    read = ReadOptions(step if step is not None or not isinstance(asked, int) else asked, sensors, trust_source)
     found = read_source(source, read)
     if found.sha256 != content["source"]["sha256"]:
         raise BundleError(

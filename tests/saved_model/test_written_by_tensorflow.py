@@ -10,6 +10,7 @@ import pytest
 
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.runtimes.pool import RuntimePool
+from converters.source import ReadOptions
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
@@ -20,19 +21,20 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("written_by_tensorflow")
 
 FLAT = {name: name for name in ("references", "resources", "bare", "bare-resources", "keys", "partitioned")}
 OF_FUNCTIONS = {"function": "function", "winding": "winding", "exported": "keras"}
+TRUSTED = ReadOptions(trust_source=True)
 THROUGH_TENSORFLOW = {"policy.keras": "keras", "policy.h5": "keras"}
 
 
 @pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *OF_FUNCTIONS.items(), *THROUGH_TENSORFLOW.items()])
 def test_reads_what_tensorflow_computes(models: Path, name: str, archive: str) -> None:
-    (policy,) = read_source(models / name).policies()
+    (policy,) = read_source(models / name, TRUSTED).policies()
     assert policy.name == Path(name).stem
     assert_agrees(policy, models / f"{archive}.npz")
 
 
 @pytest.mark.parametrize("name", [*FLAT, *OF_FUNCTIONS, *THROUGH_TENSORFLOW])
 def test_agrees_in_all_runtimes_with_the_original(models: Path, name: str, tmp_path: Path, pool: RuntimePool) -> None:
-    (result,) = export([models / name], ExportOptions(tmp_path), pool=pool)
+    (result,) = export([models / name], ExportOptions(tmp_path, read=TRUSTED), pool=pool)
     assert result.report is not None
     assert result.report.passed is True, "\n".join(failure_lines(result.report))
     assert result.report.reference == "source/tensorflow"
@@ -96,9 +98,16 @@ def test_without_tensorflow_it_says_so(models: Path, name: str, monkeypatch: pyt
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "tensorflow" else real(n, *a))
     with pytest.raises(RuntimeUnavailableError, match=r"export-model\[tensorflow\]") as caught:
-        read_source(models / name)
+        read_source(models / name, TRUSTED)
     assert caught.value.exit_status == 3
     assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("name", THROUGH_TENSORFLOW)
+def test_keras_is_loaded_only_where_the_caller_trusts_it(models: Path, name: str) -> None:
+    with pytest.raises(NotAPolicyError, match="trust") as caught:
+        read_source(models / name)
+    assert "--trust-source" in str(caught.value.fix)
 
 
 @pytest.mark.parametrize("name", ["policy.keras", "policy.h5"])
@@ -107,6 +116,6 @@ def test_damage_is_an_error_of_the_source(models: Path, name: str, tmp_path: Pat
     file = tmp_path / name
     file.write_bytes(content[: len(content) // 2])
     with pytest.raises(SourceError) as caught:
-        read_source(file)
+        read_source(file, TRUSTED)
     assert name in str(caught.value)
     assert "Traceback" not in str(caught.value)

@@ -1,7 +1,7 @@
 """TensorFlow freezing what cannot be read without it: ``python -m converters.runtimes.tensorflow.freeze_child``.
 
-A model is loaded by ``path``, ``form`` and ``signature``; run, it gives its GraphDef's bytes as ``graph`` and a JSON
-object of its inputs' and outputs' tensors as ``names``, both as bytes.
+A Keras model is loaded by ``path``, if it is made of Keras' own layers; run, it gives its GraphDef's bytes as ``graph``
+and a JSON object of its inputs' and outputs' tensors as ``names``, both as bytes.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from converters.keras.config import config_inside, refuse_code
 from converters.runtimes.child import claim_stdout, serve
 from converters.runtimes.tensorflow.freeze import FrozenFunction, frozen_function
 from converters.runtimes.wire import Tensors
+from signatures.errors import ExportModelError
 
 
 class _Frozen:
@@ -37,9 +39,11 @@ def main() -> None:
     import tensorflow as tf  # noqa: TID251  this is the child process
 
     def load(header: Mapping[str, Any]) -> _Frozen:
-        return _Frozen(frozen_function(header["path"], header["form"], header.get("signature")))
+        refuse_code(config_inside(header["path"]))
+        return _Frozen(frozen_function(header["path"], "keras"))
 
-    serve("tensorflow", tf.__version__, load, (tf.errors.OpError, AttributeError, RuntimeError, ImportError), out)
+    faults = (tf.errors.OpError, AttributeError, RuntimeError, ImportError, ExportModelError)
+    serve("tensorflow", tf.__version__, load, faults, out)
 
 
 if __name__ == "__main__":

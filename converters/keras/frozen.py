@@ -1,6 +1,7 @@
-"""Models that only TensorFlow can read (SavedModels of TensorFlow 2, Keras): it freezes them in a child process.
+"""Keras models, which only TensorFlow can read: it freezes them in a child process.
 
-TensorFlow is an extra. A model file is untrusted, and loading one runs what it contains: hence the child.
+Keras builds what a file names, so loading one runs what it says. It is read where the caller trusts it, and then, too,
+only if it is made of Keras' own layers (converters/keras/config.py); the child has no network and cannot write.
 """
 
 from __future__ import annotations
@@ -15,26 +16,25 @@ from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import RuntimeUnavailableError, SourceError
 
 _CHILD = "converters.runtimes.tensorflow.freeze_child"
-_WHAT = {"saved_model": "a SavedModel of TensorFlow 2", "keras": "a Keras model"}
 
 
-def frozen_by_tensorflow(path: Path, form: str, signature: str | None = None) -> tuple[bytes, ModelSignature]:
-    """(the GraphDef's bytes, its signature). ``form`` is "saved_model" or "keras".
+def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
+    """(the GraphDef's bytes, its signature) of calling the model with ``training=False``.
 
     Raises RuntimeUnavailableError where TensorFlow is not installed, SourceError with its message where it refuses.
     """
     if importlib.util.find_spec("tensorflow") is None:
         raise RuntimeUnavailableError(
-            f"is {_WHAT[form]}, which can only be read with TensorFlow",
-            why="its functions are flattened by TensorFlow itself, and it is not installed",
+            "is a Keras model, which can only be read with TensorFlow",
+            why="its layers are turned into a graph by TensorFlow itself, and it is not installed",
             fix="pip install 'export-model[tensorflow]'; or freeze the model where it was made, and give the GraphDef",
         )
     try:
         with RuntimeProcess("tensorflow", child_command(_CHILD)) as process:
-            answer = process.load(str(path), form=form, signature=signature).run({}, ["graph", "names"])
+            answer = process.load(str(path.resolve())).run({}, ["graph", "names"])
     except RunFailedError as error:
         raise SourceError(
-            f"is {_WHAT[form]} that TensorFlow cannot load",
+            "is a Keras model that TensorFlow cannot load",
             why=(error.why or error.what)[:600],
             fix="load it where it was made, and save it as a SavedModel with a signature, or freeze it to a GraphDef",
         ) from error
