@@ -90,6 +90,9 @@ def _verdict_text(verdict: UnityVerdict) -> str:
         same = len({_outcome(m) for m in verdict.modes.values()}) == 1
         for mode, found in list(verdict.modes.items())[: 1 if same else None]:
             lines += _mode_lines("" if same else f", {_MODES[mode]}", found)
+    if verdict.misread:
+        lines.append(f"  what {verdict.consumer.runtime} reads wrongly:")
+        lines += [line for finding in verdict.misread for line in _finding_lines(finding, "misread")]
     if verdict.overlooked:
         lines.append("  what Unity does not say:")
         lines += [line for finding in verdict.overlooked for line in _finding_lines(finding, "in play")]

@@ -14,6 +14,7 @@ from converters.targets.unity import barracuda_model, importing, rules, sentis_m
 from converters.targets.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
 from converters.targets.unity.consumers import Consumer, Engine
 from converters.targets.unity.findings import Finding, Thrown, UnityThrows
+from converters.targets.unity.misread import misread
 from converters.targets.unity.model import CheckedModel
 from converters.targets.unity.onnx_file import OnnxFile, read_onnx_file
 from converters.targets.unity.overlooked import overlooked
@@ -62,7 +63,8 @@ class UnityVerdict:
     """What one release says to one file with one set of Behavior Parameters.
 
     ``refused`` is what the import throws; ``modes`` is empty then. ``overlooked`` is what Unity does not say and a
-    player trips over. ``assumed``: nobody gave the parameters, they were taken from the file.
+    player trips over, ``misread`` what of the graph its importer takes for something else. ``assumed``: nobody gave
+    the parameters, they were taken from the file.
     """
 
     path: Path
@@ -71,6 +73,7 @@ class UnityVerdict:
     refused: Thrown | None
     modes: Mapping[str, ModeVerdict] = field(default_factory=dict)
     overlooked: tuple[Finding, ...] = ()
+    misread: tuple[Finding, ...] = ()
     assumed: bool = False
 
     @property
@@ -90,6 +93,7 @@ class UnityVerdict:
             "import": None if self.refused is None else self.refused.to_dict(),
             **{mode: verdict.to_dict() for mode, verdict in self.modes.items()},
             "overlooked": [f.to_dict() for f in self.overlooked],
+            "misread": [f.to_dict() for f in self.misread],
         }
 
 
@@ -109,9 +113,9 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
             fix=f"export it with --for {consumer.profile}, and check what that writes",
         )
     file = read_onnx_file(path)
-    refused = importing.refusal(file, consumer)
+    refused, wrong = importing.refusal(file, consumer), misread(file, consumer)
     if refused is not None:
-        return UnityVerdict(path, consumer, brain or Brain(), refused, assumed=brain is None)
+        return UnityVerdict(path, consumer, brain or Brain(), refused, misread=wrong, assumed=brain is None)
     model: CheckedModel
     if consumer.engine is Engine.BARRACUDA:
         model = barracuda_model.of_onnx(file)
@@ -120,7 +124,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
     agent = brain or assumed_brain(model, onnx_ranks(file, model))
     modes = {name: _mode(model, consumer, agent, deterministic, file) for name, deterministic in MODES.items()}
     unsaid = overlooked(model, agent, _fetched(modes), _silent(modes), consumer, file)
-    return UnityVerdict(path, consumer, agent, None, modes, unsaid, brain is None)
+    return UnityVerdict(path, consumer, agent, None, modes, unsaid, wrong, brain is None)
 
 
 def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:
@@ -140,7 +144,7 @@ def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdi
     agent = brain or assumed_brain(model, nn_ranks(parsed))
     modes = {name: _mode(model, consumer, agent, deterministic, None) for name, deterministic in MODES.items()}
     unsaid = overlooked(model, agent, _fetched(modes), _silent(modes), consumer)
-    return UnityVerdict(path, consumer, agent, None, modes, unsaid, brain is None)
+    return UnityVerdict(path, consumer, agent, None, modes, unsaid, assumed=brain is None)
 
 
 def _fetched(modes: Mapping[str, ModeVerdict]) -> dict[str, tuple[str, ...] | Thrown]:

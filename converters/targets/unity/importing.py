@@ -112,12 +112,19 @@ def _constant(file: OnnxFile, node: Any, layer: str) -> str | None:
     return None if "value" in attributes(node) else "Couldn't find attribute value of type Tensor"
 
 
+def _add(file: OnnxFile, node: Any, layer: str) -> str | None:
+    del layer
+    ranges = [name for name in node.input if getattr(file.producers.get(name), "op_type", "") == "Range"]
+    return "Assertion failure. Value was False\nExpected: True" if ranges else None
+
+
 _REFUSED: dict[str, Callable[[OnnxFile, Any, str], str | None]] = {
     "Split": _split,
     "Gemm": _gemm,
     "LSTM": _lstm,
     "Conv": _conv,
     "Constant": _constant,
+    "Add": _add,
 }
 
 

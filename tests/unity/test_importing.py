@@ -1,0 +1,55 @@
+"""The importers' refusals are those recorded: 352 small models, one construct each, in four runtimes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from onnx import TensorProto, helper
+
+from converters.targets.unity.checker import check_file
+from converters.targets.unity.consumers import CONSUMERS
+from converters.targets.unity.importing import refusal
+from converters.targets.unity.onnx_file import read_onnx_file
+from tests.unity.conftest import lines
+from tests.unity.policies import Draft
+
+ROWS = lines("onnx_rules/onnx_rules.jsonl")
+LATER = {row["id"]: row["results"] for row in lines("onnx_rules/inference_engine.jsonl")}
+PARAMETERS = [pytest.param(row, id=row["id"]) for row in ROWS] or [pytest.param({}, id="shared-is-absent")]
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize("row", PARAMETERS)
+def test_an_import_ends_as_recorded(row: dict[str, Any], unity_data: Path) -> None:
+    file = read_onnx_file(unity_data / "onnx_rules" / row["file"])
+    results = {**row["results"], **LATER[row["id"]]}
+    for consumer in CONSUMERS.values():
+        recorded, found = results[consumer.runtime]["import"], refusal(file, consumer)
+        if recorded == "ok":
+            assert found is None, consumer.name
+        else:
+            assert found is not None and found.exception == recorded["exception"], consumer.name
+            assert recorded["message"].startswith(found.message.rstrip()), consumer.name
+
+
+def test_what_is_read_wrongly_without_an_error_is_told(tmp_path: Path) -> None:
+    draft = Draft(
+        extra=[
+            helper.make_node("Cast", ["obs_0"], ["whole"], to=TensorProto.INT64),
+            helper.make_node("Cast", ["whole"], ["floored"], to=TensorProto.FLOAT),
+        ]
+    )
+    path = draft.write(tmp_path)
+    barracuda, sentis = (check_file(path, CONSUMERS[name]) for name in ("R20", "R22"))
+    assert barracuda.accepted["stochastic"] and sentis.accepted["stochastic"]
+    assert [f.message.split(":")[0] for f in barracuda.misread] == ["Cast gives other numbers, without an error"]
+    assert sentis.misread == ()
+
+
+def test_all_that_is_refused_is_told_and_not_only_the_first(tmp_path: Path) -> None:
+    nodes = [helper.make_node(op, ["obs_0"], [f"y{op}"]) for op in ("Softsign", "HardSwish")]
+    verdict = check_file(Draft(extra=nodes, opset=14).write(tmp_path), CONSUMERS["R20"])
+    assert verdict.refused is not None and "Unknown type Softsign" in verdict.refused.message
+    assert {f.message.split()[0] for f in verdict.misread} == {"Softsign", "HardSwish"}
