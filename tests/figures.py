@@ -23,8 +23,9 @@ from typing import Any
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes
 from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.findings import Finding
 from exporter.verify.histogram import added, to_dict
-from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.report import ParityReport
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
@@ -71,7 +72,7 @@ class Cell:
     least_p: float = 1.0
     elements: tuple[int, ...] = ()
 
-    def add(self, policy: str, comparison: Comparison) -> None:
+    def add(self, policy: str, comparison: Finding) -> None:
         self.policies.add(policy)
         self.comparisons += 1
         self.failures += not comparison.passed

@@ -103,7 +103,7 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         sizes: Sequence[str],
         **rest: Any,
     ) -> Any:
-        from exporter.verify.budget import parse_budget
+        from exporter.verify.checks.size import parse_budget
         from exporter.verify.subject import VerifyOptions
         from exporter.verify.tolerances import Tolerance
 

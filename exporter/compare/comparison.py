@@ -28,10 +28,11 @@ from exporter.export.bundle import POLICY, read_policy_json
 from exporter.export.sources import read_source
 from exporter.verify.difference import compare
 from exporter.verify.participants import Entrant, Failure, Feeds, unload
+from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.subject import Subject, VerifyOptions
 from exporter.verify.tolerances import Tolerance
-from exporter.verify.verification import random_outputs, verify
+from exporter.verify.verification import verify
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
 from signatures.roles import Role
 from signatures.sampling import draw_cases

@@ -12,15 +12,15 @@ from collections.abc import Sequence
 from exporter.reports.layers import Block
 from exporter.reports.layout import layout
 from exporter.reports.markup import Markup, el
+from exporter.verify.findings import Finding
 from exporter.verify.histogram import BINS, FIRST, LAST
-from exporter.verify.report import Comparison
 
 _BAR, _STRIP, _ZERO_GAP = 17.0, 46.0, 18.0
 #: Lines have this many colours; a second round of them is dashed.
 _COLOURS = 6
 
 
-def histograms(output: str, comparisons: Sequence[Comparison]) -> Markup:
+def histograms(output: str, comparisons: Sequence[Finding]) -> Markup:
     """One strip per comparison of ``output``: how many elements differ by how much, the bound marked."""
     names = [f"{c.format} · {c.runtime}" for c in comparisons]
     left = 2.0
@@ -63,7 +63,7 @@ def histograms(output: str, comparisons: Sequence[Comparison]) -> Markup:
     return _svg(parts, right + 12, bottom + 22, described)
 
 
-def drift(output: str, comparisons: Sequence[Comparison], pairs: Sequence[tuple[str, str]]) -> Markup:
+def drift(output: str, comparisons: Sequence[Finding], pairs: Sequence[tuple[str, str]]) -> Markup:
     """Lines of the worst difference per step with the memory fed back, on a logarithmic axis.
 
     A line has the colour of its (format, runtime) in ``pairs``, the same in every chart.

@@ -10,10 +10,10 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 
 from converters.formats import FORMATS
-from exporter.cli.summary import explanation, verdict
+from exporter.cli.summary import verdict
 from exporter.reports.entry import Entry
 from exporter.reports.markup import printable
-from exporter.verify.report import Comparison
+from exporter.verify.findings import Failure, Finding
 
 
 def junit_xml(entries: Sequence[Entry]) -> bytes:
@@ -29,7 +29,7 @@ def junit_xml(entries: Sequence[Entry]) -> bytes:
 
 def _suites(entry: Entry) -> Iterable[ET.Element]:
     report = entry.report
-    ran: dict[str, dict[tuple[str, str, str], list[Comparison]]] = {}
+    ran: dict[str, dict[tuple[str, str, str], list[Finding]]] = {}
     for c in report.comparisons:
         # Signatures of a SavedModel are cases of its suite, told apart by their class name.
         suite = ran.setdefault(c.format.partition(":")[0], {})
@@ -68,12 +68,12 @@ def _case_name(output: str) -> str:
     return "runs" if output == "*" else output
 
 
-def _outcome(case: ET.Element, comparisons: Sequence[Comparison]) -> None:
+def _outcome(case: ET.Element, comparisons: Sequence[Finding]) -> None:
     """At most one failure or error per case, as readers expect; its text has all that went wrong."""
     failed = [c for c in comparisons if not c.passed]
-    lines = [line for c in failed for line in explanation(c)]
+    lines = [line for c in failed for line in c.explanation()]
     if failed:
-        kind = "error" if all(c.kind == "failure" for c in failed) else "failure"
+        kind = "error" if all(isinstance(c, Failure) for c in failed) else "failure"
         element = ET.SubElement(case, kind, type=f"export-model.{failed[0].kind}", message=_text(lines[0]))
         element.text = _text("\n".join(lines))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from exporter.cli.summary import explanation, verdict
+from exporter.cli.summary import verdict
 from exporter.cli.tables import size_text
 from exporter.reports.entry import Entry
 from exporter.reports.markup import printable
@@ -30,7 +30,7 @@ def _policy(entry: Entry) -> list[str]:
     report = entry.report
     lines = [f"### {_mark(entry)} {code(report.policy)}", "", text(verdict(report)), ""]
     for c in report.failures:
-        first, *rest = explanation(c)
+        first, *rest = c.explanation()
         lines += [f"- ❌ {text(first)}", *(f"  - {text(line)}" for line in rest)]
     if report.failures:
         lines.append("")

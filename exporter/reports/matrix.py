@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.findings import Failure, Finding
+from exporter.verify.report import ParityReport
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
     """The worst comparison of one output; ``text`` is its difference in short."""
 
-    worst: Comparison
+    worst: Finding
     passed: bool
     text: str
 
@@ -43,34 +44,32 @@ class Matrix:
 
 def matrix(report: ParityReport) -> Matrix:
     """The table of ``report``."""
-    groups: dict[tuple[str, str], list[Comparison]] = {}
+    groups: dict[tuple[str, str], list[Finding]] = {}
     for c in report.comparisons:
         groups.setdefault((c.format, c.runtime), []).append(c)
     rows = []
     for (kind, runtime), group in groups.items():
-        by_output: dict[str, list[Comparison]] = {}
+        by_output: dict[str, list[Finding]] = {}
         for c in group:
-            if c.kind != "failure":
+            if not isinstance(c, Failure):
                 by_output.setdefault(c.output, []).append(c)
-        reasons = [c.reason for c in group if c.kind == "failure"]
+        reasons = [c.reason for c in group if isinstance(c, Failure)]
         cells = {output: _cell(found) for output, found in by_output.items()}
         rows.append(Row(kind, runtime, report.sizes.get(kind), cells, reasons[0] if reasons else None))
-    outputs = tuple(dict.fromkeys(c.output for c in report.comparisons if c.kind != "failure"))
+    outputs = tuple(dict.fromkeys(c.output for c in report.comparisons if not isinstance(c, Failure)))
     return Matrix(outputs, tuple(rows))
 
 
-def _cell(comparisons: list[Comparison]) -> Cell:
+def _cell(comparisons: list[Finding]) -> Cell:
     """The worst of an output's numbers, rollout and draws."""
-    worst = max(comparisons, key=lambda c: (not c.passed, c.kind in ("numbers", "rollout"), c.max_abs_diff))
+    worst = max(comparisons, key=lambda c: (not c.passed, c.measured, c.max_abs_diff))
     return Cell(worst, worst.passed, short(worst))
 
 
-def short(c: Comparison) -> str:
+def short(c: Finding) -> str:
     """A difference in a few characters."""
-    if c.kind in ("draws", "shape"):
-        return "drawn" if c.passed else "✗ drawn"
-    if c.kind == "size":
-        return "kept" if c.passed else "✗ exceeded"
+    if not c.measured:
+        return c.cell() if c.passed else f"✗ {c.cell()}"
     if c.reason and not c.passed:
         return f"✗ {c.reason.split(' instead of')[0]}" if len(c.reason) < 40 else "✗"
-    return "0" if c.max_abs_diff == 0 else f"{c.max_abs_diff:.1e}"
+    return c.cell()

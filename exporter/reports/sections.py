@@ -7,14 +7,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from exporter.cli.summary import allowed, explanation
 from exporter.cli.tables import size_text
 from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
 from exporter.reports.matrix import Cell, matrix
-from exporter.verify.report import Comparison
+from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
 
 _SHOWN_VALUES = 12
@@ -81,15 +80,15 @@ def failures(entry: Entry) -> Markup | None:
         return None
     groups: dict[str, list[Child]] = {}
     for c in failed[:_MOST_FAILURES]:
-        groups.setdefault(_where(c), []).append(_failure(c))
+        groups.setdefault(c.where, []).append(_failure(c))
     cards = [el("div", el("h4", where), content, class_="failure") for where, content in groups.items()]
     more = len(failed) - _MOST_FAILURES
     return section("What disagrees", cards, el("p", f"And {more} more: see parity.json.") if more > 0 else None)
 
 
-def _failure(c: Comparison) -> Markup:
-    first, *rest = explanation(c)
-    says = first.removeprefix(f"{_where(c)}: ")
+def _failure(c: Finding) -> Markup:
+    first, *rest = c.explanation()
+    says = first.removeprefix(f"{c.where}: ")
     name = None if c.output == "*" else el("code", c.output)
     lines = [el("p", f"{line[:1].upper()}{line[1:]}.", class_="soft") for line in rest]
     return el("div", el("p", name, says.removeprefix(c.output)), lines, class_="detail")
@@ -141,9 +140,9 @@ def spread(entry: Entry) -> Markup | None:
     return section("How the differences are spread", el("p", text, class_="soft"), el("div", figures, class_="figures"))
 
 
-def _equal_text(equal: Sequence[Comparison], of: int) -> str | None:
+def _equal_text(equal: Sequence[Finding], of: int) -> str | None:
     """Who was exactly the reference: they would be drawn as a line on the floor."""
-    names = ", ".join(dict.fromkeys(_where(c) for c in equal))
+    names = ", ".join(dict.fromkeys(c.where for c in equal))
     return (
         None
         if not equal
@@ -161,7 +160,7 @@ def _figure(title: str, picture: Markup | None, caption: str | None) -> Markup:
 
 def memory(entry: Entry) -> Markup | None:
     """Drift of the rollout, a chart per output."""
-    rolled = [c for c in entry.report.comparisons if c.kind == "rollout" and c.drift]
+    rolled = [c for c in entry.report.comparisons if isinstance(c, Rollout) and c.drift]
     if not rolled:
         return None
     moving = [c for c in rolled if any(d > 0 and math.isfinite(d) for d in c.drift)]
@@ -234,8 +233,8 @@ def tensors(entry: Entry) -> Markup | None:
 
 def worst_inputs(entry: Entry) -> Markup | None:
     """For each output the input that it differs most on, with the values that were fed."""
-    compared = [c for c in entry.report.comparisons if c.worst_input and c.kind in ("numbers", "rollout")]
-    worst: dict[str, Comparison] = {}
+    compared = [c for c in entry.report.comparisons if c.worst_input and c.measured]
+    worst: dict[str, Finding] = {}
     for c in compared:
         if c.max_abs_diff > 0:
             worst[c.output] = max(worst.get(c.output, c), c, key=lambda c: (not c.passed, c.max_abs_diff))
@@ -244,7 +243,7 @@ def worst_inputs(entry: Entry) -> Markup | None:
     rows = [
         (
             el("code", c.output),
-            _where(c),
+            c.where,
             _number(c.max_abs_diff),
             c.worst_input,
             _wide(_fed(entry, c)),
@@ -255,7 +254,7 @@ def worst_inputs(entry: Entry) -> Markup | None:
     return section("Worst inputs", table("The input on which each output differs most", head, rows))
 
 
-def _fed(entry: Entry, c: Comparison) -> Child:
+def _fed(entry: Entry, c: Finding) -> Child:
     lines = []
     for name, array in entry.feeds(c.worst_input or "").items():
         lines.append(el("div", el("code", name), f" {shortened(array)}"))
@@ -270,10 +269,6 @@ def shortened(array: np.ndarray) -> str:
     return f"[{', '.join(values)}{rest}]"
 
 
-def _where(c: Comparison) -> str:
-    return f"{c.format} in {c.runtime}"
-
-
 def _number(value: float) -> str:
     return f"{value:.3g}"
 
@@ -281,12 +276,12 @@ def _number(value: float) -> str:
 def tolerances(entry: Entry) -> Markup:
     """The default, what differs from it with its reason, and where rounding explains more."""
     comparisons = entry.report.comparisons
-    plain = list(dict.fromkeys(allowed(c) for c in comparisons if not c.tolerance.reason and c.kind != "failure"))
+    plain = list(dict.fromkeys(c.bound for c in comparisons if not c.tolerance.reason and not isinstance(c, Failure)))
     content: list[Child] = []
     if plain:
         content.append(el("p", "|Δ| ≤ ", el("code", " or ".join(plain)), " for every element."))
     special = [
-        (el("code", c.output), _where(c), el("code", allowed(c)), _wide(c.tolerance.reason))
+        (el("code", c.output), c.where, el("code", c.bound), _wide(c.tolerance.reason))
         for c in comparisons
         if c.tolerance.reason
     ]
@@ -296,7 +291,7 @@ def tolerances(entry: Entry) -> Markup:
     rounded = [
         (
             el("code", c.output),
-            _where(c),
+            c.where,
             _number(c.max_abs_diff),
             _number(c.rounding),
             c.worst_input,

@@ -20,8 +20,8 @@ import numpy as np
 
 from converters.graph.nodes import Graph
 from exporter.verify.difference import floored, ties
+from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
-from exporter.verify.verification import random_outputs
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
 from signatures.spec import PolicySignature

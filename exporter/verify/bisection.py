@@ -21,9 +21,9 @@ from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
 from exporter.verify.difference import Difference, compare
+from exporter.verify.findings import Bisection
 from exporter.verify.inner_tensors import Inside, inside, onnx_sources, outputs_read, saved_graph
 from exporter.verify.participants import Entrant, Feeds
-from exporter.verify.report import Bisection
 from exporter.verify.subject import Subject
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError

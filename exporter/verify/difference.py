@@ -50,10 +50,10 @@ def compare(
     tolerance it takes its place. A NaN or infinity must stand at the same place on both sides.
     """
     if reference.shape != candidate.shape:
-        return _wrong(f"shape {list(candidate.shape)} instead of {list(reference.shape)}")
+        return wrong(f"shape {list(candidate.shape)} instead of {list(reference.shape)}")
     names = (reference.dtype.name, candidate.dtype.name)
     if names[0] != names[1] and not (narrowed and names in NARROWED):
-        return _wrong(f"dtype {names[1]} instead of {names[0]}")
+        return wrong(f"dtype {names[1]} instead of {names[0]}")
     if not reference.size:
         return Difference(0.0, 0.0, True)
     a, b = candidate.astype(np.float64), reference.astype(np.float64)
@@ -61,7 +61,7 @@ def compare(
     if odd.any():
         same = (np.isnan(a) & np.isnan(b)) | (a == b)
         if not same[odd].all():
-            return replace(_wrong("NaN or infinity on one side only"), worst=int((odd & ~same).argmax()))
+            return replace(wrong("NaN or infinity on one side only"), worst=int((odd & ~same).argmax()))
         a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)
     difference = np.abs(a - b)
     if free is not None:
@@ -84,7 +84,8 @@ def compare(
     return Difference(float(difference.max()), worst_relative, passed, "", explained, histogram, smallest, worst)
 
 
-def _wrong(reason: str) -> Difference:
+def wrong(reason: str) -> Difference:
+    """One that no number tells, only ``reason``."""
     return Difference(float("inf"), float("inf"), False, reason)
 
 

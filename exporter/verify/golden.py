@@ -8,20 +8,17 @@ are then zero, masks allow everything. Arrays under the names of outputs are the
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from exporter.verify.difference import Difference
 from signatures.errors import UsageError
 from signatures.roles import Role
 from signatures.sampling import Case
 from signatures.spec import PolicySignature, TensorSpec
 
-Feeds = Mapping[str, np.ndarray]
-Check = Callable[[str, Feeds, np.ndarray], Difference]
 #: Rows that are run at once; a recording may hold thousands.
 _ROWS = 64
 _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
@@ -35,22 +32,6 @@ class Golden:
     answers: tuple[Mapping[str, np.ndarray], ...] = ()
     #: noise that was not recorded, so that what depends on it cannot be held against the recording
     noiseless: frozenset[str] = frozenset()
-
-    def compared(self, expected: Sequence[Feeds], check: Check) -> list[tuple[str, Difference, str]]:
-        """(output, its worst difference, the case) of the reference's answers to ``cases`` against the recording.
-
-        ``check`` compares (output, reference's answers, recorded array).
-        """
-        worst: dict[str, tuple[Difference, str]] = {}
-        for case, answers, recorded in zip(self.cases, expected, self.answers, strict=True):
-            for name in (n for n in recorded if n in answers):
-                found = check(name, answers, recorded[name])
-                if name not in worst or (not found.passed, found.max_abs) > (
-                    not worst[name][0].passed,
-                    worst[name][0].max_abs,
-                ):
-                    worst[name] = (found, case.name)
-        return [(name, *found) for name, found in worst.items()]
 
 
 def read_golden(path: Path, signature: PolicySignature) -> Golden:

@@ -12,7 +12,7 @@ import numpy as np
 from converters.formats import WRITTEN
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
-from exporter.verify.report import Comparison
+from exporter.verify.findings import Finding
 from exporter.verify.subject import Subject
 
 #: The runtime that takes longest to start, by far.
@@ -88,11 +88,11 @@ def entrants(
             unload(model)
 
 
-def in_order(results: Iterable[Comparison], subject: Subject) -> tuple[Comparison, ...]:
+def in_order(results: Iterable[Finding], subject: Subject) -> tuple[Finding, ...]:
     """Results as they are reported: by format and runtime, whichever was ready first. The reference's come first."""
     kinds = list(subject.artefacts)
 
-    def place(result: Comparison) -> tuple[int, int]:
+    def place(result: Finding) -> tuple[int, int]:
         kind = result.format.partition(":")[0]
         if kind not in kinds or result.runtime not in WRITTEN[kind].runtimes:
             return (-1, 0)

@@ -15,7 +15,8 @@ from onnx import helper, numpy_helper
 from converters.runtimes.pool import RuntimePool
 from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.findings import Finding
+from exporter.verify.report import ParityReport
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import export_model, is_refused
@@ -53,7 +54,7 @@ def renamed(model: onnx.ModelProto, old: str, new: str) -> None:
         value.name = new if value.name == old else value.name
 
 
-def only_failure(report: ParityReport) -> Comparison:
+def only_failure(report: ParityReport) -> Finding:
     assert report.passed is False
     (failure,) = report.failures
     return failure

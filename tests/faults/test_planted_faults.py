@@ -9,7 +9,8 @@ import pytest
 from converters.formats import WRITTEN
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import verify_folder
-from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.findings import Finding
+from exporter.verify.report import ParityReport
 from exporter.verify.subject import VerifyOptions
 from tests.commands import export_model, is_refused
 from tests.faults.artefacts import FORMATS, opened
@@ -90,7 +91,7 @@ def _pointed_at(fault: Fault, kind: str, runtime: str, report: ParityReport) -> 
     assert entry["bisection"]["source"]
 
 
-def _named(found: Comparison, tensors: tuple[str, ...], op: str) -> None:
+def _named(found: Finding, tensors: tuple[str, ...], op: str) -> None:
     bisection = found.bisection
     assert bisection is not None
     assert bisection.tensor in tensors, bisection

@@ -19,7 +19,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
 from converters.runtimes.tensorflow1.found import RELEASES
 from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.verify.report import Comparison
+from exporter.verify.findings import Finding
 from exporter.verify.subject import Subject
 from exporter.verify.verification import verify
 from fixtures import FIXTURES, path
@@ -51,7 +51,7 @@ def exported(source: Path, out: Path, **options: Any) -> list[ExportResult]:
     return list(export([source], ExportOptions(out, targets=("bytes",), verify="none", **options)))
 
 
-def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Comparison]:
+def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Finding]:
     file = result.folder / f"{result.policy.name}.bytes"
     subject = Subject(
         name=result.policy.name,

@@ -8,8 +8,8 @@ import numpy as np
 
 from converters.policy import Policy
 from exporter.verify.difference import compare, ties
+from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
-from exporter.verify.verification import random_outputs
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 

@@ -5,17 +5,21 @@ from __future__ import annotations
 from dataclasses import replace
 
 from exporter.reports.entry import Entry
+from exporter.verify import findings
+from exporter.verify.findings import Bisection, Finding, Numbers
 from exporter.verify.histogram import BINS
-from exporter.verify.report import Bisection, Comparison, ParityReport
+from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
 
 SPREAD = (5, 0, 0, 2, 9, *([0] * (BINS - 5)))
 RAN = {"version": "1.0", "status": "ran", "reason": None}
 
 
-def comparison(where: str, runtime: str, output: str = "action", /, **more: object) -> Comparison:
+def comparison(
+    where: str, runtime: str, output: str = "action", /, kind: type[Finding] = Numbers, **more: object
+) -> Finding:
     """One that passes, unless ``more`` says otherwise."""
-    plain = Comparison(where, runtime, output, "numbers", 1e-9, 1e-8, Tolerance(), True, "zeros", histogram=SPREAD)
+    plain = kind(where, runtime, output, 1e-9, 1e-8, Tolerance(), True, "zeros", histogram=SPREAD)
     return replace(plain, **more)  # type: ignore[arg-type]
 
 
@@ -37,7 +41,7 @@ PASSING = ParityReport(
     (
         comparison("reference", "numpy"),
         comparison("onnx", "onnxruntime"),
-        comparison("onnx", "onnxruntime", kind="rollout", drift=(0.0, 1e-9), histogram=()),
+        comparison("onnx", "onnxruntime", kind=findings.Rollout, drift=(0.0, 1e-9), histogram=()),
         comparison("onnx", "onnxruntime", "value_estimate", tolerance=Tolerance(1e-3, 1e-3, "a reason | with a bar")),
     ),
     {"onnx": 1234, "tfjs": 4321},
@@ -58,7 +62,7 @@ FAILING = replace(
             smallest_tolerance=0.2,
             bisection=BEGINNING,
         ),
-        comparison("tfjs", "tfjs-cpu", kind="rollout", passed=False, drift=(float("nan"), 0.5), histogram=()),
+        comparison("tfjs", "tfjs-cpu", kind=findings.Rollout, passed=False, drift=(float("nan"), 0.5), histogram=()),
         comparison(
             "tfjs",
             "tfjs-cpu",
@@ -70,7 +74,14 @@ FAILING = replace(
             histogram=(),
         ),
         comparison(
-            "bytes", "tensorflow", "*", kind="failure", passed=False, worst_input=None, reason="it died", histogram=()
+            "bytes",
+            "tensorflow",
+            "*",
+            kind=findings.Failure,
+            passed=False,
+            worst_input=None,
+            reason="it died",
+            histogram=(),
         ),
     ),
 )

@@ -1,14 +1,13 @@
-"""A size budget as a gate: ``--max-size tfjs=60kB``. A format that is larger is a comparison that failed."""
+"""A size budget as a gate: ``--max-size tfjs=60kB``. A format that is larger is a finding that failed."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 
 from exporter.cli.tables import size_text
-from exporter.verify.report import Comparison, ParityReport
+from exporter.verify.findings import Finding, Size
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import UsageError
 
@@ -33,18 +32,20 @@ def parse_budget(values: Sequence[str]) -> dict[str, int]:
     return budget
 
 
-def held_to(report: ParityReport, budget: Mapping[str, int]) -> ParityReport:
-    """The report with a comparison of each size in ``budget``. Raises UsageError on a format that was not written."""
-    sizes = {**report.sizes, TOTAL: sum(report.sizes.values())}
-    checks = []
+def check_budget(budget: Mapping[str, int], sizes: Mapping[str, int]) -> None:
+    """Raise UsageError where a format in ``budget`` is none of those that were written."""
+    for name in budget:
+        if name not in (*sizes, TOTAL):
+            known = ", ".join((*sizes, TOTAL))
+            raise UsageError(f"--max-size {name}=…: there is no such format here", fix=f"there are {known}")
+
+
+def sizes(budget: Mapping[str, int], written: Mapping[str, int]) -> Iterator[Finding]:
+    """What each budget says of the bytes that were written."""
+    found = {**written, TOTAL: sum(written.values())}
     for name, most in budget.items():
-        if name not in sizes:
-            raise UsageError(f"--max-size {name}=…: there is no such format here", fix=f"there are {', '.join(sizes)}")
-        over = sizes[name] - most
-        reason = "" if over <= 0 else f"{size_text(sizes[name])}, and the budget is {size_text(most)}"
+        over = found[name] - most
+        reason = "" if over <= 0 else f"{size_text(found[name])}, and the budget is {size_text(most)}"
         excess = float(max(over, 0))
         relative = excess / most if most else math.inf if excess else 0.0
-        tolerance = Tolerance(0.0, 0.0)
-        checks.append(Comparison(name, "file", "size", "size", excess, relative, tolerance, over <= 0, None, reason))
-    passed = False if any(not c.passed for c in checks) else report.passed
-    return replace(report, comparisons=(*report.comparisons, *checks), passed=passed)
+        yield Size(name, "file", "size", excess, relative, Tolerance(0.0, 0.0), over <= 0, None, reason)

@@ -1,0 +1,54 @@
+"""Numbers that are drawn, from noise in the graph or of a candidate's own, have the reference's distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from exporter.verify.checks.draws import DRAWS, likely
+from exporter.verify.findings import Draws, Finding
+from exporter.verify.participants import Entrant
+from exporter.verify.statistics import same_distribution
+from exporter.verify.trial import Trial
+from signatures.roles import Role
+from signatures.sampling import Case
+
+#: Rows of policies without cameras, instead of ``DRAWS``: a spread that is a quarter too wide is seen.
+DENSITY_DRAWS = 4096
+
+
+def densities(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
+    """Both are drawn many times for one input, the reference by the numpy kernels, and each number of an output is
+    tested by itself (Kolmogorov-Smirnov for two samples of one size).
+    """
+    names = [n for n in entrant.outputs if trial.drawn(n, entrant) and trial.signature.output(n).dtype == "float32"]
+    if not names:
+        return
+    case = trial.cases[0]
+    runs = (trial.reference.model.run, entrant.run)
+    cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
+    feeds = _rows(trial, case, DRAWS if cameras else DENSITY_DRAWS)
+    samples = [run(feeds, names) for run in runs]
+    if any((s[n] == s[n][:1]).all() for s in samples for n in names):
+        # One draw for the whole batch, or none: as many runs as draws.
+        each = [[run(_rows(trial, case, 1, i), names) for i in range(DRAWS)] for run in runs]
+        samples = [{n: np.concatenate([one[n] for one in every]) for n in names} for every in each]
+    for name in names:
+        tolerance = trial.tolerance(name, entrant)
+        columns = (s[name].reshape(len(s[name]), -1).T for s in samples)
+        p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in zip(*columns, strict=True)]
+        yield trial.finding(Draws, entrant, name, likely(min(p_values, default=1.0)), case.name)
+
+
+def _rows(trial: Trial, case: Case, count: int, run: int = 0) -> dict[str, np.ndarray]:
+    """The first row of a case ``count`` times, with noise drawn for each."""
+    rng = np.random.default_rng([trial.options.seed, run])
+    feeds = {}
+    for spec in trial.signature.inputs:
+        array = case.feeds[spec.name]
+        free = bool(spec.shape) and spec.shape[0] is None
+        array = np.repeat(array[:1], count, axis=0) if free else array
+        noise = spec.role is Role.NOISE
+        feeds[spec.name] = rng.standard_normal(array.shape).astype(np.float32) if noise else array
+    return feeds

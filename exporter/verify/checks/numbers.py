@@ -1,0 +1,75 @@
+"""Every output's numbers, for inputs that are given one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from exporter.verify.difference import Difference, wrong
+from exporter.verify.findings import Finding, Numbers, Shape
+from exporter.verify.histogram import added
+from exporter.verify.participants import Entrant
+from exporter.verify.trial import Trial
+from signatures.roles import Role
+from signatures.sampling import Case
+from signatures.spec import PolicySignature
+
+
+def numbers(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
+    """The worst difference of each output, and where it begins; of a drawn one its shape, dtype and range."""
+    worst: dict[str, tuple[Difference, Case]] = {}
+    needed: dict[str, list[float | None]] = {}
+    spread: dict[str, tuple[int, ...]] = {}
+    for case, expected in zip(trial.cases, trial.expected, strict=True):
+        got = entrant.run(case.feeds, list(entrant.outputs))
+        for name in entrant.outputs:
+            if trial.drawn(name, entrant):
+                difference = plausible(trial.signature, name, got[name], case)
+            elif name in expected:
+                difference = trial.difference(name, expected, got[name], entrant, case)
+            else:
+                continue
+            spread[name] = added(spread.get(name, ()), difference.histogram)
+            needed.setdefault(name, []).append(difference.smallest_tolerance)
+            if name not in worst or rank(difference) > rank(worst[name][0]):
+                worst[name] = (difference, case)
+    for name, (difference, case) in worst.items():
+        kind = Shape if trial.drawn(name, entrant) else Numbers
+        difference = replace(difference, smallest_tolerance=largest(needed[name]), histogram=spread[name])
+        begins = trial.bisected(entrant, name, difference, case.feeds)
+        yield trial.finding(kind, entrant, name, difference, case.name, bisection=begins)
+
+
+def plausible(signature: PolicySignature, name: str, got: np.ndarray, case: Case) -> Difference:
+    """A drawn output: shape, dtype and range; how it is distributed is for other checks.
+
+    An action without chance that is drawn is wrong, whatever it is.
+    """
+    spec = signature.output(name)
+    wanted = tuple(case.batch if n is None else n for n in spec.shape)
+    if spec.role is Role.DETERMINISTIC:
+        return wrong("it is the action without chance, and it is drawn")
+    if got.shape != wanted:
+        return wrong(f"shape {list(got.shape)} instead of {list(wanted)}")
+    if got.dtype.kind != np.dtype(spec.dtype).kind:
+        return wrong(f"dtype {got.dtype.name} instead of {spec.dtype}")
+    if not np.isfinite(got).all():
+        return wrong("NaN or infinity was drawn")
+    if spec.role is Role.SAMPLED and signature.branches:
+        sizes = np.array(signature.branches)
+        if (got < 0).any() or (got >= sizes).any():
+            return wrong("a class outside of its branch was drawn")
+    return Difference(0.0, 0.0, True)
+
+
+def rank(difference: Difference) -> tuple[bool, float]:
+    """Of two differences, the larger is the worse."""
+    return not difference.passed, difference.max_abs
+
+
+def largest(needed: Sequence[float | None]) -> float | None:
+    """The tolerance that all need; None where one of them has none."""
+    known = [t for t in needed if t is not None]
+    return max(known) if len(known) == len(needed) else None

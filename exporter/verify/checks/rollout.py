@@ -1,0 +1,52 @@
+"""The memory fed back for some steps, in each runtime by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from exporter.verify.checks.numbers import largest, rank
+from exporter.verify.difference import Difference
+from exporter.verify.findings import Finding, Rollout
+from exporter.verify.participants import Entrant, Feeds
+from exporter.verify.trial import Trial
+
+
+def rollout(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
+    """How far each output drifts, and the step where that begins."""
+    memory = trial.signature.memory
+    if not trial.steps or memory is None or memory.output not in entrant.outputs:
+        return
+    fed: list[Feeds] = []
+
+    def step(feeds: Feeds) -> dict[str, np.ndarray]:
+        fed.append(feeds)
+        return entrant.run(feeds, list(entrant.outputs))
+
+    got = trial.rolled(step)
+    names = [n for n in entrant.outputs if n in trial.expected_steps[0] and not trial.drawn(n, entrant)]
+    steps = {
+        n: [trial.difference(n, e, g[n], entrant) for e, g in zip(trial.expected_steps, got, strict=True)]
+        for n in names
+    }
+    where = [f"step {i + 1} of {len(fed)}" for i in range(len(fed))]
+    for name, differences in steps.items():
+        worst = max(range(len(fed)), key=lambda i: rank(differences[i]))
+        least = largest([d.smallest_tolerance for d in differences])
+        difference = replace(differences[worst], smallest_tolerance=least, histogram=())
+        begins = None
+        if not difference.passed:
+            # An output that goes wrong after the memory did goes wrong because of it.
+            output = min((n for n in (name, memory.output) if n in steps), key=lambda n: _first(steps[n]))
+            first = _first(steps[output])
+            begins = trial.bisected(entrant, output, steps[output][first], fed[first])
+            begins = begins and replace(begins, input=where[first])
+        drift = tuple(d.max_abs for d in differences)
+        yield trial.finding(Rollout, entrant, name, difference, where[worst], drift, begins)
+
+
+def _first(steps: Sequence[Difference]) -> int:
+    """The first step that differs; their number where none does."""
+    return next((i for i, d in enumerate(steps) if not d.passed), len(steps))

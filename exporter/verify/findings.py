@@ -1,0 +1,259 @@
+"""What the checks of a verification find: each renders itself as a sentence and as an entry of parity.json."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from converters.runtimes.process import RunFailedError
+from exporter.verify.histogram import to_dict
+from exporter.verify.statistics import FALSE_ALARM
+from exporter.verify.tolerances import Tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class Bisection:
+    """Where a disagreement begins: the first tensor in graph order that differs in that runtime.
+
+    ``source`` is the tensor of the source that it stands for. ``index`` is where the worst element is, ``expected`` and
+    ``got`` its values. ``hidden`` are tensors right before it that the format does not have, because they were fused
+    into its op: they may be the first as well. Where nothing could be named, ``tensor`` is None; ``reason`` says why.
+    """
+
+    tensor: str | None
+    op: str | None = None
+    source: str | tuple[str, ...] | None = None
+    index: tuple[int, ...] | None = None
+    expected: float | None = None
+    got: float | None = None
+    max_abs_diff: float | None = None
+    smallest_tolerance: float | None = None
+    hidden: tuple[str, ...] = ()
+    #: What was fed where that is not the comparison's worst input: the first step that differs.
+    input: str | None = None
+    reason: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in parity.json."""
+        if self.tensor is None:
+            return {"tensor": None, "reason": self.reason}
+        numbers = {k: getattr(self, k) for k in ("expected", "got", "max_abs_diff", "smallest_tolerance")}
+        entry: dict[str, Any] = {
+            "tensor": self.tensor,
+            "op": self.op,
+            "source": list(self.source) if isinstance(self.source, tuple) else self.source,
+            "index": None if self.index is None else list(self.index),
+            **{k: None if v is None else _number(v) for k, v in numbers.items()},
+        }
+        if self.hidden:
+            entry["hidden"] = list(self.hidden)
+        if self.input is not None:
+            entry["input"] = self.input
+        if self.reason:
+            entry["reason"] = self.reason
+        return entry
+
+    def sentence(self) -> str:
+        """Where it begins, in a line."""
+        if self.tensor is None:
+            return f"first difference: not found, {self.reason}"
+        text = f"first difference: {self.tensor}"
+        if self.op:
+            text += f" ({self.op})"
+        if self.source:
+            text += f", in the source {self.source if isinstance(self.source, str) else ', '.join(self.source)}"
+        if self.expected is not None and self.got is not None:
+            place = "" if self.index is None else f" at {list(self.index)}"
+            text += f":{place} expected {self.expected:.8g}, got {self.got:.8g}"
+        if self.input is not None:
+            text += f", fed {self.input}"
+        if self.hidden:
+            text += f"; not seen before it: {', '.join(self.hidden)}"
+        return f"{text}; {self.reason}" if self.reason else text
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a check says of one output of one format in one runtime, over all inputs that it tried.
+
+    Each kind says what it is called in parity.json, and how it is told in a sentence and in a table's cell.
+    ``rounding`` is not zero where the worst difference is above the tolerance, but within what float32 explains.
+    """
+
+    kind: ClassVar[str]
+    #: ``max_abs_diff`` is a difference of numbers, which a tolerance bounds.
+    measured: ClassVar[bool] = False
+
+    format: str
+    runtime: str
+    output: str
+    max_abs_diff: float
+    max_rel_diff: float
+    tolerance: Tolerance
+    passed: bool
+    worst_input: str | None
+    reason: str = ""
+    drift: tuple[float, ...] = ()
+    rounding: float = 0.0
+    #: Elements of all inputs per decade of ``|a − b|``, see exporter/verify/histogram.py.
+    histogram: tuple[int, ...] = ()
+    #: The smallest t that would pass as atol and rtol; None where no tolerance would, or none is needed.
+    smallest_tolerance: float | None = None
+    #: Where a disagreement begins; None where it was not looked for (nothing failed, or the reason says it all).
+    bisection: Bisection | None = None
+
+    @property
+    def where(self) -> str:
+        """The format and the runtime."""
+        return f"{self.format} in {self.runtime}"
+
+    @property
+    def bound(self) -> str:
+        """What is allowed, as a formula."""
+        return f"{self.tolerance.atol:g} + {self.tolerance.rtol:g}·|reference|"
+
+    def cell(self) -> str:
+        """What is said of the output in a table."""
+        return f"{self.max_abs_diff:.1e}" if self.max_abs_diff else "0"
+
+    def columns(self) -> tuple[str, str, str]:
+        """The difference, the relative one and what is allowed, for a table; empty where there is no such number."""
+        return "", "", ""
+
+    def sentence(self) -> str:
+        """What went wrong, where this one did not pass."""
+        text = f"{self.where}: {self.output} differs"
+        if self.reason:
+            text += f": {self.reason}"
+        elif math.isfinite(self.max_abs_diff):
+            text += f" by {self.max_abs_diff:.3g} (relative {self.max_rel_diff:.3g}), allowed {self.bound}"
+        return f"{text} [{self.kind}, {self.worst_input}]"
+
+    def explanation(self) -> list[str]:
+        """Why it did not pass, a line each: what and where, the first tensor that differs, what would pass."""
+        lines = [self.sentence()]
+        if self.bisection is not None:
+            lines.append(self.bisection.sentence())
+        if not self.passed and self.smallest_tolerance is not None:
+            least = _rounded_up(self.smallest_tolerance)
+            lines.append(f"smallest tolerance that would pass: {least}, as atol and rtol")
+        return lines
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in parity.json."""
+        entry: dict[str, Any] = {
+            "format": self.format,
+            "runtime": self.runtime,
+            "output": self.output,
+            "kind": self.kind,
+            "max_abs_diff": _number(self.max_abs_diff),
+            "max_rel_diff": _number(self.max_rel_diff),
+            "atol": self.tolerance.atol,
+            "rtol": self.tolerance.rtol,
+            "passed": self.passed,
+            "worst_input": self.worst_input,
+        }
+        if self.tolerance.reason:
+            entry["tolerance_reason"] = self.tolerance.reason
+        if self.rounding:
+            entry["rounding"] = self.rounding
+        if self.reason:
+            entry["reason"] = self.reason
+        if self.drift:
+            entry["drift"] = [_number(d) for d in self.drift]
+        if any(self.histogram):
+            entry["histogram"] = to_dict(self.histogram)
+        if self.smallest_tolerance is not None and not self.passed:
+            entry["smallest_tolerance"] = self.smallest_tolerance
+        if self.bisection is not None:
+            entry["bisection"] = self.bisection.to_dict()
+        return entry
+
+
+class Numbers(Finding):
+    """An output's numbers, inputs given one at a time."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "numbers"
+    measured: ClassVar[bool] = True
+
+    def columns(self) -> tuple[str, str, str]:
+        """As they are."""
+        return f"{self.max_abs_diff:.2e}", f"{self.max_rel_diff:.2e}", self.bound
+
+
+class Rollout(Numbers):
+    """An output's numbers with the memory fed back; ``drift`` has the worst difference of each step."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "rollout"
+
+
+class Shape(Finding):
+    """A drawn output's shape, dtype and range."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "shape"
+
+    def cell(self) -> str:
+        """There is no number to tell."""
+        return "drawn"
+
+
+class Draws(Shape):
+    """How a drawn output is distributed; ``max_abs_diff`` is the p-value's complement."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "draws"
+
+    def columns(self) -> tuple[str, str, str]:
+        """The p-value, and what it must reach."""
+        return "", "", f"p >= {FALSE_ALARM:g}: p = {1 - self.max_abs_diff:.2g}"
+
+
+class Failure(Finding):
+    """A runtime that gave no answer; ``output`` is "*" where that is so for all."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "failure"
+
+    def sentence(self) -> str:
+        """What the runtime said."""
+        return f"{self.where}: {self.reason}"
+
+
+class Size(Finding):
+    """The bytes of a format beside its budget; ``max_abs_diff`` is what there is too many."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "size"
+
+    def cell(self) -> str:
+        """Whether the budget is kept."""
+        return "kept" if self.passed else "exceeded"
+
+    def sentence(self) -> str:
+        """How large it is."""
+        return f"{self.format} is too large: {self.reason}"
+
+
+def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -> Failure:
+    """What a runtime said when it gave no answer."""
+    text = error.what if error.why is None else f"{error.what}: {error.why}"
+    infinite = float("inf")
+    return Failure(kind, runtime, output, infinite, infinite, Tolerance(), False, None, text.strip())
+
+
+def _number(value: float) -> float | str:
+    """JSON has no infinities: they are strings."""
+    return value if math.isfinite(value) else str(value)
+
+
+def _rounded_up(value: float) -> str:
+    """Three digits, never less than ``value``: who gives it as a tolerance must pass."""
+    if value <= 0:
+        return "0"
+    digit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    text = f"{value:.3g}"
+    return text if float(text) >= value else f"{float(text) + digit:.3g}"

@@ -1,0 +1,160 @@
+"""What the checks of one policy share: inputs, the reference's answers to them, and how an answer is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from converters.formats import narrows
+from converters.graph.nodes import Graph
+from converters.graph.run import run_graph
+from converters.runtimes.pool import RuntimePool
+from exporter.verify.bisection import Bisector
+from exporter.verify.difference import Difference, compare, floored, ties
+from exporter.verify.findings import Bisection, Finding
+from exporter.verify.golden import Golden, read_golden
+from exporter.verify.participants import Entrant, Feeds
+from exporter.verify.reference import Reference
+from exporter.verify.rounding import Rounding
+from exporter.verify.subject import Subject, VerifyOptions
+from exporter.verify.tolerances import Tolerance, ruled, tolerance_for
+from signatures.roles import Role
+from signatures.sampling import Case, draw_cases, draw_rollout
+
+Arrays = dict[str, np.ndarray]
+
+
+class Trial:
+    """One policy that is tried. Raises UsageError where a recording does not fit it."""
+
+    def __init__(self, subject: Subject, pool: RuntimePool, options: VerifyOptions) -> None:
+        self.subject, self.pool, self.options = subject, pool, options
+        self.signature = subject.signature
+        self.golden = Golden() if options.golden is None else read_golden(options.golden, self.signature)
+        drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
+        self.cases = [*drawn, *self.golden.cases]
+        self.steps = self._rollout_feeds()
+        self.expected: list[Arrays] = []
+        self.expected_steps: list[Arrays] = []
+
+    def ask(self, reference: Reference) -> None:
+        """Have every input answered by the reference. Raises RunFailedError."""
+        self.reference = reference
+        self.expected = [reference.answers(case.feeds) for case in self.cases]
+        self.expected_steps = self.rolled(reference.answers)
+        numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
+        self.rounding = Rounding(self.options.seed, numbers, self._settled)
+        self.bisector = Bisector(self.subject, self.pool, self._is_right, self.rounding.inside)
+
+    def drawn(self, name: str, entrant: Entrant) -> bool:
+        """Whether the reference or the participant draws an output: there is no number to compare then."""
+        return name in self.reference.drawn or name in entrant.drawn
+
+    def tolerance(self, output: str, entrant: Entrant) -> Tolerance:
+        """How far apart they may be: what a user said, an exception of the table, or the default."""
+        found = ruled(self.options.rules, self.subject.name, entrant.format, entrant.runtime, output)
+        return found or tolerance_for(self.signature, output, self.options.tolerance)
+
+    def difference(
+        self, name: str, expected: Feeds, got: np.ndarray, entrant: Entrant, case: Case | None = None
+    ) -> Difference:
+        """``got`` beside the reference's answer; what rounding explains for ``case`` is looked at where it matters."""
+        found = self._compared(name, expected, got, entrant, None)
+        if case is None or found.passed or found.reason or got.dtype.kind != "f":
+            return found
+        return self._compared(name, expected, got, entrant, self.rounding.outputs(self.reference.model, case).get(name))
+
+    def _compared(
+        self, name: str, expected: Feeds, got: np.ndarray, entrant: Entrant, rounding: np.ndarray | None
+    ) -> Difference:
+        return compare(
+            self._settled(expected)[name],
+            self._settled({name: got})[name],
+            self.tolerance(name, entrant),
+            free=self._ties(name, expected, entrant),
+            narrowed=narrows(entrant.format),
+            rounding=rounding,
+        )
+
+    def bisected(
+        self, entrant: Entrant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
+    ) -> Bisection | None:
+        """Where a difference begins; None where there is none, or its reason says all there is to say."""
+        if difference.passed:
+            return None
+        found = self.bisector.find(entrant, output, feeds, self.tolerance(output, entrant), branch)
+        return None if found.tensor is None and difference.reason else found
+
+    def finding(
+        self,
+        kind: type[Finding],
+        entrant: Entrant,
+        output: str,
+        difference: Difference,
+        where: str,
+        drift: tuple[float, ...] = (),
+        bisection: Bisection | None = None,
+    ) -> Finding:
+        """What a check says, from the difference that it found."""
+        return kind(
+            entrant.name,
+            entrant.runtime,
+            output,
+            difference.max_abs,
+            difference.max_rel,
+            self.tolerance(output, entrant),
+            difference.passed,
+            where,
+            difference.reason,
+            drift,
+            difference.rounding,
+            difference.histogram,
+            None if difference.passed else difference.smallest_tolerance,
+            bisection,
+        )
+
+    def rolled(self, run: Callable[[Feeds], Arrays]) -> list[Arrays]:
+        """Outputs of each step, the memory fed back."""
+        memory = self.signature.memory
+        answers: list[Arrays] = []
+        for feeds in self.steps:
+            assert memory is not None and memory.input is not None and memory.output is not None
+            if answers:
+                feeds = {**feeds, memory.input: answers[-1][memory.output]}
+            answers.append(run(feeds))
+        return answers
+
+    def _is_right(self, graph: Graph) -> bool:
+        """Whether ``graph``, run by the numpy kernels, gives what the reference does."""
+        numpy = Entrant("reference", "numpy", self.reference.model.run, [], self.reference.model)
+        for case, expected in zip(self.cases, self.expected, strict=True):
+            got = run_graph(graph, case.feeds, list(expected))
+            if not all(self.difference(name, expected, got[name], numpy, case).passed for name in expected):
+                return False
+        return True
+
+    def _settled(self, values: Feeds) -> Arrays:
+        """Values as they are compared: log-probabilities that say "never" are all the same."""
+        scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
+        return {
+            n: floored(a, self.signature.branches) if n in scores and a.dtype.kind == "f" and a.ndim else a
+            for n, a in values.items()
+        }
+
+    def _ties(self, name: str, expected: Feeds, entrant: Entrant) -> np.ndarray | None:
+        """Where an argmax is not decided, because the scores of the reference are too close."""
+        spec = self.signature.output(name)
+        if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
+            return None
+        scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
+        if scores is None or scores not in expected:
+            return None
+        found = ties(expected[scores], self.signature.branches, self.tolerance(scores, entrant))
+        return found if found.shape == expected[name].shape else None
+
+    def _rollout_feeds(self) -> list[Arrays]:
+        memory = self.signature.memory
+        if memory is None or memory.input is None or memory.output is None:
+            return []
+        return draw_rollout(self.signature, seed=self.options.seed, steps=self.options.steps)
