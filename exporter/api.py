@@ -15,8 +15,8 @@ from exporter.export.labels import Labels
 from exporter.export.pipeline import ExportOptions, ExportResult, export, verify_folder
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
+from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import VerifyOptions
 from signatures.errors import ParityError, UsageError
 from signatures.roles import Role, parse_role
 

@@ -13,7 +13,7 @@ from exporter.cli.options import comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
-    from exporter.verify.subject import VerifyOptions
+    from exporter.verify.options import VerifyOptions
 
 
 @click.command("compare")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
     from exporter.export.pipeline import ExportResult
     from exporter.reports.entry import Entry
-    from exporter.verify.subject import VerifyOptions
+    from exporter.verify.options import VerifyOptions
 
 
 class _Lazy(click.Option):

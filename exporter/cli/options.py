@@ -104,7 +104,7 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         **rest: Any,
     ) -> Any:
         from exporter.verify.checks.size import parse_budget
-        from exporter.verify.subject import VerifyOptions
+        from exporter.verify.options import VerifyOptions
         from exporter.verify.tolerances import Tolerance
 
         tolerance = Tolerance(atol, rtol)

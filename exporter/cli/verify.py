@@ -14,8 +14,8 @@ from exporter.cli.options import comparing, trusting
 
 if TYPE_CHECKING:
     from exporter.reports.entry import Entry
+    from exporter.verify.options import VerifyOptions
     from exporter.verify.report import ParityReport
-    from exporter.verify.subject import VerifyOptions
 
 
 @click.command("verify")

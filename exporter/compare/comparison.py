@@ -27,10 +27,10 @@ from converters.source import OriginalRun, ReadOptions
 from exporter.export.bundle import POLICY, read_policy_json
 from exporter.export.sources import read_source
 from exporter.verify.difference import compare
-from exporter.verify.participants import Entrant, Failure, Feeds, unload
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, unload
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import Subject, VerifyOptions
 from exporter.verify.tolerances import Tolerance
 from exporter.verify.verification import verify
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
@@ -108,7 +108,7 @@ def compare_artefacts(
     with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
         reference_file = Path(folder, "reference.bytes")
         reference_file.write_bytes(frozen(policy))
-        subject = Subject(
+        tested = PolicyUnderTest(
             policy.name,
             policy.signature,
             policy.graph,
@@ -119,11 +119,11 @@ def compare_artefacts(
             policy.source,
         )
 
-        def field(numpy_model: LoadedModel, failure: Failure) -> Iterator[Entrant]:
+        def taking_part(numpy_model: LoadedModel, failure: Failure) -> Iterator[Participant]:
             for candidate in matched:
-                yield from _entrants(candidate, policy, numpy_model, used, pool, failure)
+                yield from _participants(candidate, policy, numpy_model, used, pool, failure)
 
-        report = verify(subject, used, known, pool, options, progress, field=field)
+        report = verify(tested, used, known, pool, options, progress, participants=taking_part)
     notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
     report = replace(report, notes=(*report.notes, *notes))
     if report.passed is None and not allow_unverified:
@@ -330,14 +330,14 @@ def _constants(own: Ports, policy: Policy, taken: set[str]) -> tuple[dict[str, n
 # ---- running
 
 
-def _entrants(
+def _participants(
     candidate: _Candidate,
     policy: Policy,
     numpy_model: LoadedModel,
     runtimes: Sequence[str],
     pool: RuntimePool,
     failure: Failure,
-) -> Iterator[Entrant]:
+) -> Iterator[Participant]:
     chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
         try:
@@ -353,7 +353,7 @@ def _entrants(
             failure(candidate.label, runtime, RunFailedError(problem.text + hints.get(problem.name, "")), problem.name)
         if candidate.outputs and not blocked:
             run = _renamed(model, candidate)
-            yield Entrant(
+            yield Participant(
                 candidate.format.key, runtime, run, list(candidate.outputs), model, candidate.label, candidate.drawn
             )
         unload(model)

@@ -25,8 +25,9 @@ from exporter.export import bundle
 from exporter.export.labels import Labels, labelled, read_labels
 from exporter.export.sources import Source, naming, read_source
 from exporter.verify.inner_tensors import saved_graph
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import Subject, VerifyOptions
 from exporter.verify.verification import verify
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.spec import SourceMap
@@ -114,8 +115,8 @@ def export(
             with _staged(options.out, content, artifacts) as stage, tempfile.TemporaryDirectory() as scratch:
                 report = None
                 if runtimes:
-                    subject = _subject(job, stage, artifacts, Path(scratch))
-                    report = verify(subject, runtimes, known, pool, options.parity, progress)
+                    tested = _tested(job, stage, artifacts, Path(scratch))
+                    report = verify(tested, runtimes, known, pool, options.parity, progress)
                     with bundle.writing(options.out):
                         (stage / bundle.PARITY).write_bytes(bundle.dumps(report.to_dict()))
                 failed = report is not None and report.passed is False
@@ -157,7 +158,7 @@ def _staged(out: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]
             shutil.rmtree(stage, ignore_errors=True)
 
 
-def _subject(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> Subject:
+def _tested(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     policy = job.policy
     paths = {a.format.key: stage / a.main for a in artifacts}
     reference = paths.get("bytes")
@@ -166,7 +167,7 @@ def _subject(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pat
         reference = scratch / "reference.bytes"
         reference.write_bytes(frozen(policy))
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    return Subject(
+    return PolicyUnderTest(
         policy.name,
         policy.signature,
         policy.graph,
@@ -223,9 +224,11 @@ def verify_folder(
     )
     used, known = chosen_runtimes(runtimes, [WRITTEN[key] for key in artefacts])
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    subject = Subject(name, signature, policy.graph, artefacts, _sizes(content), graph_file, original, source_map, keys)
+    tested = PolicyUnderTest(
+        name, signature, policy.graph, artefacts, _sizes(content), graph_file, original, source_map, keys
+    )
     with RuntimePool() as pool:
-        report = verify(subject, used or ("numpy",), known, pool, options, progress)
+        report = verify(tested, used or ("numpy",), known, pool, options, progress)
     if source is None:
         note = "the source was not given: the reference is the bundle's own .bytes"
         report = replace(report, reference="bytes/numpy", notes=(*report.notes, note), self_consistent=False)

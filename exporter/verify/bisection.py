@@ -22,9 +22,8 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
 from exporter.verify.difference import Difference, compare
 from exporter.verify.findings import Bisection
-from exporter.verify.inner_tensors import Inside, inside, onnx_sources, outputs_read, saved_graph
-from exporter.verify.participants import Entrant, Feeds
-from exporter.verify.subject import Subject
+from exporter.verify.inner_tensors import InnerTensors, inner_tensors, onnx_sources, outputs_read, saved_graph
+from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError
 
@@ -40,13 +39,13 @@ class Bisector:
     """
 
     def __init__(
-        self, subject: Subject, pool: RuntimePool, agrees: Callable[[Graph], bool], rounding: Rounding
+        self, tested: PolicyUnderTest, pool: RuntimePool, agrees: Callable[[Graph], bool], rounding: Rounding
     ) -> None:
-        self.subject, self.pool = subject, pool
+        self.tested, self.pool = tested, pool
         self._agrees, self._rounding = agrees, rounding
         self._graph: Graph | None = None
         self._looked = False
-        self._opened: tuple[tuple[str, str], Inside] | None = None
+        self._opened: tuple[tuple[str, str], InnerTensors] | None = None
         self._stack = contextlib.ExitStack()
         self._sources: dict[str, str] | None = None
 
@@ -55,13 +54,15 @@ class Bisector:
         self._opened = None
         self._stack.close()
 
-    def find(self, entrant: Entrant, output: str, feeds: Feeds, tolerance: Tolerance, branch: int = 0) -> Bisection:
-        """Where ``output`` of ``entrant`` begins to differ for ``feeds``; ``branch`` is the one drawn wrongly."""
-        graph = None if entrant.path is None else self.graph()
+    def find(
+        self, participant: Participant, output: str, feeds: Feeds, tolerance: Tolerance, branch: int = 0
+    ) -> Bisection:
+        """Where ``output`` of ``participant`` begins to differ for ``feeds``; ``branch`` is the one drawn wrongly."""
+        graph = None if participant.path is None else self.graph()
         if graph is None:
             return Bisection(None, reason="no graph at hand computes what the reference does")
         try:
-            search = _Search(graph, self._inside(entrant), feeds, tolerance, self._rounding, self._source)
+            search = _Search(graph, self._within(participant), feeds, tolerance, self._rounding, self._source)
             return search.first(output, branch)
         except (ExportModelError, OSError) as error:
             why = getattr(error, "why", None)
@@ -75,27 +76,27 @@ class Bisector:
         return self._graph
 
     def _graphs(self) -> Iterator[Graph]:
-        yield plain(self.subject.graph)
+        yield plain(self.tested.graph)
         with contextlib.suppress(ExportModelError, OSError):
-            yield plain(read_graph(self.subject.reference.read_bytes()))
-        saved = self.subject.artefacts.get("saved_model")
+            yield plain(read_graph(self.tested.reference.read_bytes()))
+        saved = self.tested.artefacts.get("saved_model")
         if saved is not None:
             with contextlib.suppress(ExportModelError, OSError):
                 yield plain(saved_graph(saved))
 
-    def _inside(self, entrant: Entrant) -> Inside:
-        key = (entrant.name, entrant.runtime)
+    def _within(self, participant: Participant) -> InnerTensors:
+        key = (participant.name, participant.runtime)
         if self._opened is None or self._opened[0] != key:
             self.close()
-            assert entrant.path is not None
-            found = self._stack.enter_context(inside(entrant, entrant.path, self.pool))
+            assert participant.path is not None
+            found = self._stack.enter_context(inner_tensors(participant, participant.path, self.pool))
             self._opened = (key, found)
         return self._opened[1]
 
     def _source(self, node: Node) -> str | tuple[str, ...] | None:
         """The source's tensor: what the graph knows of it, else what the bundle's .onnx does."""
         if self._sources is None:
-            path = self.subject.artefacts.get("onnx")
+            path = self.tested.artefacts.get("onnx")
             self._sources = {} if path is None else dict(_noted(path))
         if node.origin is None or node.origin == f"{node.name}:0":
             return self._sources.get(node.name, node.origin)
@@ -108,7 +109,7 @@ class _Search:
     def __init__(
         self,
         graph: Graph,
-        candidate: Inside,
+        candidate: InnerTensors,
         feeds: Feeds,
         tolerance: Tolerance,
         rounding: Rounding,

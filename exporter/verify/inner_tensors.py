@@ -28,11 +28,11 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.saved_model.reader import read_saved_model
 from converters.source import OriginalRun
-from exporter.verify.participants import Entrant, Feeds, Run
+from exporter.verify.participants import Feeds, Participant, Run
 
 
 @dataclass(frozen=True)
-class Inside:
+class InnerTensors:
     """``view`` says how the format has a tensor of the graph (None: not at all), ``run`` fetches what it calls so."""
 
     view: Callable[[str], View | None]
@@ -45,16 +45,16 @@ class Inside:
         return {tensor: view.restored(values[view.name]) for tensor, view in views.items()}
 
 
-def inside(entrant: Entrant, path: Path, pool: RuntimePool) -> AbstractContextManager[Inside]:
-    """The inside of ``entrant``, whose file is ``path``. To enter it raises RunFailedError where it is not loaded."""
-    kind, _, key = entrant.format.partition(":")
+def inner_tensors(participant: Participant, path: Path, pool: RuntimePool) -> AbstractContextManager[InnerTensors]:
+    """Those of ``participant``, whose file is ``path``. To enter it raises RunFailedError where it is not loaded."""
+    kind, _, key = participant.format.partition(":")
     if kind == "saved_model":
         return _saved_model(path, key or "serving_default", pool)
     if kind == "onnx":
-        return _onnx(entrant.runtime, path, pool)
+        return _onnx(participant.runtime, path, pool)
     if kind == "tfjs":
-        return contextlib.nullcontext(Inside(_own_name(_tfjs_nodes(path)), entrant.model.run))
-    return contextlib.nullcontext(Inside(_own_name(_graph_nodes(path)), _not_what_is_fed(entrant.model.run)))
+        return contextlib.nullcontext(InnerTensors(_own_name(_tfjs_nodes(path)), participant.model.run))
+    return contextlib.nullcontext(InnerTensors(_own_name(_graph_nodes(path)), _not_what_is_fed(participant.model.run)))
 
 
 def _not_what_is_fed(run: Run) -> Run:
@@ -82,7 +82,7 @@ def _tfjs_nodes(folder: Path) -> frozenset[str]:
 
 
 @contextmanager
-def _saved_model(folder: Path, key: str, pool: RuntimePool) -> Iterator[Inside]:
+def _saved_model(folder: Path, key: str, pool: RuntimePool) -> Iterator[InnerTensors]:
     message = schema.parse(schema.SavedModel, (folder / "saved_model.pb").read_bytes(), "SavedModel")
     meta = message.meta_graphs[0]
     fed = {name: normal_ref(info.name) for name, info in meta.signature_def[key].inputs.items()}
@@ -95,11 +95,11 @@ def _saved_model(folder: Path, key: str, pool: RuntimePool) -> Iterator[Inside]:
         return model.run({fed[n]: a for n, a in feeds.items() if n in fed}, fetch)
 
     with _unloading(model):
-        yield Inside(_own_name(frozenset(n.name for n in meta.graph_def.node)), run)
+        yield InnerTensors(_own_name(frozenset(n.name for n in meta.graph_def.node)), run)
 
 
 @contextmanager
-def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[Inside]:
+def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[InnerTensors]:
     import onnx
 
     model = onnx.ModelProto.FromString(path.read_bytes())
@@ -131,7 +131,7 @@ def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[Inside]:
 
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / path.name
-        yield Inside(view, run)
+        yield InnerTensors(view, run)
 
 
 @contextmanager

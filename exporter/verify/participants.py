@@ -1,19 +1,21 @@
-"""Who takes part in a verification: each format of the subject in each runtime that runs it."""
+"""Who takes part in a verification: each format of the tested in each runtime that runs it."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from converters.formats import WRITTEN
+from converters.graph.nodes import Graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
+from converters.source import OriginalRun
 from exporter.verify.findings import Finding
-from exporter.verify.subject import Subject
+from signatures.spec import PolicySignature, SourceMap
 
 #: The runtime that takes longest to start, by far.
 _SLOWEST = "tensorflow"
@@ -24,8 +26,26 @@ Failure = Callable[[str, str, RunFailedError, str], None]
 Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
 
 
+@dataclass(frozen=True)
+class PolicyUnderTest:
+    """What is verified: the artefacts of one policy, and where its source is."""
+
+    name: str
+    signature: PolicySignature
+    graph: Graph
+    #: format → path that a loader is given
+    artefacts: Mapping[str, Path]
+    sizes: Mapping[str, int]
+    #: a .bytes of the policy for the numpy reference (the artefact itself, or one made for this)
+    reference: Path
+    source: OriginalRun | None = None
+    source_map: SourceMap = field(default_factory=SourceMap)
+    #: signatures of the SavedModel: key → (inputs, outputs)
+    signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
+
+
 @dataclass
-class Entrant:
+class Participant:
     """One format in one runtime: how to run it, what it can answer. ``model`` runs inner tensors too."""
 
     format: str
@@ -46,34 +66,34 @@ class Entrant:
         return self.label or self.format
 
 
-def needed_runtimes(subject: Subject, runtimes: Sequence[str]) -> list[str]:
-    """Those of ``runtimes`` that run something of this subject, the reference's first."""
-    source = () if subject.source is None else (subject.source.runtime,)
-    useful = ["numpy", *source, *(r for kind in subject.artefacts for r in WRITTEN[kind].runtimes)]
+def needed_runtimes(tested: PolicyUnderTest, runtimes: Sequence[str]) -> list[str]:
+    """Those of ``runtimes`` that run something of this tested, the reference's first."""
+    source = () if tested.source is None else (tested.source.runtime,)
+    useful = ["numpy", *source, *(r for kind in tested.artefacts for r in WRITTEN[kind].runtimes)]
     return [r for r in dict.fromkeys(useful) if r == "numpy" or r in runtimes]
 
 
-def entrants(
-    subject: Subject,
+def participants_of(
+    tested: PolicyUnderTest,
     runtimes: Sequence[str],
     pool: RuntimePool,
     reference: LoadedModel,
     failure: Failure,
-) -> Iterator[Entrant]:
+) -> Iterator[Participant]:
     """The numpy reference, then every format in every runtime, loaded one at a time.
 
     What does not load goes to ``failure`` (format, runtime, error) and takes no part.
     """
-    outputs = [s.name for s in subject.signature.outputs]
-    yield Entrant("reference", "numpy", reference.run, outputs, reference, path=subject.reference)
-    pairs = [(kind, runtime) for kind in subject.artefacts for runtime in WRITTEN[kind].runtimes]
+    outputs = [s.name for s in tested.signature.outputs]
+    yield Participant("reference", "numpy", reference.run, outputs, reference, path=tested.reference)
+    pairs = [(kind, runtime) for kind in tested.artefacts for runtime in WRITTEN[kind].runtimes]
     taking_part = [(kind, runtime) for kind, runtime in pairs if runtime in runtimes and runtime != "numpy"]
     # The others run while TensorFlow is still being imported; ``in_order`` puts the report right again.
     for kind, runtime in sorted(taking_part, key=lambda pair: pair[1] == _SLOWEST):
-        path = subject.artefacts[kind]
+        path = tested.artefacts[kind]
         loads = {"": list(outputs)}
         if WRITTEN[kind].signatures:
-            loads = {key: list(names[1]) for key, names in subject.signatures.items()}
+            loads = {key: list(names[1]) for key, names in tested.signatures.items()}
         for key, names in loads.items():
             label = kind if key in ("", "serving_default") else f"{kind}:{key}"
             try:
@@ -81,16 +101,16 @@ def entrants(
             except RunFailedError as error:
                 failure(label, runtime, error, "*")
                 continue
-            run = _limited(model.run, subject.signatures.get(key))
+            run = _limited(model.run, tested.signatures.get(key))
             if WRITTEN[kind].predicts:
                 run = _predicting(model, names)
-            yield Entrant(label, runtime, run, names, model, path=path)
+            yield Participant(label, runtime, run, names, model, path=path)
             unload(model)
 
 
-def in_order(results: Iterable[Finding], subject: Subject) -> tuple[Finding, ...]:
+def in_order(results: Iterable[Finding], tested: PolicyUnderTest) -> tuple[Finding, ...]:
     """Results as they are reported: by format and runtime, whichever was ready first. The reference's come first."""
-    kinds = list(subject.artefacts)
+    kinds = list(tested.artefacts)
 
     def place(result: Finding) -> tuple[int, int]:
         kind = result.format.partition(":")[0]

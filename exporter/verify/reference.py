@@ -12,8 +12,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from exporter.verify.findings import Failure, failure
 from exporter.verify.original import Original
-from exporter.verify.participants import unload
-from exporter.verify.subject import Subject
+from exporter.verify.participants import PolicyUnderTest, unload
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -21,18 +20,18 @@ Arrays = Mapping[str, np.ndarray]
 class Reference:
     """What all others are held against; to leave the context frees it. Raises RunFailedError where numpy fails."""
 
-    def __init__(self, subject: Subject, runtimes: Sequence[str], pool: RuntimePool, seed: int) -> None:
-        self.signature = subject.signature
+    def __init__(self, tested: PolicyUnderTest, runtimes: Sequence[str], pool: RuntimePool, seed: int) -> None:
+        self.signature = tested.signature
         #: the numpy kernels, in their child
-        self.model: LoadedModel = pool.process("numpy").load(str(subject.reference), seed=seed)
+        self.model: LoadedModel = pool.process("numpy").load(str(tested.reference), seed=seed)
         self.original: Original | None = None
         #: outputs that a sampler in the graph decides
-        self.drawn = random_outputs(subject.graph, [s.name for s in self.signature.outputs])
+        self.drawn = random_outputs(tested.graph, [s.name for s in self.signature.outputs])
         #: what the source's own runtime refused
         self.failures: list[Failure] = []
         self.name = "numpy"
         self._loaded = [self.model]
-        source = subject.source
+        source = tested.source
         if source is None or source.runtime not in runtimes:
             return
         try:
@@ -42,7 +41,7 @@ class Reference:
             self.failures.append(failure("source", source.runtime, error))
             return
         self._loaded.append(model)
-        self.original = Original(model, self.signature, subject.source_map)
+        self.original = Original(model, self.signature, tested.source_map)
         self.name = f"source/{source.runtime}"
 
     @property

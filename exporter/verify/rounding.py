@@ -46,7 +46,7 @@ class Rounding:
             self._known[case.name] = {n: _largest(exact[n], [m[n] for m in moved]) for n in exact}
         return self._known[case.name]
 
-    def inside(self, graph: Graph, feeds: Feeds, tensor: str) -> np.ndarray:
+    def inner(self, graph: Graph, feeds: Feeds, tensor: str) -> np.ndarray:
         """The same for a tensor inside ``graph``, in this process."""
         exact = run_graph(graph, feeds, [tensor])[tensor]
         moved = [run_graph(graph, feeds, [tensor], np.random.default_rng(j))[tensor] for j in self._jitters]

@@ -14,10 +14,10 @@ from exporter.verify.bisection import Bisector
 from exporter.verify.difference import Difference, compare, floored, ties
 from exporter.verify.findings import Bisection, Finding
 from exporter.verify.golden import Golden, read_golden
-from exporter.verify.participants import Entrant, Feeds
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.reference import Reference
 from exporter.verify.rounding import Rounding
-from exporter.verify.subject import Subject, VerifyOptions
 from exporter.verify.tolerances import Tolerance, ruled, tolerance_for
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
@@ -28,9 +28,9 @@ Arrays = dict[str, np.ndarray]
 class Trial:
     """One policy that is tried. Raises UsageError where a recording does not fit it."""
 
-    def __init__(self, subject: Subject, pool: RuntimePool, options: VerifyOptions) -> None:
-        self.subject, self.pool, self.options = subject, pool, options
-        self.signature = subject.signature
+    def __init__(self, tested: PolicyUnderTest, pool: RuntimePool, options: VerifyOptions) -> None:
+        self.tested, self.pool, self.options = tested, pool, options
+        self.signature = tested.signature
         self.golden = Golden() if options.golden is None else read_golden(options.golden, self.signature)
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
@@ -45,51 +45,53 @@ class Trial:
         self.expected_steps = self.rolled(reference.answers)
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
         self.rounding = Rounding(self.options.seed, numbers, self._settled)
-        self.bisector = Bisector(self.subject, self.pool, self._is_right, self.rounding.inside)
+        self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
 
-    def drawn(self, name: str, entrant: Entrant) -> bool:
+    def drawn(self, name: str, participant: Participant) -> bool:
         """Whether the reference or the participant draws an output: there is no number to compare then."""
-        return name in self.reference.drawn or name in entrant.drawn
+        return name in self.reference.drawn or name in participant.drawn
 
-    def tolerance(self, output: str, entrant: Entrant) -> Tolerance:
+    def tolerance(self, output: str, participant: Participant) -> Tolerance:
         """How far apart they may be: what a user said, an exception of the table, or the default."""
-        found = ruled(self.options.rules, self.subject.name, entrant.format, entrant.runtime, output)
+        found = ruled(self.options.rules, self.tested.name, participant.format, participant.runtime, output)
         return found or tolerance_for(self.signature, output, self.options.tolerance)
 
     def difference(
-        self, name: str, expected: Feeds, got: np.ndarray, entrant: Entrant, case: Case | None = None
+        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, case: Case | None = None
     ) -> Difference:
         """``got`` beside the reference's answer; what rounding explains for ``case`` is looked at where it matters."""
-        found = self._compared(name, expected, got, entrant, None)
+        found = self._compared(name, expected, got, participant, None)
         if case is None or found.passed or found.reason or got.dtype.kind != "f":
             return found
-        return self._compared(name, expected, got, entrant, self.rounding.outputs(self.reference.model, case).get(name))
+        return self._compared(
+            name, expected, got, participant, self.rounding.outputs(self.reference.model, case).get(name)
+        )
 
     def _compared(
-        self, name: str, expected: Feeds, got: np.ndarray, entrant: Entrant, rounding: np.ndarray | None
+        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: np.ndarray | None
     ) -> Difference:
         return compare(
             self._settled(expected)[name],
             self._settled({name: got})[name],
-            self.tolerance(name, entrant),
-            free=self._ties(name, expected, entrant),
-            narrowed=narrows(entrant.format),
+            self.tolerance(name, participant),
+            free=self._ties(name, expected, participant),
+            narrowed=narrows(participant.format),
             rounding=rounding,
         )
 
     def bisected(
-        self, entrant: Entrant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
+        self, participant: Participant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
     ) -> Bisection | None:
         """Where a difference begins; None where there is none, or its reason says all there is to say."""
         if difference.passed:
             return None
-        found = self.bisector.find(entrant, output, feeds, self.tolerance(output, entrant), branch)
+        found = self.bisector.find(participant, output, feeds, self.tolerance(output, participant), branch)
         return None if found.tensor is None and difference.reason else found
 
     def finding(
         self,
         kind: type[Finding],
-        entrant: Entrant,
+        participant: Participant,
         output: str,
         difference: Difference,
         where: str,
@@ -98,12 +100,12 @@ class Trial:
     ) -> Finding:
         """What a check says, from the difference that it found."""
         return kind(
-            entrant.name,
-            entrant.runtime,
+            participant.name,
+            participant.runtime,
             output,
             difference.max_abs,
             difference.max_rel,
-            self.tolerance(output, entrant),
+            self.tolerance(output, participant),
             difference.passed,
             where,
             difference.reason,
@@ -127,7 +129,7 @@ class Trial:
 
     def _is_right(self, graph: Graph) -> bool:
         """Whether ``graph``, run by the numpy kernels, gives what the reference does."""
-        numpy = Entrant("reference", "numpy", self.reference.model.run, [], self.reference.model)
+        numpy = Participant("reference", "numpy", self.reference.model.run, [], self.reference.model)
         for case, expected in zip(self.cases, self.expected, strict=True):
             got = run_graph(graph, case.feeds, list(expected))
             if not all(self.difference(name, expected, got[name], numpy, case).passed for name in expected):
@@ -142,7 +144,7 @@ class Trial:
             for n, a in values.items()
         }
 
-    def _ties(self, name: str, expected: Feeds, entrant: Entrant) -> np.ndarray | None:
+    def _ties(self, name: str, expected: Feeds, participant: Participant) -> np.ndarray | None:
         """Where an argmax is not decided, because the scores of the reference are too close."""
         spec = self.signature.output(name)
         if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
@@ -150,7 +152,7 @@ class Trial:
         scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
         if scores is None or scores not in expected:
             return None
-        found = ties(expected[scores], self.signature.branches, self.tolerance(scores, entrant))
+        found = ties(expected[scores], self.signature.branches, self.tolerance(scores, participant))
         return found if found.shape == expected[name].shape else None
 
     def _rollout_feeds(self) -> list[Arrays]:

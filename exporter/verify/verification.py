@@ -14,43 +14,50 @@ from exporter.verify.checks.numbers import numbers
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.checks.size import check_budget, sizes
 from exporter.verify.findings import Finding, failure
-from exporter.verify.participants import Entrant, Failure, entrants, in_order, needed_runtimes
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import (
+    Failure,
+    Participant,
+    PolicyUnderTest,
+    in_order,
+    needed_runtimes,
+    participants_of,
+)
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import Subject, VerifyOptions
 from exporter.verify.trial import Trial
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.
-Field = Callable[[LoadedModel, Failure], Iterable[Entrant]]
+Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
 #: What each participant is put through, one after the other.
-CHECKS: tuple[Callable[[Trial, Entrant], Iterator[Finding]], ...] = (numbers, rollout, draws, densities)
+CHECKS: tuple[Callable[[Trial, Participant], Iterator[Finding]], ...] = (numbers, rollout, draws, densities)
 
 
 def verify(
-    subject: Subject,
+    tested: PolicyUnderTest,
     runtimes: Sequence[str],
     known: Iterable[RuntimeInfo],
     pool: RuntimePool,
     options: VerifyOptions | None = None,
     progress: Callable[[str], None] = lambda text: None,
-    field: Field | None = None,
+    participants: Participants | None = None,
 ) -> ParityReport:
     """The report on one policy. A runtime that fails is a finding, not an exception.
 
-    ``field`` says who takes part, given the numpy reference; without it, the subject's artefacts do. Raises UsageError,
-    before anything runs, where an option does not fit the policy.
+    ``participants`` says who takes part, given the numpy reference; without it, the policy's artefacts do. Raises
+    UsageError, before anything runs, where an option does not fit the policy.
     """
     options = options or VerifyOptions()
-    check_budget(options.budget, subject.sizes)
-    trial = Trial(subject, pool, options)
+    check_budget(options.budget, tested.sizes)
+    trial = Trial(tested, pool, options)
     reference, findings = "none", list[Finding]()
     if runtimes:
-        progress(f"{subject.name}: starting the runtimes, running the source")
-        pool.start(needed_runtimes(subject, runtimes))
-        with Reference(subject, runtimes, pool, options.seed) as answering:
+        progress(f"{tested.name}: starting the runtimes, running the source")
+        pool.start(needed_runtimes(tested, runtimes))
+        with Reference(tested, runtimes, pool, options.seed) as answering:
             reference = answering.name
-            findings += _findings(trial, answering, runtimes, progress, field)
-    return _report(trial, reference, runtimes, known, in_order(findings, subject))
+            findings += _findings(trial, answering, runtimes, progress, participants)
+    return _report(trial, reference, runtimes, known, in_order(findings, tested))
 
 
 def _findings(
@@ -58,7 +65,7 @@ def _findings(
     reference: Reference,
     runtimes: Sequence[str],
     progress: Callable[[str], None],
-    field: Field | None,
+    participants: Participants | None,
 ) -> list[Finding]:
     findings: list[Finding] = [*reference.failures]
     try:
@@ -71,18 +78,18 @@ def _findings(
     def failed(kind: str, runtime: str, error: RunFailedError, output: str) -> None:
         findings.append(failure(kind, runtime, error, output))
 
-    taking_part: Iterable[Entrant]
-    if field is None:
-        taking_part = entrants(trial.subject, runtimes, trial.pool, reference.model, failed)
+    taking_part: Iterable[Participant]
+    if participants is None:
+        taking_part = participants_of(trial.tested, runtimes, trial.pool, reference.model, failed)
     else:
-        taking_part = field(reference.model, failed)
-    for entrant in taking_part:
-        progress(f"{trial.subject.name}: {entrant.name} in {entrant.runtime}")
+        taking_part = participants(reference.model, failed)
+    for participant in taking_part:
+        progress(f"{trial.tested.name}: {participant.name} in {participant.runtime}")
         try:
             for check in CHECKS:
-                findings += check(trial, entrant)
+                findings += check(trial, participant)
         except RunFailedError as error:
-            failed(entrant.name, entrant.runtime, error, "*")
+            failed(participant.name, participant.runtime, error, "*")
         finally:
             trial.bisector.close()
     return findings
@@ -95,7 +102,7 @@ def _report(
     known: Iterable[RuntimeInfo],
     findings: Sequence[Finding],
 ) -> ParityReport:
-    subject, options = trial.subject, trial.options
+    tested, options = trial.tested, trial.options
     versions = trial.pool.versions()
     tried = {f.runtime for f in findings}  # one that died has no version any more, but it ran
     states: dict[str, dict[str, str | None]] = {}
@@ -109,17 +116,17 @@ def _report(
         }
     # A recording held against the source says nothing of what was written.
     independent = any(f.runtime in INDEPENDENT and f.format not in ("golden", "source") for f in findings)
-    findings = [*findings, *sizes(options.budget, subject.sizes)]
+    findings = [*findings, *sizes(options.budget, tested.sizes)]
     passed = False if any(not f.passed for f in findings) else True if independent else None
     return ParityReport(
-        subject.name,
+        tested.name,
         passed,
         options.seed,
         options.samples,
         reference,
         states,
         tuple(findings),
-        subject.sizes,
-        subject.signature.notes,
-        self_consistent=subject.source is None,
+        tested.sizes,
+        tested.signature.notes,
+        self_consistent=tested.source is None,
     )

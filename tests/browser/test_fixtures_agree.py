@@ -14,7 +14,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export, verify_folder
-from exporter.verify.subject import VerifyOptions
+from exporter.verify.options import VerifyOptions
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.browser.conftest import BROWSERS, ONNX, TFJS

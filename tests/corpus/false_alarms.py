@@ -19,8 +19,8 @@ from pathlib import Path
 from converters.runtimes.pool import RuntimePool
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import VerifyOptions
 from signatures.errors import SourceError
 
 GENUINE = Path(__file__).resolve().parents[3] / "shared" / "genuine"

@@ -85,7 +85,7 @@ class ActingProcess:
         kind = "bytes" if self.name == "numpy" else format_of(place)
         if (kind, self.name) in self.pool.refused:
             raise RunFailedError(f"{self.name} failed", why="it does not like this model")
-        if place.suffix == ".bytes":
+        if kind == "source" or place.suffix == ".bytes":
             graph = graph_in(place)
             if self.name == "numpy":
                 self.pool.reference = graph
@@ -126,7 +126,9 @@ class ActingPool:
 
 
 def format_of(path: Path) -> str:
-    """Which format a loader is given; a ``.bytes`` that is not in a bundle is the source."""
+    """Which format a loader is given; a ``.bytes`` that is not in a bundle is the source, and so is ``source.pb``."""
+    if path.name == "source.pb":
+        return "source"
     if path.suffix == ".bytes":
         return "bytes" if (path.parent / "policy.json").exists() else "source"
     return {"saved_model": "saved_model", "tfjs": "tfjs"}.get(path.name, "onnx")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from exporter import export_model as export_by_python
-from exporter.verify.subject import VerifyOptions
+from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import Tolerance
 from fixtures import path as fixture
 from signatures.errors import UsageError

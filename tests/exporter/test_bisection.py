@@ -23,7 +23,7 @@ from exporter.verify import bisection as bisect
 from exporter.verify.bisection import _Search, plain
 from exporter.verify.difference import compare
 from exporter.verify.findings import Bisection, Numbers
-from exporter.verify.inner_tensors import Inside
+from exporter.verify.inner_tensors import InnerTensors
 from exporter.verify.participants import Feeds
 from exporter.verify.tolerances import Tolerance
 from fixtures import path as fixture
@@ -62,7 +62,7 @@ def searched(
             raise RunFailedError("it does not give that")
         return run_graph(other, fed, names)
 
-    within = Inside(lambda t: None if t in hidden else View(t), run)
+    within = InnerTensors(lambda t: None if t in hidden else View(t), run)
     search = _Search(graph, within, feeds, tolerance or Tolerance(), no_rounding, lambda node: node.origin)
     return search.first(output, 0)
 
@@ -139,7 +139,7 @@ def test_a_difference_within_the_tolerance_is_none(policies: dict[str, Policy]) 
 def test_of_a_draw_the_sampler_of_its_branch_is_named(policies: dict[str, Policy]) -> None:
     policy = policies["sampled"]
     case = draw_cases(policy.signature, samples=1)[1]
-    within = Inside(View, lambda fed, names: run_graph(policy.graph, fed, names))
+    within = InnerTensors(View, lambda fed, names: run_graph(policy.graph, fed, names))
     search = _Search(policy.graph, within, case.feeds, Tolerance(), no_rounding, lambda n: n.origin)
     found = search.first("action", 2)
     assert (found.tensor, found.op) == ("multinomial_2/Multinomial", "Multinomial")

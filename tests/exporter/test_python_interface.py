@@ -11,8 +11,8 @@ import exporter
 from exporter import export_model, inspect_model, verify_bundle
 from exporter.export.pipeline import ExportResult
 from exporter.inspect.inspection import Inspection
+from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import VerifyOptions
 from fixtures import path as fixture
 from signatures.errors import (
     BundleError,

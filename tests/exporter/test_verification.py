@@ -13,9 +13,9 @@ from converters.graph.options import CompileOptions
 from exporter.cli.summary import failure_lines, not_run_lines, parity_table, verdict
 from exporter.export.pipeline import ExportResult
 from exporter.verify.findings import Failure, Finding, Numbers
+from exporter.verify.options import VerifyOptions
 from exporter.verify.original import Original
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import VerifyOptions
 from exporter.verify.tolerances import Tolerance
 from fixtures import FIXTURES
 from fixtures import path as fixture
@@ -508,3 +508,25 @@ def test_a_source_that_takes_some_rows_only_is_asked_in_parts(rows: int) -> None
     state = np.arange(21, dtype=np.float32).reshape(7, 3)
     np.testing.assert_array_equal(original.run({"state": state, "gain": np.ones(2)})["action"], 2 * state)
     assert asked == [rows] * -(-7 // rows)
+
+
+# ------------------------------------------------------------------ an action without chance
+
+
+def test_an_action_without_chance_that_is_drawn_fails(exporting: Exporting, tmp_path: Path) -> None:
+    """However little: every runtime draws the same shape and range, so nothing else would see it."""
+    nodes = [
+        *continuous_policy(),
+        constant("drawn/shape", np.array([1, 2], np.int32)),
+        node("drawn/uniform", "RandomUniform", "drawn/shape", T=np.dtype(np.int32), dtype=np.dtype(np.float32)),
+        node("deterministic_action", "Add", "action", "drawn/uniform", T=np.dtype(np.float32)),
+    ]
+    source = tmp_path / "drawn.bytes"
+    source.write_bytes(graph_bytes(nodes))
+    result = exporting(source)
+    assert result.passed is False
+    found = [c for c in report_of(result).failures if c.output == "deterministic_action"]
+    assert {(c.format, c.runtime) for c in found} >= {("onnx", "onnxruntime"), ("bytes", "tensorflow")}
+    assert all(
+        "without chance, and it is drawn" in line for line in failure_lines(report_of(result)) if "[shape" in line
+    )

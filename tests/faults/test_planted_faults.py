@@ -10,8 +10,8 @@ from converters.formats import WRITTEN
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import verify_folder
 from exporter.verify.findings import Finding
+from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
-from exporter.verify.subject import VerifyOptions
 from tests.commands import export_model, is_refused
 from tests.faults.artefacts import FORMATS, opened
 from tests.faults.conftest import Bundle, Planted

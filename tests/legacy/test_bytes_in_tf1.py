@@ -20,7 +20,7 @@ from converters.runtimes.process import RunFailedError
 from converters.runtimes.tensorflow1.found import RELEASES
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.findings import Finding
-from exporter.verify.subject import Subject
+from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.verification import verify
 from fixtures import FIXTURES, path
 from fixtures.goldens import read_npz
@@ -53,7 +53,7 @@ def exported(source: Path, out: Path, **options: Any) -> list[ExportResult]:
 
 def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Finding]:
     file = result.folder / f"{result.policy.name}.bytes"
-    subject = Subject(
+    tested = PolicyUnderTest(
         name=result.policy.name,
         signature=result.policy.signature,
         graph=result.policy.graph,
@@ -61,7 +61,7 @@ def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Findi
         sizes=result.sizes,
         reference=file,
     )
-    report = verify(subject, ("numpy", legacy), (), pool)
+    report = verify(tested, ("numpy", legacy), (), pool)
     return [c for c in report.comparisons if c.runtime == legacy]
 
 

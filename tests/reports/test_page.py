@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from exporter.reports.entry import Entry, of_bundle, of_result
 from exporter.reports.page import page
 from exporter.reports.sections import shortened
-from exporter.verify.subject import VerifyOptions
+from exporter.verify.options import VerifyOptions
 from fixtures import path as fixture
 from tests.exporter.rehearsal import ActingPool, export
 from tests.reports.made import FAILING, PASSING, UNVERIFIED, entry

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.verify.subject import VerifyOptions
+from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerance_file import read_tolerances
 from exporter.verify.tolerances import Tolerance, ToleranceRule, ruled
 from fixtures import path as fixture

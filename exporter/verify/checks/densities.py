@@ -8,7 +8,7 @@ import numpy as np
 
 from exporter.verify.checks.draws import DRAWS, likely
 from exporter.verify.findings import Draws, Finding
-from exporter.verify.participants import Entrant
+from exporter.verify.participants import Participant
 from exporter.verify.statistics import same_distribution
 from exporter.verify.trial import Trial
 from signatures.roles import Role
@@ -18,15 +18,17 @@ from signatures.sampling import Case
 DENSITY_DRAWS = 4096
 
 
-def densities(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
+def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """Both are drawn many times for one input, the reference by the numpy kernels, and each number of an output is
     tested by itself (Kolmogorov-Smirnov for two samples of one size).
     """
-    names = [n for n in entrant.outputs if trial.drawn(n, entrant) and trial.signature.output(n).dtype == "float32"]
+    names = [
+        n for n in participant.outputs if trial.drawn(n, participant) and trial.signature.output(n).dtype == "float32"
+    ]
     if not names:
         return
     case = trial.cases[0]
-    runs = (trial.reference.model.run, entrant.run)
+    runs = (trial.reference.model.run, participant.run)
     cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
     feeds = _rows(trial, case, DRAWS if cameras else DENSITY_DRAWS)
     samples = [run(feeds, names) for run in runs]
@@ -35,10 +37,10 @@ def densities(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
         each = [[run(_rows(trial, case, 1, i), names) for i in range(DRAWS)] for run in runs]
         samples = [{n: np.concatenate([one[n] for one in every]) for n in names} for every in each]
     for name in names:
-        tolerance = trial.tolerance(name, entrant)
+        tolerance = trial.tolerance(name, participant)
         columns = (s[name].reshape(len(s[name]), -1).T for s in samples)
         p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in zip(*columns, strict=True)]
-        yield trial.finding(Draws, entrant, name, likely(min(p_values, default=1.0)), case.name)
+        yield trial.finding(Draws, participant, name, likely(min(p_values, default=1.0)), case.name)
 
 
 def _rows(trial: Trial, case: Case, count: int, run: int = 0) -> dict[str, np.ndarray]:

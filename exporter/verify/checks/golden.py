@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from exporter.verify.checks.numbers import rank
 from exporter.verify.difference import Difference
 from exporter.verify.findings import Finding, Numbers
-from exporter.verify.participants import Entrant
+from exporter.verify.participants import Participant
 from exporter.verify.trial import Trial
 
 
@@ -15,14 +15,14 @@ def recorded(trial: Trial) -> Iterator[Finding]:
     """The reference's answers against what the user recorded; what hangs on noise that was not is left out."""
     golden, reference = trial.golden, trial.reference
     names = [s.name for s in trial.signature.outputs if s.name not in reference.drawn]
-    names = [n for n in names if not trial.subject.graph.ancestors([n]) & golden.noiseless]
-    entrant = Entrant("golden", reference.runtime, reference.model.run, names, reference.model)
+    names = [n for n in names if not trial.tested.graph.ancestors([n]) & golden.noiseless]
+    participant = Participant("golden", reference.runtime, reference.model.run, names, reference.model)
     worst: dict[str, tuple[Difference, str]] = {}
     answers = trial.expected[len(trial.cases) - len(golden.cases) :]
     for case, expected, arrays in zip(golden.cases, answers, golden.answers, strict=True):
         for name in (n for n in arrays if n in names and n in expected):
-            found = trial.difference(name, expected, arrays[name], entrant)
+            found = trial.difference(name, expected, arrays[name], participant)
             if name not in worst or rank(found) > rank(worst[name][0]):
                 worst[name] = (found, case.name)
     for name, (difference, where) in worst.items():
-        yield trial.finding(Numbers, entrant, name, difference, where)
+        yield trial.finding(Numbers, participant, name, difference, where)

@@ -10,25 +10,25 @@ import numpy as np
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Finding, Numbers, Shape
 from exporter.verify.histogram import added
-from exporter.verify.participants import Entrant
+from exporter.verify.participants import Participant
 from exporter.verify.trial import Trial
 from signatures.roles import Role
 from signatures.sampling import Case
 from signatures.spec import PolicySignature
 
 
-def numbers(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
+def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """The worst difference of each output, and where it begins; of a drawn one its shape, dtype and range."""
     worst: dict[str, tuple[Difference, Case]] = {}
     needed: dict[str, list[float | None]] = {}
     spread: dict[str, tuple[int, ...]] = {}
     for case, expected in zip(trial.cases, trial.expected, strict=True):
-        got = entrant.run(case.feeds, list(entrant.outputs))
-        for name in entrant.outputs:
-            if trial.drawn(name, entrant):
+        got = participant.run(case.feeds, list(participant.outputs))
+        for name in participant.outputs:
+            if trial.drawn(name, participant):
                 difference = plausible(trial.signature, name, got[name], case)
             elif name in expected:
-                difference = trial.difference(name, expected, got[name], entrant, case)
+                difference = trial.difference(name, expected, got[name], participant, case)
             else:
                 continue
             spread[name] = added(spread.get(name, ()), difference.histogram)
@@ -36,10 +36,10 @@ def numbers(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
             if name not in worst or rank(difference) > rank(worst[name][0]):
                 worst[name] = (difference, case)
     for name, (difference, case) in worst.items():
-        kind = Shape if trial.drawn(name, entrant) else Numbers
+        kind = Shape if trial.drawn(name, participant) else Numbers
         difference = replace(difference, smallest_tolerance=largest(needed[name]), histogram=spread[name])
-        begins = trial.bisected(entrant, name, difference, case.feeds)
-        yield trial.finding(kind, entrant, name, difference, case.name, bisection=begins)
+        begins = trial.bisected(participant, name, difference, case.feeds)
+        yield trial.finding(kind, participant, name, difference, case.name, bisection=begins)
 
 
 def plausible(signature: PolicySignature, name: str, got: np.ndarray, case: Case) -> Difference:

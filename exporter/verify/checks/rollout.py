@@ -10,25 +10,25 @@ import numpy as np
 from exporter.verify.checks.numbers import largest, rank
 from exporter.verify.difference import Difference
 from exporter.verify.findings import Finding, Rollout
-from exporter.verify.participants import Entrant, Feeds
+from exporter.verify.participants import Feeds, Participant
 from exporter.verify.trial import Trial
 
 
-def rollout(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
+def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """How far each output drifts, and the step where that begins."""
     memory = trial.signature.memory
-    if not trial.steps or memory is None or memory.output not in entrant.outputs:
+    if not trial.steps or memory is None or memory.output not in participant.outputs:
         return
     fed: list[Feeds] = []
 
     def step(feeds: Feeds) -> dict[str, np.ndarray]:
         fed.append(feeds)
-        return entrant.run(feeds, list(entrant.outputs))
+        return participant.run(feeds, list(participant.outputs))
 
     got = trial.rolled(step)
-    names = [n for n in entrant.outputs if n in trial.expected_steps[0] and not trial.drawn(n, entrant)]
+    names = [n for n in participant.outputs if n in trial.expected_steps[0] and not trial.drawn(n, participant)]
     steps = {
-        n: [trial.difference(n, e, g[n], entrant) for e, g in zip(trial.expected_steps, got, strict=True)]
+        n: [trial.difference(n, e, g[n], participant) for e, g in zip(trial.expected_steps, got, strict=True)]
         for n in names
     }
     where = [f"step {i + 1} of {len(fed)}" for i in range(len(fed))]
@@ -41,10 +41,10 @@ def rollout(trial: Trial, entrant: Entrant) -> Iterator[Finding]:
             # An output that goes wrong after the memory did goes wrong because of it.
             output = min((n for n in (name, memory.output) if n in steps), key=lambda n: _first(steps[n]))
             first = _first(steps[output])
-            begins = trial.bisected(entrant, output, steps[output][first], fed[first])
+            begins = trial.bisected(participant, output, steps[output][first], fed[first])
             begins = begins and replace(begins, input=where[first])
         drift = tuple(d.max_abs for d in differences)
-        yield trial.finding(Rollout, entrant, name, difference, where[worst], drift, begins)
+        yield trial.finding(Rollout, participant, name, difference, where[worst], drift, begins)
 
 
 def _first(steps: Sequence[Difference]) -> int:

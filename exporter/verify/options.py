@@ -1,4 +1,4 @@
-"""What is verified, and how."""
+"""How to verify."""
 
 from __future__ import annotations
 
@@ -7,29 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from converters.graph.nodes import Graph
-from converters.source import OriginalRun
 from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
-from signatures.spec import PolicySignature, SourceMap
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What is verified: the artefacts of one policy, and where its source is."""
-
-    name: str
-    signature: PolicySignature
-    graph: Graph
-    #: format → path that a loader is given
-    artefacts: Mapping[str, Path]
-    sizes: Mapping[str, int]
-    #: a .bytes of the policy for the numpy reference (the artefact itself, or one made for this)
-    reference: Path
-    source: OriginalRun | None = None
-    source_map: SourceMap = field(default_factory=SourceMap)
-    #: signatures of the SavedModel: key → (inputs, outputs)
-    signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

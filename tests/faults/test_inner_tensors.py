@@ -11,9 +11,8 @@ from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import verify_folder
 from exporter.verify.bisection import plain
 from exporter.verify.difference import compare
-from exporter.verify.inner_tensors import inside, outputs_read, saved_graph
-from exporter.verify.participants import entrants
-from exporter.verify.subject import Subject
+from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
+from exporter.verify.participants import PolicyUnderTest, participants_of
 from exporter.verify.tolerances import Tolerance
 from signatures.sampling import draw_cases
 from tests.faults.conftest import Bundle
@@ -24,15 +23,15 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("runtimes"), pytest.mark
 HIDDEN = {"MatMul", "BiasAdd", "Conv2D", "Const"}
 
 
-def subject_of(folder: object, monkeypatch: pytest.MonkeyPatch) -> Subject:
+def tested_in(folder: object, monkeypatch: pytest.MonkeyPatch) -> PolicyUnderTest:
     """What a verification of the bundle is about."""
-    caught: list[Subject] = []
+    caught: list[PolicyUnderTest] = []
 
     class CaughtError(Exception):
         pass
 
-    def catch(subject: Subject, *rest: object, **more: object) -> None:
-        caught.append(subject)
+    def catch(tested: PolicyUnderTest, *rest: object, **more: object) -> None:
+        caught.append(tested)
         raise CaughtError
 
     monkeypatch.setattr("exporter.export.pipeline.verify", catch)
@@ -45,38 +44,38 @@ def subject_of(folder: object, monkeypatch: pytest.MonkeyPatch) -> Subject:
 def test_every_tensor_that_a_format_has_is_the_graphs(
     name: str, bundle: Bundle, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    subject = subject_of(bundle(name).folder, monkeypatch)
-    graph = plain(subject.graph)
-    case = draw_cases(subject.signature, seed=3, samples=1)[1]
+    tested = tested_in(bundle(name).folder, monkeypatch)
+    graph = plain(tested.graph)
+    case = draw_cases(tested.signature, seed=3, samples=1)[1]
     read = outputs_read([n.name for n in graph.nodes], [r for n in graph.nodes for r in n.inputs])
     tensors = [t for n in graph.nodes for t in read[n.name]]
     expected = run_graph(graph, case.feeds, tensors)
     installed = [
         r.name for r in available_runtimes() if r.installed and "chromium" not in r.name and "webgl" not in r.name
     ]
-    reference = pool.process("numpy").load(str(subject.reference))
+    reference = pool.process("numpy").load(str(tested.reference))
     tried = set()
-    for entrant in entrants(subject, installed, pool, reference, lambda *failure: pytest.fail(str(failure))):
-        assert entrant.path is not None
-        with inside(entrant, entrant.path, pool) as within:
-            upstream = graph.ancestors(list(entrant.outputs))
+    for participant in participants_of(tested, installed, pool, reference, lambda *failure: pytest.fail(str(failure))):
+        assert participant.path is not None
+        with inner_tensors(participant, participant.path, pool) as within:
+            upstream = graph.ancestors(list(participant.outputs))
             wanted = [t for t in tensors if graph.producer(t).name in upstream]
             got = within.fetch(case.feeds, wanted)
         missing = {graph.producer(t).op for t in wanted if t not in got}
-        assert missing <= (HIDDEN if entrant.format in ("tfjs", "onnx") else set()), (entrant.name, missing)
+        assert missing <= (HIDDEN if participant.format in ("tfjs", "onnx") else set()), (participant.name, missing)
         assert len(got) >= 0.6 * len(wanted)
         for tensor, value in got.items():
             exact = graph.producer(tensor).op == "Const"
             wide = value.astype(expected[tensor].dtype)
             found = compare(expected[tensor], wide, Tolerance(0, 0) if exact else Tolerance())
-            assert found.passed, (entrant.name, entrant.runtime, tensor, found)
-        tried.add(entrant.format)
+            assert found.passed, (participant.name, participant.runtime, tensor, found)
+        tried.add(participant.format)
     assert tried >= {"reference", "bytes", "saved_model", "tfjs", "onnx"}
 
 
 def test_a_saved_model_has_the_same_graph_as_the_bytes(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    subject = subject_of(bundle("recurrent").folder, monkeypatch)
-    ours, other = plain(subject.graph), plain(saved_graph(subject.artefacts["saved_model"]))
+    tested = tested_in(bundle("recurrent").folder, monkeypatch)
+    ours, other = plain(tested.graph), plain(saved_graph(tested.artefacts["saved_model"]))
     assert [(n.name, n.op, n.inputs) for n in ours.nodes] == [(n.name, n.op, n.inputs) for n in other.nodes]
     assert all(
         np.array_equal(a.value, b.value) for a, b in zip(ours.nodes, other.nodes, strict=True) if a.op == "Const"
