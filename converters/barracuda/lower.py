@@ -76,7 +76,7 @@ class _Part:
 class _Lowering:
     def __init__(self, policy: Policy) -> None:
         self.policy, self.signature = policy, policy.signature
-        self.graph: Graph = fuse(policy.graph, policy.fetches.values(), activations=())
+        self.graph: Graph = fuse(policy.graph, policy.fetches.values(), activations=False)
         self.inputs: list[NnInput] = []
         self.parts = self._memory_parts()
         self.heads = [s for s in self.signature.outputs if base_name(s) in HEADS]

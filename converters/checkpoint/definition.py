@@ -14,9 +14,7 @@ import numpy as np
 from converters import schema
 from converters.frozen_graph.tensors import from_array
 from converters.graph.nodes import NameScope, node_of
-
-#: What passes a variable's handle on.
-_PASSING = frozenset(("Identity", "Enter", "Switch", "Merge", "Exit", "NextIteration"))
+from converters.graph.ops.table import hands_on
 
 
 def with_values(graph_def: Any, values: Mapping[str, np.ndarray]) -> Any:
@@ -36,7 +34,7 @@ def with_values(graph_def: Any, values: Mapping[str, np.ndarray]) -> Any:
             continue
         if node.op == "ReadVariableOp":
             _become(copy, "Identity", T=dtype)
-        elif node.op in _PASSING:
+        elif hands_on(node):
             copy.attr["T"].type = dtype
         elif node.op == "VariableShape":
             copy.op = "Shape"
@@ -55,7 +53,7 @@ def _handles(graph_def: Any, values: Mapping[str, np.ndarray]) -> dict[str, int]
     found = {name: schema.dtype_number(array.dtype) for name, array in values.items()}
     readers: dict[str, list[Any]] = {}
     for node in graph_def.node:
-        if node.op in _PASSING:
+        if hands_on(node):
             for reference in node.input:
                 readers.setdefault(node_of(reference), []).append(node)
     stack = list(found)

@@ -15,12 +15,12 @@ import numpy as np
 from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
+from converters.graph.ops.table import hands_on, is_fed
 from converters.understand.brains import find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.roles import CONSTANT_NAMES
 
 VARIABLES = frozenset(("VariableV2", "Variable", "VarHandleOp", "AutoReloadVariable"))
-_PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
 #: What only training runs: it changes or keeps variables.
 _EFFECTS = ("Assign", "Apply", "ResourceApply", "SparseApply", "Scatter", "ResourceScatter", "Save", "Restore")
 
@@ -97,7 +97,7 @@ def wanted_variables(graph: Graph) -> list[str]:
     variables = [n.name for n in graph.nodes if n.op in VARIABLES]
     fed: set[str] = set()
     for node in graph.nodes:
-        if node.op in _PLACEHOLDERS or (not is_effect(node) and any(node_of(r) in fed for r in node.inputs)):
+        if is_fed(node) or (not is_effect(node) and any(node_of(r) in fed for r in node.inputs)):
             fed.add(node.name)
     needed = graph.ancestors(sorted(fed))
     return [n for n in variables if n in needed or n.rpartition("/")[2] in CONSTANT_NAMES]
@@ -174,6 +174,6 @@ def _handles(graph: Graph, values: Collection[str]) -> set[str]:
     """Frozen variables, and what passes them on."""
     found = set(values)
     for node in graph.nodes:
-        if node.op in ("Identity", "Enter", "Switch", "Merge") and any(node_of(r) in found for r in node.inputs):
+        if hands_on(node) and any(node_of(r) in found for r in node.inputs):
             found.add(node.name)
     return found

@@ -21,8 +21,6 @@ from signatures.errors import GraphError, UnsupportedOpError
 
 #: GraphDef version written: that of TF 1.4. (Graphs frozen by TF 1.x carry none, which TensorFlow.js cannot read.)
 PRODUCER = 24
-#: Ops in the table that TF 1.4 lacks; the normalise pass leaves none of them, fused ops are for TensorFlow.js.
-_NEWER_OPS = frozenset(("BroadcastTo", "_FusedMatMul", "_FusedConv2D"))
 
 
 def encode(graph: Graph, *, explicit: bool = False) -> Any:
@@ -31,9 +29,10 @@ def encode(graph: Graph, *, explicit: bool = False) -> Any:
     message = schema.GraphDef()
     message.versions.producer = PRODUCER
     for node in graph.nodes:
-        if not explicit and node.op in _NEWER_OPS:
+        entry = op_of(node)
+        if not explicit and entry.since is not None:
             raise UnsupportedOpError(
-                f"{node.op} (node {node.name!r}) does not exist in TensorFlow 1.4",
+                f"{node.op} (node {node.name!r}) came with TensorFlow {entry.since}",
                 issues=[(node.name, node.op)],
                 why="a .bytes graph must load in the runtimes of its time",
                 fix="write the other formats: --to saved_model,tfjs,onnx",
@@ -45,7 +44,7 @@ def encode(graph: Graph, *, explicit: bool = False) -> Any:
             proto.attr["dtype"].type = schema.dtype_number(node.value.dtype)
             proto.attr["value"].tensor.CopyFrom(from_array(node.value))
             continue
-        for attr in op_of(node).attrs:
+        for attr in entry.attrs:
             value = _value(node, attr, types)
             if value is _OMIT or (not explicit and attr.since is not None and value == attr.default):
                 continue

@@ -13,6 +13,7 @@ import numpy as np
 from converters import schema
 from converters.frozen_graph.tensors import Allowance, to_array
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
+from converters.graph.ops.table import is_fed
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).
@@ -70,12 +71,13 @@ def _node(proto: Any, producer: int, allowance: Allowance) -> Node:
                 f"the constant {proto.name!r} has no value", fix="freeze the graph again; this file is damaged"
             )
         attrs = {}
-    if proto.op in ("Placeholder", "PlaceholderWithDefault"):
+    inputs = tuple(normal_ref(i) for i in proto.input if not i.startswith("^"))
+    node = Node(proto.name, proto.op, inputs, attrs, value, origin=f"{proto.name}:0")
+    if is_fed(node):
         _check_placeholder(proto.name, attrs)
     if proto.op == "Placeholder" and attrs.get("shape") == TensorShape(()) and producer < SCALAR_SHAPE_PRODUCER:
         attrs["shape"] = TensorShape(None)
-    inputs = tuple(normal_ref(i) for i in proto.input if not i.startswith("^"))
-    return Node(proto.name, proto.op, inputs, attrs, value, origin=f"{proto.name}:0")
+    return node
 
 
 def _check_placeholder(name: str, attrs: dict[str, Any]) -> None:

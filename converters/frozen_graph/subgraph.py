@@ -11,26 +11,17 @@ What is refused, is refused wherever it hangs: behind a control input, too, thou
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 from converters import schema
 from converters.graph.nodes import Node, node_of
-from converters.graph.ops.table import CONTROL_FLOW, TABLE, unsupported
-from converters.graph.passes.normalise import DECOMPOSED, RENAMED
+from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, SPELLINGS, TABLE, unsupported
 from signatures.errors import GraphError
 
 #: Ops that compute a value from their inputs (or draw one) and do nothing else.
-COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *RENAMED, *DECOMPOSED))
+COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *SPELLINGS))
 #: Ops that may hang behind a control input, where they are left out: they compute nothing that anyone reads.
 ORDERING = frozenset(("NoOp", "Assert"))
-#: What a constant in a while loop or a branch is pinned to by a control input.
-PIVOTS = frozenset(("Identity", "Switch", "Merge"))
-#: Ops that take references to variables, which frozen graphs do not have, and those that take values.
-_OF_VALUES: Mapping[str, str] = MappingProxyType(
-    {"RefEnter": "Enter", "RefExit": "Exit", "RefMerge": "Merge", "RefSwitch": "Switch",
-     "RefNextIteration": "NextIteration", "RefIdentity": "Identity"}
-)  # fmt: skip
 
 
 def subgraph(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) -> Any:
@@ -76,7 +67,7 @@ def _check(nodes: Mapping[str, Any], roots: Iterable[str]) -> None:
                 why="it is read, or asked for, and no node makes it",
                 fix="freeze the graph again from its checkpoint",
             )
-        if node.op not in COMPUTING and node.op not in _OF_VALUES and not (ordering and node.op in ORDERING):
+        if node.op not in COMPUTING and node.op not in OF_VALUES and not (ordering and node.op in ORDERING):
             refused.append(node)
         ordered = node.op in ORDERING
         stack.extend((node_of(i.removeprefix("^")), ordered or i.startswith("^")) for i in node.input)
@@ -87,12 +78,17 @@ def _check(nodes: Mapping[str, Any], roots: Iterable[str]) -> None:
 
 def _inputs(nodes: Mapping[str, Any], node: Any, looping: bool) -> list[str]:
     """A node's inputs without control inputs, those apart that say in which frame of a loop it is."""
-    return [i for i in node.input if not i.startswith("^") or (looping and nodes[i[1:]].op in PIVOTS)]
+    return [i for i in node.input if not i.startswith("^") or (looping and is_pivot(nodes[i[1:]]))]
+
+
+def is_pivot(node: Any) -> bool:
+    """Whether a constant in a while loop or a branch may be pinned to a node by a control input."""
+    return node.op == "Identity" or CONTROL_FLOW.get(node.op) in ("switch", "merge")
 
 
 def _bare(node: Any, inputs: Iterable[str]) -> Any:
     """A node without device, place and hints: its op, inputs, and the attributes that the op itself has."""
-    bare = schema.NodeDef(name=node.name, op=_OF_VALUES.get(node.op, node.op))
+    bare = schema.NodeDef(name=node.name, op=OF_VALUES.get(node.op, node.op))
     bare.input.extend(inputs)
     for key, value in node.attr.items():
         if not key.startswith("_"):

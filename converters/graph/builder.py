@@ -22,8 +22,6 @@ from converters.graph.shapes import Types, add_types
 from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
 from signatures.errors import UnsupportedOpError
 
-#: Ops whose result depends on shapes, not on values.
-_SHAPE_OPS = frozenset(("Shape", "Size", "Rank"))
 #: A policy has some hundreds.
 MAX_NODES = 1 << 16
 _SHARED_CONSTANT = 64
@@ -102,7 +100,7 @@ class Builder:
             )
         if self.typed:
             add_types(self.types, node, self.symbols)
-            if node.op not in _SHAPE_OPS and any(r in self.tainted for r in node.inputs):
+            if not TABLE[node.op].of_shape and any(r in self.tainted for r in node.inputs):
                 self.tainted.update(ref(node.name, i) for i in range(self.outputs(node.name)))
         self.position[node.name] = len(self.nodes)
         self.nodes.append(node)

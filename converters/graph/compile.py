@@ -19,7 +19,7 @@ from converters.graph.passes.noise import lift_noise, samplers, unseeded
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.transposes import cancel_transposes
-from converters.graph.passes.unroll import straighten
+from converters.graph.passes.unroll import unroll
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
 from converters.policy import Policy
@@ -105,7 +105,7 @@ class _Compiler:
         pins = [Node(fetches[out], "Identity", (reference,), origin=sources[out]) for out, reference in outputs]
         pinned = Graph(topological([*upstream.nodes, *pins]))
 
-        work = straighten(complete_shapes(normalise(settle_inputs(pinned, roles)), roles))
+        work = unroll(complete_shapes(normalise(settle_inputs(pinned, roles)), roles))
         work, fetches = drop_identities(fold(work).pruned(fetches.values()), fetches)
         work, fetches = cancel_transposes(*collapse_views(work, fetches))
 

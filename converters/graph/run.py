@@ -12,34 +12,7 @@ from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
 from signatures.errors import GraphError
 
-#: Ops that round nothing, beside the structural ones.
-_EXACT = frozenset(
-    (
-        "Reshape",
-        "Transpose",
-        "Unpack",
-        "Split",
-        "SplitV",
-        "Fill",
-        "Tile",
-        "OneHot",
-        "Cast",
-        "Maximum",
-        "Minimum",
-        "Relu",
-    )
-)
-#: Ops that add up many products: a runtime rounds each, in an order of its own, so each term is moved.
-_SUMS = frozenset(("MatMul", "BatchMatMul", "_FusedMatMul", "Conv2D", "_FusedConv2D", "DepthwiseConv2dNative", "Sum"))
-
-
-#: Functions that runtimes approximate, each in its own way, to a few units in the last place (Eigen's tanh: 3 to 4).
-_APPROXIMATED = frozenset(
-    (
-        *("Exp", "Expm1", "Log", "Log1p", "Pow", "Tanh", "Sigmoid", "Softmax", "LogSoftmax", "Elu", "Selu", "Softplus"),
-        *("Erf", "Sin", "Cos", "Tan", "Rsqrt"),
-    )
-)
+#: Functions that runtimes approximate are right to a few units in the last place (Eigen's tanh: 3 to 4).
 _APPROXIMATION_ULPS = 4
 
 
@@ -67,7 +40,7 @@ def _added_up(
     """
     if any(r.dtype.kind != "f" for r in results):
         return tuple(results)
-    if node.op == "Sum":
+    if not entry.layer:
         terms = arguments[0].size / max(1, results[0].size)
     else:  # the second operand is the kernel: its last axis is the result's (a transposed one has as many elements)
         terms = arguments[1].size / max(1, results[0].shape[-1])
@@ -111,13 +84,13 @@ def run_graph(
             continue
         entry = op_of(node)
         arguments = [values[r] for r in node.inputs]
-        if jitter is not None and node.op in _SUMS:
+        if jitter is not None and entry.precision == "summed":
             arguments = [_moved(a, jitter) for a in arguments]
         results = run_kernel(entry, node, arguments)
-        if jitter is not None and node.op in _SUMS:
+        if jitter is not None and entry.precision == "summed":
             results = _added_up(entry, node, arguments, results, jitter)
-        if jitter is not None and not entry.structural and node.op not in _EXACT:
-            ulps = _APPROXIMATION_ULPS if node.op in _APPROXIMATED else 1
+        if jitter is not None and not entry.exact:
+            ulps = _APPROXIMATION_ULPS if entry.precision == "approximate" else 1
             results = tuple(_moved(r, jitter, ulps) for r in results)
         for index, result in enumerate(results):
             values.setdefault(ref(node.name, index), result)

@@ -9,14 +9,12 @@ import numpy as np
 
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.base import OpDef
-from converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of
+from converters.graph.ops.table import CONTROL_FLOW, op_of
 from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, product
 from signatures.errors import ExportModelError, GraphError
 
 Types = dict[str, TensorType]
 
-#: Where a structural op's data operands are; the others are indices that must be plain numbers.
-_DATA = {"ConcatV2": slice(0, -1), "Pack": slice(None)}
 #: Folding may not make a constant of more elements than this out of smaller ones.
 _MAX_FOLD = 1 << 20
 #: No tensor may have more elements than this per row (256 MiB in float32), unless the op was given as many: a Fill,
@@ -28,7 +26,7 @@ def infer_types(graph: Graph, *, partial: bool = False) -> Types:
     """The type of every output in ``graph``, by reference.
 
     ``partial`` lets loops through (their outputs have unknown shapes), for the passes that come before the
-    straightening. Otherwise they raise UnsupportedOpError, as unknown ops always do. Raises GraphError where shapes
+    unrolling. Otherwise they raise UnsupportedOpError, as unknown ops always do. Raises GraphError where shapes
     contradict each other.
     """
     types: Types = {}
@@ -126,9 +124,8 @@ def _symbolic(
     symbols: Symbols,
 ) -> Sequence[TensorType]:
     """Follow shape vectors that hold symbols through the ops that shape arithmetic is made of."""
-    if op.structural:
-        data = _DATA.get(node.op, slice(0, 1))
-        positions = set(range(len(values))[data])
+    if op.moves:
+        positions = set(op.moved(range(len(values))))
         if any(v.dtype == object for i, v in enumerate(values) if i not in positions):
             return results
         objects = [v.astype(object) if i in positions else v for i, v in enumerate(values)]
@@ -158,8 +155,3 @@ def _plain(cells: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if all(not isinstance(c, str) for c in cells.reshape(-1).tolist()):
         return cells.astype(dtype)
     return cells
-
-
-def known_op(node: Node) -> bool:
-    """Whether the table or the straightener covers a node's op."""
-    return node.op in TABLE or node.op in CONTROL_FLOW

@@ -97,10 +97,10 @@ class _Builder:
             self.bind(node.name, self.const(node.value, "value" if node.name in self.outputs else ""))
             return
         entry = op_of(node)
-        if entry.lower is None:
+        if entry.onnx is None:
             raise unsupported([node])
         before = len(self.nodes)
-        result = entry.lower(node, self)
+        result = entry.onnx(node, self)
         values = result if isinstance(result, tuple) else (result,)
         for index, value in enumerate(values):
             reference = ref(node.name, index)
@@ -178,7 +178,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
             why=f"the lowerings are made for opsets {min(IR_VERSIONS)} to {max(IR_VERSIONS)}",
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
-    graph = fuse(policy.graph, policy.fetches.values(), activations=())
+    graph = fuse(policy.graph, policy.fetches.values(), activations=False)
     builder = _Builder(infer_types(graph), options.opset, [s.name for s in policy.signature.outputs])
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)

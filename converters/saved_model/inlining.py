@@ -10,13 +10,12 @@ function that has effects, whether its result needs them or not.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from converters import schema
-from converters.frozen_graph.subgraph import COMPUTING, ORDERING, PIVOTS
+from converters.frozen_graph.subgraph import COMPUTING, ORDERING, is_pivot
 from converters.graph.nodes import NameScope, Node, ref, split_ref
-from converters.graph.ops.table import unsupported
+from converters.graph.ops.table import RESULTS, unsupported
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Ops that call the function which their attribute ``f`` names.
@@ -28,18 +27,6 @@ CALLING = CALLS | _WHILE | _IF
 #: What reads a variable; freezing replaces it.
 _READING = frozenset(("VarHandleOp", "ReadVariableOp", "ResourceGather", "VariableShape"))
 _ALLOWED = COMPUTING | _READING | ORDERING | CALLING
-#: Ops with several results of different names, in their order (the registry of TensorFlow 2.21).
-_RESULTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        **dict.fromkeys(
-            ("FusedBatchNorm", "FusedBatchNormV2", "FusedBatchNormV3"),
-            ("y", "batch_mean", "batch_variance", "reserve_space_1", "reserve_space_2", "reserve_space_3"),
-        ),
-        "Switch": ("output_false", "output_true"),
-        "Merge": ("output", "value_index"),
-        "TensorArrayV3": ("handle", "flow"),
-    }
-)
 _BOOL = 10  # DataType
 #: Copies of a graph's functions may hold this many nodes, and bytes: a small file could unfold to any size otherwise.
 MAX_NODES = 1 << 17
@@ -95,7 +82,7 @@ class _Flattening:
             return ref(placed.get(name, name), index)
 
         self._check(nodes)
-        pinned = {n.name for n in nodes if n.op in PIVOTS}
+        pinned = {n.name for n in nodes if is_pivot(n)}
         for node in nodes:
             self._place(node, placed[node.name], [tensor(i) for i in node.input if not i.startswith("^")], "", 0)
             if not self._calls(node):  # which frame of a while loop of TensorFlow 1 it is in
@@ -295,7 +282,7 @@ def _index(op: str, result: str, position: str) -> int:
     """The number of an output of an op, of ``<name of the result>:<position in it>``."""
     if not position.isascii() or not position.isdigit() or len(position) > 9:
         return 0
-    named = _RESULTS.get(op, ())
+    named = RESULTS.get(op, ())
     return int(position) + (named.index(result) if result in named else 0)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from converters.format import Port
 from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
+from converters.graph.ops.table import is_fed
 from converters.renaming import renamed
 from converters.schema import dtype_number
 from converters.understand.inputs import role_by_name
@@ -102,7 +103,7 @@ def _with_placeholders(graph: Graph, signature: ModelSignature) -> Graph:
     nodes = []
     for node in graph.nodes:
         tensor = given.get(node.name)
-        if tensor is not None and node.op not in ("Placeholder", "PlaceholderWithDefault") and tensor.dtype is not None:
+        if tensor is not None and not is_fed(node) and tensor.dtype is not None:
             node = Node(
                 node.name, "Placeholder", (), {"dtype": tensor.dtype, "shape": tensor.shape}, origin=node.origin
             )
@@ -115,7 +116,7 @@ def fed_by_signature(graph_def: Any, signature: ModelSignature) -> Any:
     given = {node_of(t.name): t for t in signature.inputs.values() if split_ref(t.name)[1] == 0}
     for node in graph_def.node:
         tensor = given.get(node.name)
-        if tensor is None or node.op in ("Placeholder", "PlaceholderWithDefault") or tensor.dtype is None:
+        if tensor is None or is_fed(node) or tensor.dtype is None:
             continue
         node.op = "Placeholder"
         del node.input[:]

@@ -15,6 +15,7 @@ from converters import schema
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.frozen_graph.writer import with_contract
+from converters.graph.ops.samplers import SAMPLERS
 from converters.policy import Policy
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -32,7 +33,7 @@ def signatures_of(policy: Policy) -> dict[str, tuple[list[TensorSpec], list[Tens
     every = policy.signature
     signatures = {SERVING: (list(every.inputs), list(every.outputs))}
     noise = {policy.feeds[s.name] for s in every.inputs if s.role is Role.NOISE}
-    samplers = {n.name for n in policy.graph.nodes if n.op in ("Multinomial", "RandomStandardNormal", "RandomUniform")}
+    samplers = {n.name for n in policy.graph.nodes if n.op in SAMPLERS}
     needs = {s.name: policy.graph.ancestors([policy.fetches[s.name]]) for s in every.outputs}
     outputs = [s for s in every.outputs if not needs[s.name] & (noise | samplers)]
     upstream = set().union(*(needs[s.name] for s in outputs)) if outputs else set()

@@ -22,6 +22,7 @@ import numpy as np
 from converters import schema
 from converters.fetch import Fetched
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
+from converters.graph.ops.table import is_fed
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
@@ -193,12 +194,13 @@ def _node(entry: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Node:
         if name not in weights:
             raise _damaged(f"the constant {name!r} has no values", "weightsManifest does not name it")
         return Node(name, op, value=_shaped(weights[name], entry), origin=f"{name}:0")
-    if op in ("Placeholder", "PlaceholderWithDefault"):
+    inputs = tuple(normal_ref(i) for i in entry.get("input") or () if not i.startswith("^"))
+    node = Node(name, op, inputs, attrs, origin=f"{name}:0")
+    if is_fed(node):
         attrs.setdefault("shape", TensorShape(None))
         if not isinstance(attrs.get("dtype"), np.dtype) or not isinstance(attrs["shape"], TensorShape):
             raise _damaged(f"the placeholder {name!r} does not say its dtype or shape")
-    inputs = tuple(normal_ref(i) for i in entry.get("input") or () if not i.startswith("^"))
-    return Node(name, op, inputs, attrs, origin=f"{name}:0")
+    return node
 
 
 def _shaped(value: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:

@@ -23,11 +23,13 @@ import numpy as np
 from converters import schema
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
+from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
+from converters.graph.ops.table import op_of
 from converters.graph.passes.fuse import fuse
+from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
 from converters.policy import Policy
-from converters.tfjs.dialect import for_tfjs
 from signatures.errors import UnsupportedOpError
 from signatures.spec import TensorSpec
 
@@ -35,8 +37,6 @@ SHARD_BYTES = 4 << 20
 #: The module that acts with the model in a page, and its types; they lie beside it.
 _JS = Path(__file__).with_name("js")
 _ACTING = ("policy.mjs", "policy.d.mts")
-#: Activations that TensorFlow.js fuses into a product on every backend (tfjs-core ops/fused_util).
-FUSED_ACTIVATIONS = ("Relu", "Relu6", "Elu", "Sigmoid")
 _NARROW = {
     np.dtype(np.int64): INT32,
     np.dtype(np.float64): FLOAT32,
@@ -62,6 +62,18 @@ def _narrowed(node: Node) -> np.ndarray:
         )
     # not ascontiguousarray, which makes a vector of a scalar
     return np.asarray(value.astype(target, copy=False), order="C")
+
+
+def for_tfjs(graph: Graph) -> Graph:
+    """The graph in ops that TensorFlow.js has and computes rightly; names of the nodes that stay are kept."""
+    if not any(op_of(n).tfjs for n in graph.nodes):
+        return graph
+    types = infer_types(graph)
+    editor = Editor(graph)
+    for node in graph.nodes:
+        rewrite = op_of(node).tfjs
+        editor.keep(node if rewrite is None else rewrite(editor, node, types))
+    return editor.graph()
 
 
 # ------------------------------------------------------------------ GraphDef as JSON
@@ -145,7 +157,7 @@ def _shards(blob: bytes) -> Mapping[str, bytes]:
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     """The TensorFlow.js artefact."""
-    graph = fuse(for_tfjs(policy.graph), policy.fetches.values(), FUSED_ACTIVATIONS)
+    graph = fuse(for_tfjs(policy.graph), policy.fetches.values(), activations=True)
     entries, blob = _weights(graph)
     shards = _shards(blob)
     contract = json.loads(options.contract)

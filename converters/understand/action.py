@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from converters.graph.nodes import Graph, Node
+from converters.graph.ops.table import passes_on, traits
 from signatures.roles import Role
 
 _MAX_LEAVES = 1024
-#: Ops that pass a value on without changing its numbers.
-TRANSPARENT = frozenset(
-    ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics", "Reshape", "Squeeze", "ExpandDims")
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,17 +28,17 @@ class ActionMeaning:
 def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: bool) -> ActionMeaning:
     """Decide from dtype and ancestors whether an action is continuous, sampled, log-probabilities or an argmax.
 
-    ``graph`` must be free of loops (after the straighten pass).
+    ``graph`` must be free of loops (after the unroll pass).
     """
     leaves = _leaves(graph, reference)
     producers = [graph.producer(leaf) for leaf in leaves]
     if dtype.kind in "iu":
-        if all(p.op == "Multinomial" for p in producers):
+        if all(traits(p).sampler == "categorical" for p in producers):
             return ActionMeaning(Role.SAMPLED, tuple(p.inputs[0] for p in producers), tuple(p.name for p in producers))
         if all(p.op == "ArgMax" for p in producers):
             return ActionMeaning(Role.DETERMINISTIC, tuple(p.inputs[0] for p in producers))
         return ActionMeaning(Role.DETERMINISTIC)
-    if all(p.op in ("Log", "LogSoftmax") for p in producers):
+    if all(p.op == "Log" or p.op == "LogSoftmax" for p in producers):
         return ActionMeaning(Role.LOG_PROBS, tuple(leaves))
     if all(p.op == "Softmax" for p in producers):
         return ActionMeaning(Role.PROBS, tuple(leaves))
@@ -72,7 +69,7 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
 
 def _parts(graph: Graph, node: Node) -> Sequence[str]:
     """What a node passes on or joins along the last axis; empty where it computes."""
-    if node.op in TRANSPARENT or node.op == "Cast":
+    if passes_on(node) or node.op == "Cast":
         return node.inputs[:1]
     if node.op == "ConcatV2":
         axis = graph.constant(node.inputs[-1])

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from converters.graph.nodes import Graph, node_of, normal_ref, split_ref
+from converters.graph.ops.table import is_fed
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.roles import (
     ACTION_NAMES,
@@ -25,7 +26,6 @@ from signatures.roles import (
     Role,
 )
 
-_PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
 #: A constant that lists sizes has no more of them.
 _MAX_LISTED = 1024
 
@@ -112,7 +112,7 @@ def find_brains(
     scopes: dict[str, int] = {}
     for node in graph.nodes:
         scope, _, base = node.name.rpartition("/")
-        if base in ACTION_NAMES and node.name in fed and node.op not in _PLACEHOLDERS:
+        if base in ACTION_NAMES and node.name in fed and not is_fed(node):
             scopes[f"{scope}/" if scope else ""] = node.name.count("/")
     if scopes:
         depth = min(scopes.values())
@@ -140,7 +140,7 @@ def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
     for node in graph.nodes:
         base = node.name[len(scope) :]
         named = node.name.startswith(scope) and base in OUTPUT_NAMES
-        if named and node.name in fed and node.op not in _PLACEHOLDERS:
+        if named and node.name in fed and not is_fed(node):
             outputs.append((base, OUTPUT_NAMES[base], node.name))
     return Brain(scope, tuple(outputs), _constants(graph, scope))
 
@@ -149,7 +149,7 @@ def _depends_on_input(graph: Graph) -> set[str]:
     """Names of nodes downstream of a placeholder (parameters included)."""
     fed: set[str] = set()
     for node in graph.nodes:
-        if node.op in _PLACEHOLDERS or any(node_of(r) in fed for r in node.inputs):
+        if is_fed(node) or any(node_of(r) in fed for r in node.inputs):
             fed.add(node.name)
     return fed
 
@@ -194,7 +194,7 @@ def _scope_of(graph: Graph, names: Sequence[str]) -> str:
     """The scope of a brain whose outputs are ``names``: the one they share, if a placeholder is in it, too."""
     parents = {name.rpartition("/")[0] for name in names}
     scope = f"{parents.pop()}/" if len(parents) == 1 else "/"
-    return scope if any(n.op in _PLACEHOLDERS and n.name.startswith(scope) for n in graph.nodes) else ""
+    return scope if any(is_fed(n) and n.name.startswith(scope) for n in graph.nodes) else ""
 
 
 def close_names(name: str, names: Sequence[str]) -> str | None:
@@ -209,7 +209,7 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
     """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
     read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
     fed = fed - set(known)
-    sinks = [n for n in graph.nodes if n.name not in read and n.name in fed and n.op not in _PLACEHOLDERS]
+    sinks = [n for n in graph.nodes if n.name not in read and n.name in fed and not is_fed(n)]
     if not sinks:
         raise NotAPolicyError(
             "there is no policy in this graph",

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 
 from converters.graph.nodes import Graph, Node
-from converters.understand.action import TRANSPARENT
+from converters.graph.ops.table import passes_on, traits
 
 BYTE = 255.0
 #: A divisor may be repeated for each colour.
 _CHANNELS = 16
-_PASSED = TRANSPARENT | {"Cast", "Transpose"}
 
 
 def highest_colour(graph: Graph, name: str) -> int:
@@ -30,7 +29,7 @@ def _readers(graph: Graph, image: Node) -> list[tuple[Node, str]]:
     while stack:
         name = stack.pop()
         for reader in consumers[name]:
-            if reader.op in _PASSED and reader.inputs[0] == name:
+            if _passes_on(reader) and reader.inputs[0] == name:
                 if reader.name not in seen:
                     seen.add(reader.name)
                     stack.append(reader.name)
@@ -39,14 +38,19 @@ def _readers(graph: Graph, image: Node) -> list[tuple[Node, str]]:
     return found
 
 
+def _passes_on(node: Node) -> bool:
+    return passes_on(node) or node.op == "Cast" or traits(node).moves == "turn"
+
+
 def _divides(graph: Graph, reader: Node, source: str) -> bool:
-    if reader.op not in ("RealDiv", "Div", "Mul") or len(reader.inputs) != 2:
+    product = reader.op == "Mul"
+    if not (product or reader.op == "RealDiv") or len(reader.inputs) != 2:
         return False
     other = reader.inputs[1] if reader.inputs[0] == source else reader.inputs[0]
     value = graph.constant(other)
     if value is None or value.dtype.kind not in "iuf" or not 0 < value.size <= _CHANNELS:
         return False
-    if reader.op != "Mul" and other != reader.inputs[1]:
+    if not product and other != reader.inputs[1]:
         return False  # 255 / image
-    wanted = 1 / BYTE if reader.op == "Mul" else BYTE
+    wanted = 1 / BYTE if product else BYTE
     return all(math.isclose(float(v), wanted, rel_tol=1e-5) for v in value.reshape(-1))

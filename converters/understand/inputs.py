@@ -5,17 +5,15 @@ What is not decided is a parameter, or an error that lists the candidates.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from converters.graph.nodes import Graph, Node, TensorShape, node_of
-from converters.understand.action import TRANSPARENT
+from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.brains import Brain, close_names
 from signatures.errors import SignatureError, UsageError
 from signatures.roles import INPUT_PATTERNS, INPUT_ROLES, OBSERVATIONS, Role
-
-_PLACEHOLDERS = ("Placeholder", "PlaceholderWithDefault")
 
 
 def classify_inputs(
@@ -27,9 +25,9 @@ def classify_inputs(
     nor by ML-Agents is left out: its default is used. Raises SignatureError when no observation can be told.
     """
     upstream = graph.ancestors(brain.roots)
-    found = [n for n in graph.nodes if n.op in _PLACEHOLDERS and n.name in upstream]
+    found = [n for n in graph.nodes if is_fed(n) and n.name in upstream]
     inputs = {n.name for n in found}
-    others = {n.name for n in graph.nodes if n.op in _PLACEHOLDERS and not n.name.startswith(brain.scope)} - inputs
+    others = {n.name for n in graph.nodes if is_fed(n) and not n.name.startswith(brain.scope)} - inputs
     wanted = {name: role for name, role in (wanted or {}).items() if node_of(name) not in others}
     roles: dict[str, Role] = {}
     decided: set[str] = set()
@@ -123,9 +121,9 @@ def _by_structure(graph: Graph, found: Sequence[Node], roles: dict[str, Role], d
         roles[floats[0].name] = Role.VECTOR
 
 
-def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Iterable[str]) -> list[Node]:
-    """Nodes that read ``node``, looked for behind the ops in ``through``."""
-    passed, stack, met = frozenset(through), [node], []
+def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Callable[[Node], bool]) -> list[Node]:
+    """Nodes that read ``node``, looked for behind those that ``through`` holds for."""
+    stack, met = [node], []
     seen: set[str] = set()
     while stack:
         for reader in consumers[stack.pop().name]:
@@ -133,19 +131,23 @@ def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Iterable[
                 continue
             seen.add(reader.name)
             met.append(reader)
-            if reader.op in passed:
+            if through(reader):
                 stack.append(reader)
     return met
 
 
+def _shows(node: Node) -> bool:
+    """Whether a node passes its operand on, or parts of it."""
+    return passes_on(node) or traits(node).moves == "pick"
+
+
 def _feeds_one_hot(node: Node, consumers: Mapping[str, list[Node]]) -> bool:
-    through = TRANSPARENT | {"Cast", "StridedSlice", "Slice", "Split", "Unpack", "Unstack"}
-    return any(r.op == "OneHot" for r in _reached(node, consumers, through))
+    return any(r.op == "OneHot" for r in _reached(node, consumers, lambda n: _shows(n) or n.op == "Cast"))
 
 
 def _is_mask(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> bool:
     """A float matrix that multiplies a softmax (perhaps plus a constant) is a mask."""
-    for reader in _reached(node, consumers, TRANSPARENT | {"StridedSlice", "Slice", "Split"}):
+    for reader in _reached(node, consumers, _shows):
         if reader.op == "Mul" and any(
             "Softmax" in {graph[n].op for n in graph.ancestors([r]) if _near(graph, r, n)} for r in reader.inputs
         ):
@@ -157,6 +159,6 @@ def _near(graph: Graph, reference: str, name: str) -> bool:
     """Whether ``name`` is the producer of ``reference`` or one Add before it."""
     node = graph.producer(reference)
     names = {node.name}
-    if node.op in ("Add", "AddV2"):
+    if traits(node).name == "Add":
         names |= {node_of(r) for r in node.inputs}
     return name in names

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from converters.graph.nodes import Graph, ref
+from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types, run_kernel
-
-#: Ops that only pick and move elements.
-_MOVES = frozenset(("StridedSlice", "Slice", "Split", "SplitV", "ConcatV2", "Tile"))
+from signatures.errors import GraphError
 
 
 def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
@@ -29,13 +29,22 @@ def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
         read = [shown[r] for r in node.inputs if r in shown]
         operands = [shown.get(r, types[r].constant) for r in node.inputs]
         known = [o for o in operands if o is not None]
-        if read and node.op in _MOVES and len(known) == len(operands):
-            for index, columns in enumerate(run_kernel(op_of(node), node, known)):
+        joined = op_of(node).moves == "join"
+        if read and op_of(node).moves and len(known) == len(operands):
+            for index, columns in enumerate(_moved(node, known)):
                 shown[ref(node.name, index)] = columns
-        elif node.op in ("ConcatV2", "Mul"):
+        elif joined or node.op == "Mul":
             for columns in read:
                 part = tuple(columns.reshape(-1).tolist())
-                parts[part] = "h" if node.op == "ConcatV2" else parts.get(part, "c")
+                parts[part] = "h" if joined else parts.get(part, "c")
     ordered = sorted(parts)
     whole = [column for part in ordered for column in part] == list(range(shape[-1]))
     return tuple(parts[part] for part in ordered) if whole else ()
+
+
+def _moved(node: Node, row: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """The results of a node that moves elements, of one row; nothing where it takes several apart."""
+    try:
+        return run_kernel(op_of(node), node, row)
+    except GraphError:
+        return ()

@@ -14,6 +14,7 @@ import numpy as np
 from converters.bundle.source import contract_of, redrawn
 from converters.bundle.source import facts_of as facts_of_contract
 from converters.graph.nodes import Graph, NameScope, Node, topological
+from converters.graph.ops.table import passes_on, traits
 from converters.onnx.reader import OnnxModel
 from converters.onnx.writer import CONTRACT_KEY
 from converters.renaming import renamed
@@ -110,7 +111,7 @@ def _of_torch(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts
 def _squashed(graph: Graph, name: str) -> bool:
     """Whether an action is a tanh (SAC)."""
     node = graph[name]
-    while node.op in ("Identity", "Reshape", "ConcatV2") and node.inputs:
+    while passes_on(node) or traits(node).moves == "join":
         node = graph.producer(node.inputs[0])
     return node.op == "Tanh"
 

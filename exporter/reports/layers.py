@@ -7,18 +7,16 @@ cell of an LSTM) belongs to it as long as no circle of blocks arises. It is a pi
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from converters.graph.nodes import Graph, Node, node_of
+from converters.graph.ops.table import traits
 
-_STARTS = frozenset(
-    {"MatMul", "BatchMatMul", "BatchMatMulV2", "Conv2D", "Conv2DBackpropInput", "DepthwiseConv2dNative"}
-)
-_DRAWS = frozenset({"Multinomial", "RandomStandardNormal", "RandomUniform"})
-_ACTIVATIONS = {"Relu": "relu", "Elu": "elu", "LeakyRelu": "leaky relu", "Selu": "selu", "Softplus": "softplus"}
-_SMALL = frozenset({"ConcatV2", "StridedSlice", "Slice", "OneHot", "Reshape", "Mul", "Add", "Cast", "Split", "Pack"})
-_NORMALISERS = ({"Sub", "RealDiv"}, {"Sub", "Mul"})
+#: A box that normalises has no more nodes.
+_NORMALISER = 6
+#: The activations of an LSTM's gates.
+_GATES = ("sigmoid", "tanh")
 
 
 @dataclass
@@ -100,11 +98,26 @@ def _followers(blocks: list[Block], live: list[int]) -> Iterator[tuple[int, int]
 
 
 def _starts(block: Block) -> bool:
-    return any(n.op in _STARTS for n in block.nodes)
+    return any(_has_weights(n) for n in block.nodes)
+
+
+def _has_weights(node: Node) -> bool:
+    return traits(node).layer in ("dense", "convolution")
+
+
+def _draws(node: Node) -> bool:
+    return bool(traits(node).sampler)
 
 
 def _small(block: Block) -> bool:
-    return {n.op for n in block.nodes} <= _SMALL
+    """Whether a box only moves elements, or takes numbers to another scale or dtype."""
+    return all(map(_is_small, block.nodes))
+
+
+def _is_small(node: Node) -> bool:
+    entry = traits(node)
+    arithmetic = entry.elementwise and not entry.activation and entry.precision != "approximate"
+    return bool(entry.moves) or arithmetic or node.op == "OneHot"
 
 
 def _twins(a: Block, b: Block) -> bool:
@@ -126,13 +139,13 @@ def _ordered(blocks: list[Block]) -> list[Block]:
 
 def _home(node: Node, sources: set[int], blocks: list[Block], reach: list[set[int]]) -> int | None:
     """The block that takes ``node`` in: the last of its sources that nothing else it reads comes after."""
-    if node.op == "Placeholder" or node.op in _STARTS or node.op in _DRAWS:
+    if node.op == "Placeholder" or _has_weights(node) or _draws(node):
         return None
     for place in sorted(sources, reverse=True):
         others = sources - {place}
         if blocks[place].kind == "layer" and not any(place in reach[o] for o in others):
             # A box that only prepares (normalises, joins) does not take in what several layers lead to.
-            if len(others) and not any(n.op in _STARTS for n in blocks[place].nodes) and _layers(others, blocks):
+            if len(others) and not _starts(blocks[place]) and _layers(others, blocks):
                 continue
             return None if node.op == "ConcatV2" and _layers(others, blocks) else place
     return None
@@ -148,7 +161,7 @@ def _described(block: Block, graph: Graph) -> tuple[str, str]:
         return block.nodes[0].name, ""
     first = block.nodes[0]
     words = []
-    weights = graph.constant(first.inputs[1]) if first.op in _STARTS and len(first.inputs) > 1 else None
+    weights = graph.constant(first.inputs[1]) if _has_weights(first) and len(first.inputs) > 1 else None
     if weights is not None and first.op == "Conv2D" and weights.ndim == 4:
         strides = first.attrs.get("strides")
         step = f" /{strides[1]}" if isinstance(strides, tuple) and strides[1] != 1 else ""
@@ -159,33 +172,29 @@ def _described(block: Block, graph: Graph) -> tuple[str, str]:
             words.append(f"LSTM {width // 4}")
         else:
             words.append(f"dense {width}")
-    elif first.op in _STARTS:
-        words.append("matrix product" if "MatMul" in first.op else "convolution")
+    elif _has_weights(first):
+        words.append("matrix product" if traits(first).layer == "dense" else "convolution")
     elif _normalises(ops):
         words.append("normalise")
-    elif _DRAWS & set(ops):
+    elif any(map(_draws, block.nodes)):
         words.append("draw")
-    words += _activations(ops, lstm=bool(words) and words[0].startswith("LSTM"))
+    words += _activations(block.nodes, ops, lstm=bool(words) and words[0].startswith("LSTM"))
     if not words:
-        words = [_plain_title(ops)]
+        words = [_plain_title(block.nodes)]
     return ", ".join(words), " · ".join(op if n == 1 else f"{op} ×{n}" for op, n in ops.items())
 
 
 def _normalises(ops: Mapping[str, int]) -> bool:
-    return any(need <= set(ops) for need in _NORMALISERS) and sum(ops.values()) <= 6
+    return "Sub" in ops and ("RealDiv" in ops or "Mul" in ops) and sum(ops.values()) <= _NORMALISER
 
 
-def _activations(ops: Mapping[str, int], *, lstm: bool) -> list[str]:
-    words = [word for op, word in _ACTIVATIONS.items() if ops.get(op)]
-    if not lstm:
-        if ops.get("Sigmoid"):
-            words.append("swish" if ops.get("Mul") else "sigmoid")
-        if ops.get("Tanh"):
-            words.append("tanh")
+def _activations(nodes: Iterable[Node], ops: Mapping[str, int], *, lstm: bool) -> list[str]:
+    names = sorted({traits(n).activation for n in nodes} - {""}, key=_last_of_all)
+    if lstm:
+        names = [n for n in names if n not in _GATES]
+    words = ["swish" if n == "sigmoid" and ops.get("Mul") else n for n in names]
     if ops.get("MaxPool"):
         words.append("max pool")
-    if ops.get("Softmax") or ops.get("LogSoftmax"):
-        words.append("softmax")
     if ops.get("Minimum") and ops.get("Maximum"):
         words.append("clip")
     if ops.get("Sum") and ops.get("Log") and ops.get("RealDiv"):
@@ -195,9 +204,20 @@ def _activations(ops: Mapping[str, int], *, lstm: bool) -> list[str]:
     return words
 
 
-def _plain_title(ops: Mapping[str, int]) -> str:
-    names = {"OneHot": "one-hot", "Reshape": "reshape", "Mul": "scale", "ConcatV2": "join"}
-    words = [word for op, word in names.items() if op in ops]
-    if set(ops) <= {"StridedSlice", "Slice", "Split"}:
+def _last_of_all(activation: str) -> tuple[bool, str]:
+    """A softmax comes after the other activations of its box."""
+    return activation == "softmax", activation
+
+
+def _plain_title(nodes: Sequence[Node]) -> str:
+    """Of a box that says little: what it does with elements, else its first op."""
+    if all(traits(n).moves == "pick" for n in nodes):
         return "slice"
-    return ", ".join(words) if words and set(ops) <= {*names, "StridedSlice", "Slice", "Add"} else next(iter(ops))
+    words = list(dict.fromkeys(word for n in nodes if (word := _plain_word(n))))
+    return ", ".join(words) if words and all(map(_is_small, nodes)) else nodes[0].op
+
+
+def _plain_word(node: Node) -> str:
+    if node.op == "OneHot":
+        return "one-hot"
+    return "scale" if node.op == "Mul" else {"view": "reshape", "join": "join"}.get(traits(node).moves, "")

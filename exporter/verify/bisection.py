@@ -16,6 +16,7 @@ import numpy as np
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node, split_ref
 from converters.graph.ops.samplers import SAMPLERS
+from converters.graph.ops.table import traits
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
@@ -162,7 +163,7 @@ class _Search:
         if got.dtype != expected.dtype:  # int64 as int32 in TensorFlow.js; the outputs' dtypes are compared elsewhere
             narrow = np.promote_types(got.dtype, expected.dtype)
             got, expected = got.astype(narrow), expected.astype(narrow)
-        exact = node.op in ("Const", "Placeholder")
+        exact = bool(traits(node).start)
         difference = compare(expected, got, Tolerance(0, 0) if exact else self.tolerance)
         if difference.passed:
             return None

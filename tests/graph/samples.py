@@ -434,10 +434,6 @@ def _sources() -> Iterator[Sample]:
         attrs = {"dtype": array.dtype, "shape": TensorShape((None, *array.shape[1:]) if array.ndim else ())}
         node = Node("op", "Placeholder", attrs=attrs)
         yield Sample("Placeholder", title, (node,), {"op": array})
-    for array in (floats(2, 3), ints(4)):
-        yield sample(
-            "PlaceholderWithDefault", str(array.dtype), const(array), dtype=array.dtype, shape=TensorShape(array.shape)
-        )
     for op in ("Identity", "StopGradient", "Snapshot"):
         yield sample(op, "float32", floats(3, 4))
         yield sample(op, "int32", ints(3))

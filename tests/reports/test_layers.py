@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.graph.nodes import Graph, Node
+from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.options import CompileOptions
 from exporter.export.sources import read_source
 from exporter.reports.layers import Block, blocks_of
@@ -50,6 +51,12 @@ def test_every_node_is_in_a_box_and_every_box_comes_after_what_it_reads(name: st
 )
 def test_layers_have_the_names_that_people_use(name: str, titles: set[str]) -> None:
     assert titles <= {b.title for b in blocks(fixture(name))[0]}
+
+
+@pytest.mark.parametrize("op", sorted(SAMPLERS))
+def test_every_sampler_is_a_draw(op: str) -> None:
+    graph = Graph((Node("in", "Placeholder"), Node("out", op, ("in",))))
+    assert [b.title for b in blocks_of(graph, ["in"], ["out"])] == ["in", "draw", "out"]
 
 
 @st.composite

@@ -382,18 +382,24 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     return tuple(builder.emit("Slice", [value, begin, end, on]) for begin, end in itertools.pairwise(starts))
 
 
-_PASS = ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
 _SHAPE_OF = (T, Attr("out_type", "type", INT32))
 
 OPS = (
-    OpDef("Const", _infer_const, lambda node: node.value, attrs=(Attr("dtype", "type", derive="out:0"),)),
-    OpDef("Placeholder", _infer_placeholder, attrs=(Attr("dtype", "type"), Attr("shape", "shape", TensorShape(None)))),
     OpDef(
-        "PlaceholderWithDefault",
-        same_as(0),
-        _identity,
-        _lower_identity,
-        (Attr("dtype", "type", derive="in:0"), Attr("shape", "shape", TensorShape(None))),
+        "Const",
+        _infer_const,
+        lambda node: node.value,
+        attrs=(Attr("dtype", "type", derive="out:0"),),
+        start="constant",
+        precision="exact",
+    ),
+    OpDef(
+        "Placeholder",
+        _infer_placeholder,
+        attrs=(Attr("dtype", "type"), Attr("shape", "shape", TensorShape(None))),
+        spellings=("PlaceholderV2",),
+        start="fed",
+        precision="exact",
     ),
     *(
         OpDef(
@@ -402,37 +408,49 @@ OPS = (
             _identity,
             _lower_identity,
             (T, Attr("message", "str", "")) if name in ("PreventGradient", "CheckNumerics") else (T,),
-            structural=True,
+            moves="same",
         )
-        for name in _PASS
+        for name in ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
     ),
-    OpDef("Shape", _infer_shape, _shape, _lower_shape, _SHAPE_OF),
-    OpDef("Size", _infer_size, lambda node, x: np.array(x.size, node.attrs["out_type"]), _lower_size, _SHAPE_OF),
-    OpDef("Rank", _infer_rank, lambda node, x: np.array(x.ndim, np.int32), None, (T,)),
+    OpDef("Shape", _infer_shape, _shape, _lower_shape, _SHAPE_OF, precision="exact", of_shape=True),
+    OpDef(
+        "Size",
+        _infer_size,
+        lambda node, x: np.array(x.size, node.attrs["out_type"]),
+        _lower_size,
+        _SHAPE_OF,
+        precision="exact",
+        of_shape=True,
+    ),
+    OpDef(
+        "Rank", _infer_rank, lambda node, x: np.array(x.ndim, np.int32), None, (T,), precision="exact", of_shape=True
+    ),
     OpDef(
         "Reshape",
         _infer_reshape,
         lambda node, x, shape: x.reshape([int(d) for d in shape.reshape(-1)]),
         _lower_reshape,
         (T, type_attr("Tshape", "in:1")),
+        moves="view",
     ),
-    OpDef("Squeeze", _infer_squeeze, _squeeze, _lower_squeeze, (T, Attr("squeeze_dims", "int", ())), structural=True),
+    OpDef("Squeeze", _infer_squeeze, _squeeze, _lower_squeeze, (T, Attr("squeeze_dims", "int", ())), moves="view"),
     OpDef(
         "ExpandDims",
         _infer_expand_dims,
         _expand_dims,
         _lower_expand_dims,
         (T, type_attr("Tdim", "in:1")),
-        structural=True,
+        moves="view",
     ),
-    OpDef("Transpose", _infer_transpose, _transpose, _lower_transpose, (T, type_attr("Tperm", "in:1"))),
+    OpDef("Transpose", _infer_transpose, _transpose, _lower_transpose, (T, type_attr("Tperm", "in:1")), moves="turn"),
     OpDef(
         "ConcatV2",
         _infer_concat,
         _concat,
         _lower_concat,
         (Attr("N", "int", derive="count:1"), T, type_attr("Tidx", "in:-1")),
-        structural=True,
+        moves="join",
+        data=(0, -1),
     ),
     OpDef(
         "Pack",
@@ -440,10 +458,29 @@ OPS = (
         _pack,
         _lower_pack,
         (Attr("N", "int", derive="count"), T, Attr("axis", "int", 0)),
-        structural=True,
+        moves="join",
+        data=(0, None),
     ),
-    OpDef("Unpack", _infer_unpack, _unpack, _lower_unpack, (Attr("num", "int"), T, Attr("axis", "int", 0)), outputs=-1),
-    OpDef("Split", _infer_split, _split, _lower_split, (Attr("num_split", "int"), type_attr("T", "in:1")), outputs=-1),
+    OpDef(
+        "Unpack",
+        _infer_unpack,
+        _unpack,
+        _lower_unpack,
+        (Attr("num", "int"), T, Attr("axis", "int", 0)),
+        outputs=-1,
+        spellings=("Unstack",),
+        moves="pick",
+    ),
+    OpDef(
+        "Split",
+        _infer_split,
+        _split,
+        _lower_split,
+        (Attr("num_split", "int"), type_attr("T", "in:1")),
+        outputs=-1,
+        moves="pick",
+        data=(1, 2),
+    ),
     OpDef(
         "SplitV",
         _infer_split,
@@ -451,5 +488,6 @@ OPS = (
         _lower_split,
         (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
         outputs=-1,
+        moves="pick",
     ),
 )

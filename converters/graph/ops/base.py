@@ -1,13 +1,14 @@
 """What an entry of the op table is made of, and the helpers that entries share.
 
 One entry holds everything the compiler knows of an op: its numpy *kernel* (the oracle, and what folds constants), its
-*infer* rule (result dtype and shape), its ONNX *lowering*, and the attributes it has in a GraphDef.
+*infer* rule (result dtype and shape), its *lowering* for each target that needs one, the attributes it has in a
+GraphDef, how other versions of TensorFlow spell it, and the *traits* that passes ask for. No other file lists ops.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -52,7 +53,46 @@ class OnnxBuilder(Protocol):
         ...
 
 
+class GraphBuilder(Protocol):
+    """What an op that is written as other ops may use; ``converters.graph.editor.Editor`` is one."""
+
+    def add(
+        self, op: str, inputs: Iterable[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
+    ) -> str:
+        """A new node under a fresh name like ``name``; returns its output 0."""
+        ...
+
+    def const(self, array: np.ndarray, name: str) -> str:
+        """A new Const under a fresh name like ``name``."""
+        ...
+
+    def redirect(self, reference: str, to: str) -> None:
+        """Let every later reader of ``reference`` read ``to``."""
+        ...
+
+    def resolve(self, reference: str) -> str:
+        """Where a tensor of the old graph is now."""
+        ...
+
+
 Lower = Callable[[Node, OnnxBuilder], Any]
+#: A node as nodes of older ops; returns the tensor that stands for its output 0.
+Older = Callable[[GraphBuilder, Node], str]
+#: A node as TensorFlow.js computes it rightly: further nodes are added, the one that takes its place is returned.
+Tfjs = Callable[[GraphBuilder, Node, Mapping[str, TensorType]], Node]
+
+#: How a result is rounded: not at all; once, as IEEE says; by an approximation of each runtime's own (Eigen's tanh is 3
+#: to 4 units in the last place off); or a sum of many products, added in an order of each runtime's own.
+Precision = Literal["exact", "rounded", "approximate", "summed"]
+#: What an op that computes nothing does with elements: pass them on, show them under another shape, pick some, join
+#: several operands', repeat them, change the order of axes.
+Moves = Literal["", "same", "view", "pick", "join", "repeat", "turn"]
+#: The layer of a network that an op computes.
+Layer = Literal["", "dense", "convolution", "pool"]
+#: What a graph starts from: what is fed, what stands in the file.
+Start = Literal["", "fed", "constant"]
+#: The distribution that is drawn from.
+Sampler = Literal["", "normal", "truncated normal", "uniform", "categorical"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +120,57 @@ class OpDef:
     name: str
     infer: Infer
     kernel: Kernel | None = None
-    lower: Lower | None = None
+    onnx: Lower | None = None
     attrs: tuple[Attr, ...] = ()
+    _: KW_ONLY
+    #: -1: as many as the node says.
     outputs: int = 1
     #: Folding is wrong for samplers and for matrix products (whose rounding depends on the processor).
     foldable: bool = True
-    #: The kernel moves elements without arithmetic, so it also works on shape vectors with symbols.
-    structural: bool = False
+    #: Where TensorFlow.js computes it otherwise, or not at all.
+    tfjs: Tfjs | None = None
+    #: Names under which the same op stands in graphs of other TensorFlow versions.
+    spellings: tuple[str, ...] = ()
+    #: Where TensorFlow 1.4 lacks it: how it is written with what that has. The normalise pass leaves none of these.
+    older: Older | None = None
+    #: The first TensorFlow that has it, where that is later than 1.4 and a writer may make one.
+    since: str | None = None
+
+    start: Start = ""
+    moves: Moves = ""
+    #: The operands whose elements are moved, from and to; the others say how.
+    data: tuple[int | None, int | None] = (0, 1)
+    precision: Precision = "rounded"
+    #: The result at an index depends on the operands at that index only.
+    elementwise: bool = False
+    #: The result depends on the shapes of the operands, not on their elements.
+    of_shape: bool = False
+    layer: Layer = ""
+    sampler: Sampler = ""
+    #: What papers call the activation that it is.
+    activation: str = ""
+    #: TensorFlow.js computes the activation as a part of a fused product, on every backend (tfjs-core ops/fused_util).
+    tfjs_fuses: bool = False
+    #: The op that computes this one, a bias and an activation in one.
+    fused: str = ""
+
+    def moved(self, operands: Sequence[Any]) -> Sequence[Any]:
+        """Those of ``operands`` whose elements are moved."""
+        return operands[slice(*self.data)]
+
+    @property
+    def exact(self) -> bool:
+        """Whether it rounds nothing."""
+        return bool(self.moves) or self.precision == "exact"
+
+
+def written_as_older(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    """The infer rule of an op that the normalise pass leaves nowhere."""
+    raise GraphError(
+        f"node {node.name!r} ({node.op}) is not written in the spelling of TensorFlow 1.4",
+        why="its type is known once the normalise pass has run",
+        fix="this is a fault of export-model; please open an issue with the source",
+    )
 
 
 def type_attr(name: str = "T", derive: str = "in:0") -> Attr:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from converters.graph.nodes import Node
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
+    GraphBuilder,
     OnnxBuilder,
     OpDef,
     constant_input,
@@ -19,7 +21,7 @@ from converters.graph.ops.base import (
     type_attr,
 )
 from converters.graph.ops.linear import activation, lower_activation
-from converters.graph.types import Dim, Symbols, TensorType
+from converters.graph.types import INT32, Dim, Symbols, TensorType
 
 T = type_attr()
 _TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]
@@ -85,7 +87,7 @@ def _window_of(node: Node, args: Sequence[TensorType]) -> tuple[tuple[Dim, ...],
     image = args[0].shape
     if image is None or len(image) != 4:
         raise shape_error(node, args, "an image has four axes: batch, height, width, channels")
-    if node.op in ("MaxPool", "AvgPool"):
+    if "ksize" in node.attrs:
         window = node.attrs["ksize"]
         if window[0] != 1 or window[3] != 1:
             raise shape_error(node, args, "pooling over batch or channels is not supported")
@@ -153,6 +155,30 @@ def _lower_depthwise(node: Node, builder: OnnxBuilder) -> Any:
     return _lower_window(node, builder, "Conv", [weights], kernel_shape=[height, width], group=channels)
 
 
+def _tfjs_convolution(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js on wasm gives zeros for SAME whose windows leave a rest, which is less than nothing to pad: Pad and
+    VALID.
+    """
+    image, kernel = types[node.inputs[0]].shape, types[node.inputs[1]].shape
+    if node.attrs["padding"] != "SAME" or image is None or kernel is None:
+        return node
+    pads, rest = [(0, 0)], False
+    for size, span, stride, dilation in zip(
+        image[1:3], kernel[:2], node.attrs["strides"][1:3], node.attrs["dilations"][1:3], strict=True
+    ):
+        if not isinstance(size, int) or not isinstance(span, int):
+            return node
+        window = (span - 1) * dilation + 1
+        count, before, after = window_padding(size, window, stride, "SAME")
+        rest |= (count - 1) * stride + window < size
+        pads.append((before, after))
+    if not rest:
+        return node
+    amounts = builder.const(np.array([*pads, (0, 0)], INT32), f"{node.name}/pads")
+    padded = builder.add("Pad", [node.inputs[0], amounts], f"{node.name}/pad")
+    return replace(node, inputs=(padded, *node.inputs[1:]), attrs={**node.attrs, "padding": "VALID"})
+
+
 def _lower_pool(onnx_op: str) -> Any:
     def lower(node: Node, builder: OnnxBuilder) -> Any:
         return _lower_window(node, builder, onnx_op, [], kernel_shape=list(node.attrs["ksize"][1:3]))
@@ -215,7 +241,18 @@ _CONV = (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT, _CUDNN)
 _POOL = (T, Attr("ksize", "int", REQUIRED), _STRIDES, _PADDING, _FORMAT, _EXPLICIT)
 
 OPS = (
-    OpDef("Conv2D", _infer_window, _conv2d, _lower_conv2d, _CONV, foldable=False),
+    OpDef(
+        "Conv2D",
+        _infer_window,
+        _conv2d,
+        _lower_conv2d,
+        _CONV,
+        foldable=False,
+        tfjs=_tfjs_convolution,
+        precision="summed",
+        layer="convolution",
+        fused="_FusedConv2D",
+    ),
     OpDef(
         "_FusedConv2D",
         _infer_window,
@@ -223,6 +260,9 @@ OPS = (
         _lower_conv2d,
         (*_CONV, Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001)),
         foldable=False,
+        since="1.13",
+        precision="summed",
+        layer="convolution",
     ),
     OpDef(
         "DepthwiseConv2dNative",
@@ -231,9 +271,14 @@ OPS = (
         _lower_depthwise,
         (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT),
         foldable=False,
+        tfjs=_tfjs_convolution,
+        precision="summed",
+        layer="convolution",
     ),
-    OpDef("MaxPool", _infer_window, _max_pool, _lower_pool("MaxPool"), _POOL),
-    OpDef("AvgPool", _infer_window, _avg_pool, _lower_pool("AveragePool"), _POOL[:-1]),
-    OpDef("Pad", _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1"))),
-    OpDef("PadV2", _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1"))),
+    OpDef("MaxPool", _infer_window, _max_pool, _lower_pool("MaxPool"), _POOL, precision="exact", layer="pool"),
+    OpDef("AvgPool", _infer_window, _avg_pool, _lower_pool("AveragePool"), _POOL[:-1], layer="pool"),
+    *(
+        OpDef(name, _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1")), precision="exact")
+        for name in ("Pad", "PadV2")
+    ),
 )

@@ -7,7 +7,7 @@ every processor, and the oracle is closer to the true value than any runtime it 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from converters.graph.nodes import Node
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
+    GraphBuilder,
     Lower,
     OnnxBuilder,
     OpDef,
@@ -26,6 +27,7 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.older import clip, leaky_relu, select_v2
 from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
 
 T = type_attr()
@@ -65,13 +67,14 @@ _SELU_ALPHA, _SELU_SCALE = 1.6732632423543772, 1.0507009873554805
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
-def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
-    return OpDef(name, same_as(0), kernel, direct(lower) if isinstance(lower, str) else lower, (T,))
+def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
+    lowering = direct(lower) if isinstance(lower, str) else lower
+    return OpDef(name, same_as(0), kernel, lowering, (T,), elementwise=True, **traits)
 
 
-def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
+def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
     lowering = _pair(lower) if isinstance(lower, str) else lower
-    return OpDef(name, broadcast_of(count=2), _plain(function), lowering, (T,))
+    return OpDef(name, broadcast_of(count=2), _plain(function), lowering, (T,), elementwise=True, **traits)
 
 
 def _pair(onnx_op: str) -> Lower:
@@ -99,7 +102,9 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lower: str | Low
     if name in ("Equal", "NotEqual"):
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
     lowering = direct(lower) if isinstance(lower, str) else lower
-    return OpDef(name, broadcast_of(BOOL, count=2), _plain(function), lowering, attrs)
+    return OpDef(
+        name, broadcast_of(BOOL, count=2), _plain(function), lowering, attrs, precision="exact", elementwise=True
+    )
 
 
 def _chain(*steps: tuple[str, float | None]) -> Lower:
@@ -122,11 +127,6 @@ def _lower_square(node: Node, builder: OnnxBuilder) -> Any:
 def _lower_squared_difference(node: Node, builder: OnnxBuilder) -> Any:
     value = builder.emit("Sub", [builder.value(r) for r in node.inputs])
     return builder.emit("Mul", [value, value])
-
-
-def _lower_clip(node: Node, builder: OnnxBuilder) -> Any:
-    low, high = builder.value(node.inputs[1]), builder.value(node.inputs[2])
-    return builder.emit("Max", [builder.emit("Min", [builder.value(node.inputs[0]), high]), low])
 
 
 def _real_div(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -166,10 +166,6 @@ def _lower_not_equal(node: Node, builder: OnnxBuilder) -> Any:
 def _lower_greater_equal(node: Node, builder: OnnxBuilder) -> Any:
     """The other way round: Barracuda has no GreaterOrEqual."""
     return builder.emit("LessOrEqual", [builder.value(r) for r in reversed(node.inputs)])
-
-
-def _lower_leaky_relu(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("LeakyRelu", [builder.value(node.inputs[0])], alpha=float(node.attrs["alpha"]))
 
 
 def _leaky_relu(node: Node, x: np.ndarray) -> np.ndarray:
@@ -251,44 +247,100 @@ def _lower_ones_like(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Expand", [builder.const(np.ones((), dtype), "one"), shape])
 
 
+def _tfjs_softsign(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js 4.22 has no Softsign."""
+    size = builder.add("Abs", [node.inputs[0]], f"{node.name}/abs")
+    one = builder.const(np.ones((), types[node.name].dtype), f"{node.name}/one")
+    below = builder.add("Add", [size, one], f"{node.name}/below")
+    return Node(node.name, "RealDiv", (node.inputs[0], below), origin=node.origin)
+
+
+def _tfjs_cast(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js cuts a float that is cast to bool (0.6 is false on wasm)."""
+    source = types[node.inputs[0]].dtype
+    if node.attrs["DstT"] != BOOL or source.kind != "f":
+        return node
+    zero = builder.const(np.zeros((), source), f"{node.name}/zero")
+    return Node(node.name, "NotEqual", (node.inputs[0], zero), origin=node.origin)
+
+
+def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js broadcasts a vector condition over the last axis, not the first: SelectV2 of a reshaped one."""
+    condition, a, b = node.inputs
+    rank, wide = types[condition].rank, types[a].rank
+    if rank == 1 and wide is not None and wide > 1:
+        shape = builder.const(np.array([-1] + [1] * (wide - 1), INT32), f"{node.name}/rows")
+        condition = builder.add("Reshape", [condition, shape], f"{node.name}/condition")
+    return Node(node.name, "SelectV2", (condition, a, b), origin=node.origin)
+
+
 UNARY = (
-    _unary("Neg", _plain(np.negative), "Neg"),
-    _unary("Abs", _plain(np.abs), "Abs"),
-    _unary("Sign", _plain(np.sign), "Sign"),
+    _unary("Neg", _plain(np.negative), "Neg", precision="exact"),
+    _unary("Abs", _plain(np.abs), "Abs", precision="exact"),
+    _unary("Sign", _plain(np.sign), "Sign", precision="exact"),
     _unary("Square", _plain(np.square), _lower_square),
-    _unary("Reciprocal", _plain(np.reciprocal), "Reciprocal"),
-    _unary("Floor", _plain(np.floor), "Floor"),
-    _unary("Ceil", _plain(np.ceil), "Ceil"),
-    _unary("Round", _plain(np.rint), "Round"),
-    _unary("Exp", _wide(np.exp), "Exp"),
-    _unary("Expm1", _wide(np.expm1), _chain(("Exp", None), ("Sub", 1.0))),
-    _unary("Log", _wide(np.log), "Log"),
-    _unary("Log1p", _wide(np.log1p), _chain(("Add", 1.0), ("Log", None))),
+    _unary("Reciprocal", _plain(np.reciprocal), "Reciprocal", spellings=("Inv",)),
+    _unary("Floor", _plain(np.floor), "Floor", precision="exact"),
+    _unary("Ceil", _plain(np.ceil), "Ceil", precision="exact"),
+    _unary("Round", _plain(np.rint), "Round", precision="exact"),
+    _unary("Exp", _wide(np.exp), "Exp", precision="approximate"),
+    _unary("Expm1", _wide(np.expm1), _chain(("Exp", None), ("Sub", 1.0)), precision="approximate"),
+    _unary("Log", _wide(np.log), "Log", precision="approximate"),
+    _unary("Log1p", _wide(np.log1p), _chain(("Add", 1.0), ("Log", None)), precision="approximate"),
     _unary("Sqrt", _wide(np.sqrt), "Sqrt"),
-    _unary("Rsqrt", _wide(lambda x: np.asarray(1 / np.sqrt(x))), _chain(("Sqrt", None), ("Reciprocal", None))),
-    _unary("Sin", _wide(np.sin), "Sin"),
-    _unary("Cos", _wide(np.cos), "Cos"),
-    _unary("Tan", _wide(np.tan), "Tan"),
-    _unary("Erf", _wide(_erf), "Erf"),
-    _unary("Sigmoid", _wide(_sigmoid), "Sigmoid"),
-    _unary("Tanh", _wide(np.tanh), "Tanh"),
-    _unary("Relu", _plain(lambda x: np.maximum(x, x.dtype.type(0))), "Relu"),
-    _unary("Relu6", _plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))), _chain(("Max", 0.0), ("Min", 6.0))),
-    _unary("Elu", _wide(_elu), "Elu"),
+    _unary(
+        "Rsqrt",
+        _wide(lambda x: np.asarray(1 / np.sqrt(x))),
+        _chain(("Sqrt", None), ("Reciprocal", None)),
+        precision="approximate",
+    ),
+    _unary("Sin", _wide(np.sin), "Sin", precision="approximate"),
+    _unary("Cos", _wide(np.cos), "Cos", precision="approximate"),
+    _unary("Tan", _wide(np.tan), "Tan", precision="approximate"),
+    _unary("Erf", _wide(_erf), "Erf", precision="approximate"),
+    _unary("Sigmoid", _wide(_sigmoid), "Sigmoid", precision="approximate", activation="sigmoid", tfjs_fuses=True),
+    _unary("Tanh", _wide(np.tanh), "Tanh", precision="approximate", activation="tanh"),
+    _unary(
+        "Relu",
+        _plain(lambda x: np.maximum(x, x.dtype.type(0))),
+        "Relu",
+        precision="exact",
+        activation="relu",
+        tfjs_fuses=True,
+    ),
+    _unary(
+        "Relu6",
+        _plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))),
+        _chain(("Max", 0.0), ("Min", 6.0)),
+        precision="exact",
+        activation="relu 6",
+        tfjs_fuses=True,
+    ),
+    _unary("Elu", _wide(_elu), "Elu", precision="approximate", activation="elu", tfjs_fuses=True),
     _unary(
         "Selu",
         _wide(lambda x: _SELU_SCALE * np.where(x > 0, x, _SELU_ALPHA * np.expm1(np.minimum(x, 0)))),
         "Selu",
+        precision="approximate",
+        activation="selu",
     ),
-    _unary("Softplus", _wide(lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))), "Softplus"),
-    _unary("Softsign", _wide(lambda x: x / (1 + np.abs(x))), "Softsign"),
-    OpDef("LogicalNot", same_as(0), _plain(np.logical_not), direct("Not")),
+    _unary(
+        "Softplus",
+        _wide(lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))),
+        "Softplus",
+        precision="approximate",
+        activation="softplus",
+    ),
+    _unary("Softsign", _wide(lambda x: x / (1 + np.abs(x))), "Softsign", tfjs=_tfjs_softsign, activation="softsign"),
+    OpDef("LogicalNot", same_as(0), _plain(np.logical_not), direct("Not"), precision="exact", elementwise=True),
     OpDef(
         "LeakyRelu",
         same_as(0),
         _leaky_relu,
-        _lower_leaky_relu,
-        (T, Attr("alpha", "float", 0.20000000298023224)),
+        attrs=(T, Attr("alpha", "float", 0.20000000298023224)),
+        older=leaky_relu,
+        activation="leaky relu",
+        elementwise=True,
     ),
     OpDef(
         "Cast",
@@ -300,30 +352,43 @@ UNARY = (
             Attr("DstT", "type", REQUIRED),
             Attr("Truncate", "bool", False, since="1.14", supported=False),
         ),
+        tfjs=_tfjs_cast,
+        precision="exact",
+        elementwise=True,
     ),
-    OpDef("ZerosLike", same_as(0), lambda node, x: np.zeros_like(x), _lower_zeros_like, (T,)),
-    OpDef("OnesLike", same_as(0), lambda node, x: np.ones_like(x), _lower_ones_like, (T,)),
+    _unary("ZerosLike", lambda node, x: np.zeros_like(x), _lower_zeros_like, precision="exact"),
+    _unary("OnesLike", lambda node, x: np.ones_like(x), _lower_ones_like, precision="exact"),
 )
 
 BINARY = (
-    _binary("Add", np.add, "Add"),
+    _binary("Add", np.add, "Add", spellings=("AddV2",)),
     _binary("Sub", np.subtract, "Sub"),
     _binary("Mul", np.multiply, "Mul"),
-    _binary("RealDiv", _real_div, "Div"),
+    _binary("RealDiv", _real_div, "Div", spellings=("Div",)),
     _binary("FloorDiv", _floor_div, _lower_floor_div),
     _binary("FloorMod", np.mod, _lower_floor_mod),
-    _binary("Maximum", np.maximum, "Max"),
-    _binary("Minimum", np.minimum, "Min"),
-    OpDef("Pow", broadcast_of(count=2), _wide(np.power), direct("Pow"), (T,)),
+    _binary("Maximum", np.maximum, "Max", precision="exact"),
+    _binary("Minimum", np.minimum, "Min", precision="exact"),
+    OpDef(
+        "Pow",
+        broadcast_of(count=2),
+        _wide(np.power),
+        direct("Pow"),
+        (T,),
+        precision="approximate",
+        elementwise=True,
+    ),
     _binary("SquaredDifference", lambda a, b: np.square(a - b), _lower_squared_difference),
     OpDef(
         "ClipByValue",
         broadcast_of(),
         _plain(lambda x, low, high: np.maximum(np.minimum(x, high), low)),
-        _lower_clip,
-        (T,),
+        attrs=(T,),
+        older=clip,
+        precision="exact",
+        elementwise=True,
     ),
-    OpDef("AddN", broadcast_of(), _add_n, _lower_add_n, (Attr("N", "int", derive="count"), T)),
+    OpDef("AddN", broadcast_of(), _add_n, _lower_add_n, (Attr("N", "int", derive="count"), T), elementwise=True),
 )
 
 LOGIC = (
@@ -333,15 +398,28 @@ LOGIC = (
     _comparison("GreaterEqual", np.greater_equal, _lower_greater_equal),
     _comparison("Equal", np.equal, "Equal"),
     _comparison("NotEqual", np.not_equal, _lower_not_equal),
-    OpDef("LogicalAnd", broadcast_of(BOOL, count=2), _plain(np.logical_and), direct("And")),
-    OpDef("LogicalOr", broadcast_of(BOOL, count=2), _plain(np.logical_or), direct("Or")),
-    OpDef("Select", _infer_select, _select, _lower_select, (type_attr("T", "in:1"),)),
-    OpDef(
+    *(
+        OpDef(name, broadcast_of(BOOL, count=2), _plain(function), direct(onnx), precision="exact", elementwise=True)
+        for name, function, onnx in (("LogicalAnd", np.logical_and, "And"), ("LogicalOr", np.logical_or, "Or"))
+    ),
+    OpDef(  # not elementwise: a condition of rank 1 chooses whole rows
+        "Select",
+        _infer_select,
+        _select,
+        _lower_select,
+        (type_attr("T", "in:1"),),
+        tfjs=_tfjs_select,
+        precision="exact",
+    ),
+    OpDef(  # of no policy's graph, but of a TensorFlow.js model's
         "SelectV2",
         _infer_select_v2,
         lambda node, c, a, b: np.where(c, a, b),
-        direct("Where"),
-        (type_attr("T", "in:1"),),
+        attrs=(type_attr("T", "in:1"),),
+        older=select_v2,
+        since="1.14",
+        precision="exact",
+        elementwise=True,
     ),
 )
 

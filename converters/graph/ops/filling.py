@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from converters.graph.nodes import Node
 from converters.graph.ops.arrays import target_dims
 from converters.graph.ops.base import (
     Attr,
+    GraphBuilder,
     OnnxBuilder,
     OpDef,
     as_int64,
@@ -22,6 +23,7 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.older import broadcast_to
 from converters.graph.types import INT32, Symbols, TensorType, broadcast, product
 
 T = type_attr()
@@ -47,10 +49,6 @@ def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
 def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     dims = target_dims(args[1].value, args[1], symbols)
     return [TensorType(args[0].dtype, None if dims is None else broadcast(args[0].shape, tuple(dims), symbols))]
-
-
-def _lower_broadcast_to(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Expand", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
 
 
 def _tile(node: Node, x: np.ndarray, multiples: np.ndarray) -> np.ndarray:
@@ -122,6 +120,39 @@ def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Where", [hot, builder.value(node.inputs[2]), builder.value(node.inputs[3])])
 
 
+def _tfjs_one_hot(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js has OneHot over the last axis alone, of no depth of 1, and on wasm of int32 values only (floats
+    come out as bit patterns): on and off are applied after a cast, off + hot·(on − off).
+    """
+    indices, depth, on, off = node.inputs
+    on_value, off_value = types[on].constant, types[off].constant
+    dtype = types[on].dtype
+    one = builder.const(np.array(1, INT32), f"{node.name}/one")
+    zero = builder.const(np.array(0, INT32), f"{node.name}/zero")
+    size = types[depth].constant
+    if size is not None and int(size) < 2:  # tfjs refuses a depth of 1
+        last = builder.const(np.array(-1, INT32), f"{node.name}/last")
+        index = builder.add("ExpandDims", [indices, last], f"{node.name}/index")
+        only = builder.const(np.zeros((), types[indices].dtype), f"{node.name}/only")
+        equal = builder.add("Equal", [index, only], f"{node.name}/equal")
+        hot = builder.add("Cast", [equal], f"{node.name}/hot", DstT=INT32)
+    else:
+        hot = builder.add("OneHot", [indices, depth, one, zero], f"{node.name}/hot", axis=-1)
+    axis, rank = int(node.attrs["axis"]), types[node.name].rank
+    if axis >= 0 and rank is not None and axis != rank - 1:
+        order = [*range(axis), rank - 1, *range(axis, rank - 1)]
+        hot = builder.add(
+            "Transpose", [hot, builder.const(np.array(order, INT32), f"{node.name}/perm")], f"{node.name}/moved"
+        )
+    plain = on_value is not None and off_value is not None and on_value == 1 and off_value == 0
+    if plain:
+        return Node(node.name, "Cast", (hot,), {"DstT": dtype, "Truncate": False}, origin=node.origin)
+    scaled = builder.add("Cast", [hot], f"{node.name}/cast", DstT=dtype)
+    width = builder.add("Sub", [on, off], f"{node.name}/width")
+    product = builder.add("Mul", [scaled, width], f"{node.name}/scaled")
+    return Node(node.name, "Add", (product, off), origin=node.origin)
+
+
 OPS = (
     OpDef(
         "Fill",
@@ -129,9 +160,17 @@ OPS = (
         _fill,
         _lower_fill,
         (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
+        precision="exact",
     ),
-    OpDef("BroadcastTo", _infer_broadcast_to, _broadcast_to, _lower_broadcast_to, (T, type_attr("Tidx", "in:1"))),
-    OpDef("Tile", _infer_tile, _tile, _lower_tile, (T, type_attr("Tmultiples", "in:1"))),
+    OpDef(
+        "BroadcastTo",
+        _infer_broadcast_to,
+        _broadcast_to,
+        attrs=(T, type_attr("Tidx", "in:1")),
+        older=broadcast_to,
+        moves="repeat",
+    ),
+    OpDef("Tile", _infer_tile, _tile, _lower_tile, (T, type_attr("Tmultiples", "in:1")), moves="repeat"),
     OpDef("Range", _infer_range, _range, _lower_range, (type_attr("Tidx"),)),
     OpDef(
         "OneHot",
@@ -139,5 +178,7 @@ OPS = (
         _one_hot,
         _lower_one_hot,
         (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
+        tfjs=_tfjs_one_hot,
+        precision="exact",
     ),
 )

@@ -13,6 +13,7 @@ from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
+    Precision,
     constant_input,
     require_constant,
     same_as,
@@ -173,11 +174,12 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
     return lower
 
 
-def _reduce(name: str, function: Callable[..., Any], onnx_op: str, *, wide: bool = False) -> OpDef:
+def _reduce(name: str, function: Callable[..., Any], onnx_op: str, precision: Precision) -> OpDef:
     attrs: tuple[Attr, ...] = (Attr("keep_dims", "bool", False), type_attr("Tidx", "in:1"))
     if name not in ("All", "Any"):
         attrs = (T, *attrs)
-    return OpDef(name, _infer_reduction, _reduction(function, wide=wide), _lower_reduction(onnx_op), attrs)
+    kernel = _reduction(function, wide=precision != "exact")
+    return OpDef(name, _infer_reduction, kernel, _lower_reduction(onnx_op), attrs, precision=precision)
 
 
 def _arg(function: Callable[..., Any]) -> Callable[..., np.ndarray]:
@@ -250,6 +252,9 @@ OPS = (
             Attr("grad_b", "bool", False, since="2.16"),
         ),
         foldable=False,
+        precision="summed",
+        layer="dense",
+        fused="_FusedMatMul",
     ),
     OpDef(
         "BatchMatMul",
@@ -258,6 +263,9 @@ OPS = (
         _lower_matmul,
         (T, Attr("adj_x", "bool", False), Attr("adj_y", "bool", False)),
         foldable=False,
+        spellings=("BatchMatMulV2", "BatchMatMulV3"),
+        precision="summed",
+        layer="dense",
     ),
     OpDef(
         "_FusedMatMul",
@@ -273,6 +281,9 @@ OPS = (
             Attr("epsilon", "float", 0.0001),
         ),
         foldable=False,
+        since="1.15",
+        precision="summed",
+        layer="dense",
     ),
     OpDef(
         "BiasAdd",
@@ -281,21 +292,31 @@ OPS = (
         _lower_bias_add,
         (T, Attr("data_format", "str", "NHWC")),
     ),
-    _reduce("Sum", np.sum, "ReduceSum", wide=True),
-    _reduce("Mean", np.mean, "ReduceMean", wide=True),
-    _reduce("Prod", np.prod, "ReduceProd", wide=True),
-    _reduce("Max", np.max, "ReduceMax"),
-    _reduce("Min", np.min, "ReduceMin"),
-    _reduce("All", np.all, "ReduceMin"),
-    _reduce("Any", np.any, "ReduceMax"),
-    OpDef("ArgMax", _infer_arg, _arg(np.argmax), _lower_arg("ArgMax"), _ARG_ATTRS),
-    OpDef("ArgMin", _infer_arg, _arg(np.argmin), _lower_arg("ArgMin"), _ARG_ATTRS),
+    _reduce("Sum", np.sum, "ReduceSum", "summed"),
+    _reduce("Mean", np.mean, "ReduceMean", "rounded"),
+    _reduce("Prod", np.prod, "ReduceProd", "rounded"),
+    _reduce("Max", np.max, "ReduceMax", "exact"),
+    _reduce("Min", np.min, "ReduceMin", "exact"),
+    _reduce("All", np.all, "ReduceMin", "exact"),
+    _reduce("Any", np.any, "ReduceMax", "exact"),
+    OpDef("ArgMax", _infer_arg, _arg(np.argmax), _lower_arg("ArgMax"), _ARG_ATTRS, precision="exact"),
+    OpDef("ArgMin", _infer_arg, _arg(np.argmin), _lower_arg("ArgMin"), _ARG_ATTRS, precision="exact"),
     OpDef(
         "Softmax",
         same_as(0),
         lambda node, x: softmax64(x).astype(x.dtype),
         _lower_softmax("Softmax"),
         (T,),
+        precision="approximate",
+        activation="softmax",
     ),
-    OpDef("LogSoftmax", same_as(0), _log_softmax, _lower_softmax("LogSoftmax"), (T,)),
+    OpDef(
+        "LogSoftmax",
+        same_as(0),
+        _log_softmax,
+        _lower_softmax("LogSoftmax"),
+        (T,),
+        precision="approximate",
+        activation="softmax",
+    ),
 )

@@ -11,12 +11,6 @@ from converters.graph.nodes import Node
 from converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, constant_input, type_attr
 from converters.graph.types import INT64, Dim, Symbols, TensorType
 
-#: Ops whose output is N(0, 1); the lift pass turns them into the input ``epsilon``.
-NORMAL_SAMPLERS = ("RandomStandardNormal",)
-#: Ops that draw a class from log-probabilities.
-CATEGORICAL_SAMPLERS = ("Multinomial",)
-SAMPLERS = (*NORMAL_SAMPLERS, *CATEGORICAL_SAMPLERS, "RandomUniform", "TruncatedNormal")
-
 _SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
 
 
@@ -105,9 +99,25 @@ def _lower_multinomial(node: Node, builder: OnnxBuilder) -> Any:
 _RANDOM = (*_SEEDS, Attr("dtype", "type"), type_attr("T"))
 
 OPS = (
-    OpDef("RandomStandardNormal", _infer_random, _normal, _lower_random("RandomNormalLike"), _RANDOM, foldable=False),
-    OpDef("RandomUniform", _infer_random, _uniform, _lower_random("RandomUniformLike"), _RANDOM, foldable=False),
-    OpDef("TruncatedNormal", _infer_random, _truncated, None, _RANDOM, foldable=False),
+    OpDef(
+        "RandomStandardNormal",
+        _infer_random,
+        _normal,
+        _lower_random("RandomNormalLike"),
+        _RANDOM,
+        foldable=False,
+        sampler="normal",
+    ),
+    OpDef("TruncatedNormal", _infer_random, _truncated, None, _RANDOM, foldable=False, sampler="truncated normal"),
+    OpDef(
+        "RandomUniform",
+        _infer_random,
+        _uniform,
+        _lower_random("RandomUniformLike"),
+        _RANDOM,
+        foldable=False,
+        sampler="uniform",
+    ),
     OpDef(
         "Multinomial",
         _infer_multinomial,
@@ -115,5 +125,8 @@ OPS = (
         _lower_multinomial,
         (*_SEEDS, type_attr("T"), Attr("output_dtype", "type", INT64, since="1.7")),
         foldable=False,
+        sampler="categorical",
     ),
 )
+#: Every op that draws.
+SAMPLERS = frozenset(op.name for op in OPS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from converters.graph.nodes import Node
 from converters.graph.ops.base import (
     Attr,
+    GraphBuilder,
     OnnxBuilder,
     OpDef,
     constant_input,
@@ -208,6 +209,29 @@ def _cut(builder: OnnxBuilder, value: str, cuts: Sequence[_Cut]) -> str:
     return result
 
 
+def _tfjs_strided_slice(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js takes other elements where a stride stands beside a shrunk axis, which is kept, then squeezed."""
+    operands = [types[r].constant for r in node.inputs[1:4]]
+    attrs = node.attrs
+    shrunk = [i for i in range(32) if int(attrs["shrink_axis_mask"]) >> i & 1]
+    plain = not (attrs["ellipsis_mask"] or attrs["new_axis_mask"])
+    if not shrunk or not plain or any(o is None for o in operands):
+        return node
+    begin, end, strides = (np.array(o) for o in operands)
+    if (strides == 1).all():
+        return node
+    end_mask = int(attrs["end_mask"])
+    for axis in shrunk:
+        end[axis], strides[axis] = begin[axis] + 1, 1
+        end_mask = end_mask | 1 << axis if begin[axis] == -1 else end_mask & ~(1 << axis)
+    begin_mask = int(attrs["begin_mask"]) & ~sum(1 << axis for axis in shrunk)
+    bounds = [builder.const(v, f"{node.name}/{k}") for k, v in (("begin", begin), ("end", end), ("strides", strides))]
+    kept = builder.add(
+        "StridedSlice", [node.inputs[0], *bounds], f"{node.name}/kept", begin_mask=begin_mask, end_mask=end_mask
+    )
+    return Node(node.name, "Squeeze", (kept,), {"squeeze_dims": tuple(shrunk)}, origin=node.origin)
+
+
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
     return np.take(x, indices, axis=0 if axis is None else int(axis))
 
@@ -227,14 +251,15 @@ def _lower_gather(node: Node, builder: OnnxBuilder) -> Any:
 _MASKS = tuple(Attr(f"{k}_mask", "int", 0) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis"))
 
 OPS = (
-    OpDef("Slice", _infer_slice, _slice, _lower_slice, (T, type_attr("Index", "in:1")), structural=True),
+    OpDef("Slice", _infer_slice, _slice, _lower_slice, (T, type_attr("Index", "in:1")), moves="pick"),
     OpDef(
         "StridedSlice",
         _infer_strided_slice,
         _strided_slice,
         _lower_strided_slice,
         (T, type_attr("Index", "in:1"), *_MASKS),
-        structural=True,
+        tfjs=_tfjs_strided_slice,
+        moves="pick",
     ),
     OpDef(
         "Gather",
@@ -242,7 +267,7 @@ OPS = (
         _gather,
         _lower_gather,
         (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
-        structural=True,
+        moves="pick",
     ),
     OpDef(
         "GatherV2",
@@ -255,6 +280,6 @@ OPS = (
             type_attr("Taxis", "in:2"),
             Attr("batch_dims", "int", 0, since="1.14", supported=False),
         ),
-        structural=True,
+        moves="pick",
     ),
 )

@@ -4,21 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
+from typing import Protocol
 
 from converters.graph.nodes import Node
-from converters.graph.ops import arrays, convolution, elementwise, filling, linear, slicing
-from converters.graph.ops import samplers as chance
-from converters.graph.ops.base import OpDef
+from converters.graph.ops import arrays, convolution, elementwise, filling, linear, older, samplers, slicing
+from converters.graph.ops.base import OpDef, written_as_older
 from signatures.errors import UnsupportedOpError
 
-#: While loops, conditionals and tensor arrays: the straighten pass removes them, so they have no entry.
-CONTROL_FLOW = frozenset(
-    (
-        *("Enter", "Exit", "Merge", "Switch", "LoopCond", "NextIteration"),
-        *("RefEnter", "RefExit", "RefMerge", "RefSwitch", "RefNextIteration"),
-        *("TensorArrayV3", "TensorArrayScatterV3", "TensorArrayGatherV3"),
-        *("TensorArrayReadV3", "TensorArrayWriteV3", "TensorArraySizeV3"),
-    )
+#: While loops, conditionals and tensor arrays, by what they do: the unroll pass removes them, so they have no entry.
+CONTROL_FLOW: Mapping[str, str] = MappingProxyType(
+    {
+        **{f"{ref}{op}": op.lower() for ref in ("", "Ref") for op in ("Enter", "Exit", "Merge", "Switch")},
+        **dict.fromkeys(("NextIteration", "RefNextIteration"), "next_iteration"),
+        "LoopCond": "loop_cond",
+        "TensorArrayV3": "array",
+        **{f"TensorArray{op}V3": op.lower() for op in ("Scatter", "Gather", "Read", "Write", "Size")},
+    }
+)
+
+#: Ops that take references to variables, which frozen graphs do not have → those that take values.
+OF_VALUES: Mapping[str, str] = MappingProxyType(
+    {f"Ref{op}": op for op in ("Enter", "Exit", "Merge", "Switch", "NextIteration", "Identity")}
+)
+
+#: Ops with several results of different names, in their order (the registry of TensorFlow 2.21).
+RESULTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        **dict.fromkeys(
+            ("FusedBatchNorm", "FusedBatchNormV2", "FusedBatchNormV3"),
+            ("y", "batch_mean", "batch_variance", "reserve_space_1", "reserve_space_2", "reserve_space_3"),
+        ),
+        "Switch": ("output_false", "output_true"),
+        "Merge": ("output", "value_index"),
+        "TensorArrayV3": ("handle", "flow"),
+    }
 )
 
 #: Ops that reach outside the graph. A model file is untrusted input: these are refused by name.
@@ -33,7 +52,7 @@ FORBIDDEN = frozenset(
 
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
-    for module in (elementwise, linear, convolution, arrays, slicing, filling, chance):
+    for module in (elementwise, linear, convolution, arrays, slicing, filling, samplers, older):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")
@@ -42,6 +61,39 @@ def _table() -> Mapping[str, OpDef]:
 
 
 TABLE = _table()
+#: Other names of an op → the op's.
+SPELLINGS: Mapping[str, str] = MappingProxyType({name: op.name for op in TABLE.values() for name in op.spellings})
+_UNKNOWN = OpDef("", written_as_older)
+
+
+class Operation(Protocol):
+    """A Node, or a NodeDef message."""
+
+    @property
+    def op(self) -> str:
+        """The op's name."""
+        ...
+
+
+def traits(node: Operation) -> OpDef:
+    """What is known of a node's op, whichever version spells it; of an op that the table lacks, nothing."""
+    return TABLE.get(SPELLINGS.get(node.op, node.op), _UNKNOWN)
+
+
+def is_fed(node: Operation) -> bool:
+    """Whether a node is a placeholder, with a default or without."""
+    return traits(node).start == "fed"
+
+
+def passes_on(node: Operation) -> bool:
+    """Whether a node gives its operand's elements in their order, perhaps under another shape."""
+    return traits(node).moves in ("same", "view")
+
+
+def hands_on(node: Operation) -> bool:
+    """Whether a node gives its operand as it is, perhaps into a loop or branch, or out of one."""
+    flow = CONTROL_FLOW.get(node.op)
+    return traits(node).moves == "same" or flow in ("enter", "exit", "merge", "switch", "next_iteration")
 
 
 def op_of(node: Node) -> OpDef:

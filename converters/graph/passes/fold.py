@@ -21,7 +21,7 @@ def fold(graph: Graph) -> Graph:
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
-        if node.op in ("Const", "Placeholder"):
+        if op_of(node).start:
             editor.keep(node)
             continue
         count = op_of(node).outputs if op_of(node).outputs > 0 else _outputs(types, node.name)

@@ -10,23 +10,21 @@ from collections.abc import Iterable
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, node_of
+from converters.graph.ops.table import op_of
 
-_FUSED = {"MatMul": "_FusedMatMul", "Conv2D": "_FusedConv2D"}
 
-
-def fuse(graph: Graph, roots: Iterable[str], activations: Iterable[str]) -> Graph:
-    """The graph with the pairs (and triples, for ``activations``) joined; the last node's name is kept.
+def fuse(graph: Graph, roots: Iterable[str], *, activations: bool) -> Graph:
+    """The graph with the pairs joined (and with ``activations`` the triples); the last node's name is kept.
 
     A product that something else reads too, or that is an output, stays as it is; so does a transposed one:
     TensorFlow.js's wasm backend adds the bias wrongly there (4.22).
     """
     consumers = graph.consumers()
     outputs = {node_of(r) for r in roots}
-    allowed = frozenset(activations)
     replaced: dict[str, Node] = {}
     swallowed: set[str] = set()
     for node in graph.nodes:
-        if node.op not in _FUSED or node.name in outputs or len(consumers[node.name]) != 1:
+        if not op_of(node).fused or node.name in outputs or len(consumers[node.name]) != 1:
             continue
         if node.attrs.get("transpose_a") or node.attrs.get("transpose_b"):
             continue
@@ -35,11 +33,11 @@ def fuse(graph: Graph, roots: Iterable[str], activations: Iterable[str]) -> Grap
             continue
         last, names = bias, ["BiasAdd"]
         readers = consumers[bias.name]
-        if bias.name not in outputs and len(readers) == 1 and readers[0].op in allowed:
+        if bias.name not in outputs and len(readers) == 1 and activations and op_of(readers[0]).tfjs_fuses:
             last, names = readers[0], ["BiasAdd", readers[0].op]
         replaced[last.name] = Node(
             last.name,
-            _FUSED[node.op],
+            op_of(node).fused,
             (*node.inputs, bias.inputs[1]),
             {**node.attrs, "num_args": 1, "fused_ops": tuple(names), "epsilon": 0.0001},
             origin=last.origin,

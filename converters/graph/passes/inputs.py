@@ -10,7 +10,9 @@ import numpy as np
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape, node_of
+from converters.graph.ops.base import Layer
 from converters.graph.ops.convolution import window_padding
+from converters.graph.ops.table import is_fed, traits
 from converters.graph.passes.normalise import as_placeholder
 from converters.graph.shapes import MAX_ELEMENTS
 from converters.graph.types import INT32
@@ -19,8 +21,6 @@ from signatures.errors import GraphError, UsageError
 from signatures.roles import OBSERVATIONS, Role
 
 _LARGEST_IMAGE = 512
-_POOLS = ("MaxPool", "AvgPool")
-_WINDOWS = ("Conv2D", "DepthwiseConv2dNative", *_POOLS)
 
 
 def set_values(graph: Graph, values: Mapping[str, float]) -> Graph:
@@ -33,7 +33,7 @@ def set_values(graph: Graph, values: Mapping[str, float]) -> Graph:
     nodes = []
     for node in graph.nodes:
         if node.name in values:
-            if node.op not in ("Placeholder", "PlaceholderWithDefault"):
+            if not is_fed(node):
                 raise UsageError(f"--set names {node.name!r}, which is a {node.op}, not a placeholder")
             node = constant_for(node, values[node.name])
         nodes.append(node)
@@ -133,18 +133,22 @@ def complete_shapes(graph: Graph, roles: Mapping[str, Role]) -> Graph:
 
 
 def _dense_length(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> int | None:
-    for reader in consumers[node.name]:
-        if reader.op == "MatMul" and node_of(reader.inputs[0]) == node.name:
-            kernel = graph.constant(reader.inputs[1])
-            if kernel is not None:
-                return int(kernel.shape[1 if reader.attrs.get("transpose_b") else 0])
-        if reader.op in ("Identity", "Sub", "Sigmoid", "Tanh"):
-            return _dense_length(graph, reader, consumers)
+    """Rows of the nearest kernel that a placeholder is multiplied with, perhaps normalised or activated before."""
+    queue, seen = [node], {node.name}
+    for source in queue:
+        for reader in consumers[source.name]:
+            if reader.op == "MatMul" and node_of(reader.inputs[0]) == source.name:
+                kernel = graph.constant(reader.inputs[1])
+                if kernel is not None:
+                    return int(kernel.shape[1 if reader.attrs.get("transpose_b") else 0])
+            elif reader.name not in seen and (traits(reader).elementwise or traits(reader).moves == "same"):
+                seen.add(reader.name)
+                queue.append(reader)
     return None
 
 
 def _image_shape(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], known: TensorShape) -> TensorShape:
-    first = _next(graph, node, consumers, ("Conv2D", "DepthwiseConv2dNative"))
+    first = _next(node, consumers, "convolution")
     if first is None:
         return known
     kernel = graph.constant(first.inputs[1])
@@ -152,8 +156,8 @@ def _image_shape(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], 
     dims = known.dims if known.dims is not None and len(known.dims) == 4 else (None, None, None, channels)
     if any(d is not None for d in dims[1:3]) and None not in dims[1:3]:
         return TensorShape((None, dims[1], dims[2], dims[3] or channels))
-    layers, last = _window_chain(graph, first, consumers)
-    dense = _next(graph, last, consumers, ("MatMul",))
+    layers, last = _window_chain(first, consumers)
+    dense = _next(last, consumers, "dense")
     weights = None if dense is None else graph.constant(dense.inputs[1])
     if weights is None:
         return TensorShape((None, dims[1], dims[2], dims[3] or channels))
@@ -164,12 +168,12 @@ def _image_shape(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], 
     return TensorShape((None, dims[1], dims[2], dims[3] or channels))
 
 
-def _next(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], ops: tuple[str, ...]) -> Node | None:
-    """The first node of one of ``ops`` downstream, nearest first."""
+def _next(node: Node, consumers: Mapping[str, list[Node]], *layers: Layer) -> Node | None:
+    """The first node downstream that computes one of ``layers``, nearest first."""
     queue, seen = [node], {node.name}
-    while queue:
-        for reader in consumers[queue.pop(0).name]:
-            if reader.op in ops:
+    for source in queue:
+        for reader in consumers[source.name]:
+            if traits(reader).layer in layers:
                 return reader
             if reader.name not in seen:
                 seen.add(reader.name)
@@ -177,10 +181,10 @@ def _next(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], ops: tu
     return None
 
 
-def _window_chain(graph: Graph, first: Node, consumers: Mapping[str, list[Node]]) -> tuple[list[Node], Node]:
+def _window_chain(first: Node, consumers: Mapping[str, list[Node]]) -> tuple[list[Node], Node]:
     """Convolutions and pools in a row from ``first`` on."""
     chain, node = [first], first
-    while (following := _next(graph, node, consumers, (*_WINDOWS, "MatMul"))) and following.op != "MatMul":
+    while (following := _next(node, consumers, "convolution", "pool", "dense")) and traits(following).layer != "dense":
         chain.append(following)
         node = following
     return chain, node
@@ -189,7 +193,7 @@ def _window_chain(graph: Graph, first: Node, consumers: Mapping[str, list[Node]]
 def _flattened(layers: list[Node], graph: Graph, height: int, width: int) -> int:
     channels = 0
     for layer in layers:
-        kernel = None if layer.op in _POOLS else graph.constant(layer.inputs[1])
+        kernel = None if traits(layer).layer == "pool" else graph.constant(layer.inputs[1])
         window = layer.attrs["ksize"][1:3] if kernel is None else kernel.shape[:2]
         if kernel is not None:
             channels = int(kernel.shape[3]) * (int(kernel.shape[2]) if layer.op == "DepthwiseConv2dNative" else 1)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, split_ref, topological
+from converters.graph.ops.table import traits
 
 
 def name_tensors(
@@ -24,7 +25,7 @@ def name_tensors(
     multiple |= {node_of(r) for r in fetches.values() if split_ref(r)[1]}
     for name, reference in fetches.items():
         node = graph.producer(reference)
-        if node.name in renamed or node.name in multiple or node.op in ("Placeholder", "Const"):
+        if node.name in renamed or node.name in multiple or traits(node).start:
             identities.append((name, reference))
         else:
             renamed[node.name] = name

@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.samplers import NORMAL_SAMPLERS, SAMPLERS
+from converters.graph.ops.table import traits
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
 from signatures.errors import UnsupportedOpError
@@ -24,14 +24,14 @@ NoiseMode = Literal["lift", "keep", "zero"]
 
 def samplers(graph: Graph) -> list[Node]:
     """The nodes that draw from N(0, 1), in graph order."""
-    return [n for n in graph.nodes if n.op in NORMAL_SAMPLERS]
+    return [n for n in graph.nodes if traits(n).sampler == "normal"]
 
 
 def unseeded(graph: Graph) -> Graph:
     """Samplers without the seed that the trainer's run had: with it, a game draws the same actions after every start,
     and TensorFlow.js, which starts its generator anew for every run, the same one each time.
     """
-    nodes = [replace(n, attrs={**n.attrs, "seed": 0, "seed2": 0}) if n.op in SAMPLERS else n for n in graph.nodes]
+    nodes = [replace(n, attrs={**n.attrs, "seed": 0, "seed2": 0}) if traits(n).sampler else n for n in graph.nodes]
     return Graph(tuple(nodes))
 
 
@@ -46,7 +46,7 @@ def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> G
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
-        if node.op not in NORMAL_SAMPLERS and node.name not in fed:
+        if traits(node).sampler != "normal" and node.name not in fed:
             editor.keep(node)
             continue
         shape = types[node.name].shape

@@ -13,17 +13,16 @@ import numpy as np
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.slicing import strided_steps
+from converters.graph.ops.table import op_of, traits
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import INT32
-
-IDENTITIES = frozenset(("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"))
 
 
 def drop_identities(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
     """The graph without pass-through ops, and where the fetched tensors are now."""
     editor = Editor(graph)
     for node in graph.nodes:
-        if node.op in IDENTITIES:
+        if traits(node).moves == "same":
             editor.redirect(node.name, editor.resolve(node.inputs[0]))
         else:
             editor.keep(node)
@@ -60,10 +59,11 @@ def collapse_views(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dic
 
 def _is_view(node: Node, types: Types) -> bool:
     """Whether a node shows the same elements in the same order under another shape."""
-    if node.op in ("Reshape", "Squeeze", "ExpandDims"):
+    entry = op_of(node)
+    if entry.moves == "view":
         return types[node.inputs[0]].shape is not None and types[node.name].shape is not None
-    if node.op in ("Pack", "ConcatV2"):
-        return len(node.inputs) == (1 if node.op == "Pack" else 2) and types[node.name].shape is not None
+    if entry.moves == "join":
+        return len(entry.moved(node.inputs)) == 1 and types[node.name].shape is not None
     before = types[node.inputs[0]].shape if node.inputs else None
     if before is None:
         return False

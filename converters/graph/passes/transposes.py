@@ -15,12 +15,9 @@ import numpy as np
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, split_ref
-from converters.graph.ops.elementwise import OPS
+from converters.graph.ops.table import op_of
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import INT32
-
-#: Ops whose result at an index depends on their operands at that index only. TF 1's Select chooses rows.
-_ELEMENTWISE = frozenset(op.name for op in OPS) - {"Select"}
 
 #: (a tensor, the order in which its axes are read)
 _Turned = tuple[str, tuple[int, ...]]
@@ -83,7 +80,7 @@ class _Sinking:
     def _pass_through(self, node: Node) -> bool:
         """An elementwise op of held tensors works on what they are made of; its result is held in their place."""
         orders = {self.held[r][1] for r in node.inputs if r in self.held}
-        if node.op not in _ELEMENTWISE or len(orders) != 1:
+        if not op_of(node).elementwise or len(orders) != 1:
             return False
         (order,) = orders
         operands = [self._turned_operand(r, order) for r in node.inputs]

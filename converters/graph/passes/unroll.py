@@ -41,7 +41,7 @@ class _DeadError(Exception):
     """A tensor on the branch that is not taken."""
 
 
-def straighten(graph: Graph) -> Graph:
+def unroll(graph: Graph) -> Graph:
     """See the module."""
     if not any(n.op in CONTROL_FLOW for n in graph.nodes):
         return graph
@@ -110,7 +110,7 @@ class _Unroller:
 
     def _control(self, node: Node, index: int, turn: int | None) -> str | _Flow | None:
         try:
-            return getattr(self, "_" + _METHODS[node.op])(node, index, turn)  # type: ignore[no-any-return]
+            return getattr(self, f"_{CONTROL_FLOW[node.op]}")(node, index, turn)  # type: ignore[no-any-return]
         except _DeadError:
             return None
 
@@ -118,6 +118,8 @@ class _Unroller:
 
     def _enter(self, node: Node, index: int, turn: int | None) -> str | _Flow:
         return self.tensor(node.inputs[0], None)
+
+    _next_iteration = _enter
 
     def _merge(self, node: Node, index: int, turn: int | None) -> str | _Flow:
         back = [r for r in node.inputs if self.graph.producer(r).op == "NextIteration"]
@@ -259,24 +261,6 @@ class _Unroller:
         return run_kernel(op_of(node), node, [o for o in operands if o is not None])[index]
 
 
-_METHODS = {
-    "Enter": "enter",
-    "Merge": "merge",
-    "Switch": "switch",
-    "Exit": "exit",
-    "LoopCond": "loop_cond",
-    "NextIteration": "enter",
-    "TensorArrayV3": "array",
-    "TensorArrayScatterV3": "scatter",
-    "TensorArrayReadV3": "read",
-    "TensorArrayWriteV3": "write",
-    "TensorArrayGatherV3": "gather",
-    "TensorArraySizeV3": "size",
-    **{f"Ref{op}": op.lower() for op in ("Enter", "Merge", "Switch", "Exit")},
-    "RefNextIteration": "enter",
-}
-
-
 def _alive(value: str | _Flow | None) -> str | _Flow:
     if value is None:
         raise _DeadError
@@ -288,7 +272,7 @@ def _frames(graph: Graph) -> dict[str, str]:
     frames: dict[str, str] = {}
     for node in graph.nodes:
         inside = [frames[n] for n in (split_ref(r)[0] for r in node.inputs) if n in frames]
-        if node.op in ("Enter", "RefEnter"):
+        if CONTROL_FLOW.get(node.op) == "enter":
             if inside:
                 raise UnsupportedOpError(
                     f"cannot convert Enter (node {node.name!r}): a loop inside a loop",
@@ -297,7 +281,7 @@ def _frames(graph: Graph) -> dict[str, str]:
                     fix="please open an issue with the graph",
                 )
             frames[node.name] = str(node.attrs.get("frame_name", ""))
-        elif inside and node.op not in ("Exit", "RefExit"):
+        elif inside and CONTROL_FLOW.get(node.op) != "exit":
             frames[node.name] = inside[0]
     return frames
 

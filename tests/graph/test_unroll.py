@@ -14,7 +14,7 @@ from converters.graph.ops.table import CONTROL_FLOW
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import set_values
 from converters.graph.passes.normalise import normalise
-from converters.graph.passes.unroll import MAX_TURNS, straighten
+from converters.graph.passes.unroll import MAX_TURNS, unroll
 from converters.graph.run import run_graph
 from fixtures import path
 from fixtures.goldens import read_npz
@@ -33,8 +33,8 @@ def straight(nodes: Sequence[Any], *outputs: str) -> Graph:
     """Read, normalised and unrolled, only what the outputs need; the outputs are called ``out:…``."""
     read = from_graph_def(handmade.graph_def(nodes, producer=24))
     pins = [Node(f"out:{name}", "Identity", (name,)) for name in outputs]
-    made = straighten(normalise(Graph((*read.nodes, *pins)).pruned([p.name for p in pins])))
-    assert not {n.op for n in made.nodes} & CONTROL_FLOW
+    made = unroll(normalise(Graph((*read.nodes, *pins)).pruned([p.name for p in pins])))
+    assert not {n.op for n in made.nodes} & CONTROL_FLOW.keys()
     return made
 
 
@@ -56,13 +56,13 @@ OUTPUTS = ("action", "action_probs", "recurrent_out")
 def recurrent(steps: int) -> Graph:
     """The fixture's LSTM for sequences of ``steps``, unrolled."""
     source = read_graph(path("recurrent").read_bytes()).pruned(OUTPUTS)
-    return straighten(normalise(set_values(source, {"sequence_length": steps})))
+    return unroll(normalise(set_values(source, {"sequence_length": steps})))
 
 
 @pytest.mark.parametrize("run", ["b1", "b3", "b7", "step0", "step3"])
 def test_an_lstm_of_one_step_is_its_cell(run: str) -> None:
     made = recurrent(1)
-    assert not {n.op for n in made.nodes} & CONTROL_FLOW
+    assert not {n.op for n in made.nodes} & CONTROL_FLOW.keys()
     goldens = read_npz(path("recurrent.npz"))
     feeds = {n.name: goldens[f"{run}/in/{n.name}"] for n in made.nodes if n.op == "Placeholder"}
     results = run_graph(made, feeds, OUTPUTS)
@@ -282,4 +282,4 @@ def test_a_tensor_array_of_unknown_indices_is_refused() -> None:
 
 def test_a_graph_without_loops_stays_the_same_object() -> None:
     read = from_graph_def(handmade.graph_def([placeholder("x"), node("y", "Neg", "x", T=F32)]))
-    assert straighten(read) is read
+    assert unroll(read) is read

@@ -1,0 +1,139 @@
+"""What the op table says of ops, held against the kernels; and that no other file lists ops."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pytest
+
+from converters.graph.nodes import Graph, Node
+from converters.graph.ops.table import CONTROL_FLOW, SPELLINGS, TABLE, hands_on, is_fed, passes_on, traits
+from converters.graph.run import run_graph
+from tests.commands import ROOT
+from tests.graph.harness import Array
+from tests.graph.making import defaults
+from tests.graph.samples import SAMPLES, Sample
+
+NAMES = {*TABLE, *SPELLINGS, *CONTROL_FLOW}
+#: Where names are a source's or a consumer's own words, which only sound like TensorFlow's: folder or file → whose.
+VOCABULARIES = {
+    "converters/barracuda": "Barracuda's layers",
+    "converters/onnx": "ONNX's ops",
+    "converters/targets": "the ops that Unity's importers take",
+    "converters/tfjs/unfuse.py": "the fused ops of TensorFlow.js",
+}
+
+
+def listed(tree: ast.AST) -> Iterator[tuple[int, set[str]]]:
+    """(line, ops) of every literal collection that names at least two ops."""
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Tuple | ast.List | ast.Set):
+            parts: list[ast.expr | None] = list(found.elts)
+        elif isinstance(found, ast.Dict):
+            parts = [*found.keys, *found.values]
+        else:
+            continue
+        ops = {p.value for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, str)} & NAMES
+        if len(ops) > 1:
+            yield found.lineno, ops
+
+
+def test_no_other_file_lists_ops() -> None:
+    found = {}
+    for package in ("signatures", "converters", "exporter"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            name = path.relative_to(ROOT).as_posix()
+            if name.startswith("converters/graph/ops/") or "node_modules" in name:
+                continue
+            if not any(name.startswith(place) for place in VOCABULARIES):
+                found |= {f"{name}:{line}": ops for line, ops in listed(ast.parse(path.read_text(encoding="utf-8")))}
+    assert found == {}
+
+
+def test_a_list_of_ops_would_be_found() -> None:
+    assert list(listed(ast.parse('A = frozenset(("MatMul", "x", "Conv2D"))'))) == [(1, {"MatMul", "Conv2D"})]
+    assert list(listed(ast.parse('A = {"AddV2": 1, "Enter": 2}'))) == [(1, {"AddV2", "Enter"})]
+    assert list(listed(ast.parse('A = ("MatMul", "width")'))) == []
+
+
+@pytest.mark.parametrize("place", VOCABULARIES)
+def test_every_vocabulary_is_there(place: str) -> None:
+    assert (ROOT / place).exists()
+
+
+# ------------------------------------------------------------------ traits
+
+
+def wide(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    return {name: a.astype(np.float64) if a.dtype == np.float32 else a for name, a in arrays.items()}
+
+
+def computed(sample: Sample, *, in_double: bool) -> list[Array]:
+    feeds = wide(sample.feeds) if in_double else dict(sample.feeds)
+    if in_double:
+        feeds |= wide({n.name: n.value for n in sample.nodes if n.value is not None})
+    results = run_graph(sample.graph, feeds, sample.fetches)
+    return [results[name] for name in sample.fetches]
+
+
+@pytest.mark.parametrize("op", [op.name for op in TABLE.values() if op.exact and op.kernel is not None])
+def test_an_exact_op_rounds_nothing(op: str) -> None:
+    """In float64 the same numbers come out."""
+    for sample in (s for s in SAMPLES if s.op == op):
+        for narrow, double in zip(computed(sample, in_double=False), computed(sample, in_double=True), strict=True):
+            np.testing.assert_array_equal(narrow.astype(np.float64), double.astype(np.float64), sample.title)
+
+
+@pytest.mark.parametrize("op", [op.name for op in TABLE.values() if not op.exact and op.elementwise])
+def test_an_op_that_rounds_rounds(op: str) -> None:
+    """In float64 other numbers come out."""
+    names = "abc"[: max(len(s.graph["op"].inputs) for s in SAMPLES if s.op == op)]
+    operands = np.random.default_rng(0).standard_normal((len(names), 200)).astype(np.float32)
+    operands[:, 0] = np.float32([1, 0.1, 0.3])[: len(names)]  # 1 // 0.1 is 10 in float32 alone
+    graph = Graph((Node("op", op, tuple(names), defaults(op)),))
+    narrow, double = (
+        run_graph(graph, {n: row.astype(dtype) for n, row in zip(names, operands, strict=True)}, ["op"])
+        for dtype in (np.float32, np.float64)
+    )
+    assert not np.array_equal(narrow["op"].astype(np.float64), double["op"], equal_nan=True)
+
+
+@pytest.mark.parametrize("op", [op.name for op in TABLE.values() if op.moves])
+def test_what_moves_elements_makes_none(op: str) -> None:
+    for sample in (s for s in SAMPLES if s.op == op):
+        node = sample.graph["op"]
+        moved = list(TABLE[op].moved(node.inputs))
+        values = run_graph(sample.graph, sample.feeds, [*moved, *sample.fetches])
+        elements = np.concatenate([values[r].reshape(-1) for r in moved])
+        for name in sample.fetches:
+            assert np.isin(values[name], elements).all(), sample.title
+
+
+@pytest.mark.parametrize("op", [op.name for op in TABLE.values() if op.elementwise])
+def test_an_elementwise_op_sees_one_element_at_a_time(op: str) -> None:
+    """The operands' elements in another order: the results come in that order."""
+    for sample in (s for s in SAMPLES if s.op == op):
+        node = sample.graph["op"]
+        values = run_graph(sample.graph, sample.feeds, [*node.inputs, "op"])
+        result = values["op"].reshape(-1)
+        order = np.random.default_rng(0).permutation(result.size)
+        feeds = {r: np.broadcast_to(values[r], values["op"].shape).reshape(-1)[order] for r in node.inputs}
+        again = run_graph(Graph((node,)), feeds, ["op"])["op"]
+        np.testing.assert_array_equal(again, result[order], sample.title)
+
+
+def test_spellings_are_no_ops_of_their_own() -> None:
+    assert not SPELLINGS.keys() & TABLE.keys()
+    assert set(SPELLINGS.values()) <= TABLE.keys()
+
+
+def test_traits_are_known_under_every_spelling() -> None:
+    assert traits(Node("n", "AddV2")) is TABLE["Add"]
+    assert traits(Node("n", "BatchMatMulV3")).layer == "dense"
+    assert is_fed(Node("n", "PlaceholderWithDefault"))
+    assert is_fed(Node("n", "PlaceholderV2"))
+    assert passes_on(Node("n", "Squeeze")) and not hands_on(Node("n", "Squeeze"))
+    assert hands_on(Node("n", "Enter")) and hands_on(Node("n", "StopGradient"))
+    assert not traits(Node("n", "NoSuchOp")).exact
