@@ -37,3 +37,5 @@ class Runtime:
     independent: bool = True
     #: ``auto`` takes it where it is installed; a browser is started only when it is asked for (``full`` or by name).
     automatic: bool = True
+    #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.
+    confined: bool = True

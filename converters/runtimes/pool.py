@@ -17,6 +17,8 @@ INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
 _ORIGINALS = tuple(r.name for r in RUNTIMES if "source" in r.formats)
 #: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for.
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
+#: Runtimes that have a sandbox of their own.
+_FREE = frozenset(r.name for r in RUNTIMES if not r.confined)
 _COMMANDS = MappingProxyType({r.name: r.command for r in RUNTIMES})
 
 
@@ -72,7 +74,7 @@ class RuntimePool:
 
     def _launched(self, name: str) -> RuntimeProcess:
         if name not in self._processes:
-            self._processes[name] = RuntimeProcess(name, self._commands[name]())
+            self._processes[name] = RuntimeProcess(name, self._commands[name](), confined=name not in _FREE)
         self._processes[name].launch()
         return self._processes[name]
 

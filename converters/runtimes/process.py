@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
+from converters.runtimes.memory import Memory
+from converters.runtimes.python import confined
 from converters.runtimes.wire import FramingError, Tensors, read_frame, write_frame
 from signatures.errors import ExportModelError, RuntimeUnavailableError
 
@@ -28,12 +32,16 @@ class RunFailedError(ExportModelError):
 class RuntimeProcess:
     """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
 
-    def __init__(self, name: str, command: Sequence[str]) -> None:
+    def __init__(self, name: str, command: Sequence[str], *, confined: bool = True) -> None:
+        """``confined``: it may not write outside a folder of its own, nor reach a network (confinement.py)."""
         self.name = name
         self.command = list(command)
+        self.confined = confined
         self.version: str | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._memory: Memory | None = None
         self._loaded = 0
 
     def launch(self) -> None:
@@ -44,11 +52,19 @@ class RuntimeProcess:
         if self._process is not None:
             return
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
+        self._scratch = tempfile.TemporaryDirectory(prefix="export-model-", ignore_cleanup_errors=True)
+        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), self._scratch.name)
         try:
+            command = confined(self.command, self._scratch.name) if self.confined else self.command
             self._process = subprocess.Popen(
-                self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                env={**os.environ, **places},
             )
         except OSError as error:
+            self.close()
             raise RuntimeUnavailableError(
                 f"the runtime {self.name} did not start", why=str(error), fix="export-model runtimes shows what is here"
             ) from error
@@ -74,6 +90,8 @@ class RuntimeProcess:
                 fix="export-model runtimes shows what is here and how to install what is not",
             ) from error
         self.version = str(answer["version"])
+        if self._process is not None and self.confined:
+            self._memory = Memory(self._process.pid)
         return self.version
 
     def load(self, path: str, **options: Any) -> LoadedModel:
@@ -81,6 +99,8 @@ class RuntimeProcess:
         self.start()
         self._loaded += 1
         identity = f"m{self._loaded}"
+        if self._memory is not None:
+            self._memory.allow(_size(path))
         self.request({"cmd": "load", "id": identity, "path": path, **options})
         return LoadedModel(self, identity)
 
@@ -91,6 +111,8 @@ class RuntimeProcess:
 
         Raises RunFailedError where the answer is an error, the process died, or hangs.
         """
+        if self._memory is not None:
+            self._memory.allow_for_request(sum(a.nbytes for a in (tensors or {}).values()))
         return self._exchange(lambda stream: write_frame(stream, header, tensors))
 
     @property
@@ -157,6 +179,10 @@ class RuntimeProcess:
         if self._errors is not None:
             self._errors.close()
             self._errors = None
+        if self._scratch is not None:
+            self._scratch.cleanup()
+            self._scratch = None
+        self._memory = None
 
     def __enter__(self) -> RuntimeProcess:
         return self
@@ -165,6 +191,14 @@ class RuntimeProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _size(path: str) -> int:
+    """The bytes of a model: a file, or a folder of files."""
+    place = Path(path)
+    if place.is_dir():
+        return sum(f.stat().st_size for f in place.rglob("*") if f.is_file())
+    return place.stat().st_size if place.is_file() else 0
 
 
 def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
+import os
+import shutil
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +31,19 @@ def child_command(module: str, *arguments: str) -> list[str]:
     root = str(Path(converters.__file__).resolve().parent.parent)
     start = f"import sys, runpy; sys.path.insert(0, {root!r}); "
     return [sys.executable, "-c", f"{start}runpy.run_module({module!r}, run_name='__main__')", *arguments]
+
+
+def confined(command: Sequence[str], scratch: str) -> list[str]:
+    """A command whose process may write below ``scratch`` only, and reach no network, as far as the system offers it.
+
+    Raises FileNotFoundError where there is no such program.
+    """
+    if os.name != "posix":
+        return list(command)
+    if shutil.which(command[0]) is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
+    program = str(Path(converters.__file__).resolve().parent / "runtimes" / "confinement.py")
+    return [sys.executable, "-I", "-S", program, scratch, *command]
 
 
 def module_origin(name: str) -> str | None:

@@ -8,6 +8,14 @@ import click
 
 from signatures.errors import UsageError
 
+#: Part of the confinement of a runtime's process → what it means.
+_SAID = {
+    "writing": "writes to a scratch folder only",
+    "network": "has no network",
+    "memory": "has bounded memory",
+    "processor": "has bounded time",
+}
+
 
 @click.group("runtimes", invoke_without_command=True)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
@@ -16,16 +24,27 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     """Which runtimes are here, in which version, and how to install the others."""
     if ctx.invoked_subcommand is not None:
         return
+    from converters.runtimes.confinement import in_force
     from converters.runtimes.registry import available_runtimes
     from exporter.cli.tables import table
 
     found = available_runtimes()
+    kept = in_force()
     if as_json:
         rows = [{"name": i.name, "installed": i.installed, "version": i.version, "install": i.how} for i in found]
-        click.echo(json.dumps({"runtimes": rows}, indent=1))
+        click.echo(json.dumps({"runtimes": rows, "confinement": kept}, indent=1))
         return
     cells = [[i.name, i.version or "-", "installed" if i.installed else i.how] for i in found]
     click.echo(table(("runtime", "version", "state"), cells))
+    lacking = [_SAID[part] for part, there in kept.items() if not there]
+    held = [_SAID[part] for part, there in kept.items() if there]
+    click.echo()
+    if held:
+        click.echo(
+            f"a runtime's process {', '.join(held)}" + (" (a browser has its own sandbox)" if not lacking else "")
+        )
+    if lacking:
+        click.echo(f"not on this system: {', '.join(lacking)}")
 
 
 @runtimes_command.command("install")

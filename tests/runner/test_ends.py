@@ -33,7 +33,7 @@ PARENT = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
 from converters.runtimes.process import RuntimeProcess
-RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}]).load(sys.argv[1])
+RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}], confined=False).load(sys.argv[1])
 """
 #: A parent whose child multiplies matrices that take TensorFlow.js minutes.
 MULTIPLYING = f"""
@@ -122,11 +122,13 @@ def test_one_that_speaks_no_frames_is_refused(said: bytes) -> None:
 
 
 INTERRUPTED = f"""
-import sys
+import pathlib, sys
 sys.path.insert(0, {str(ROOT)!r})
 from converters.runtimes.pool import RuntimePool
-never = "import pathlib, sys, time; pathlib.Path(sys.argv[1]).touch(); time.sleep(600)"
-with RuntimePool({{"a": lambda: [sys.executable, "-c", never, sys.argv[1]]}}) as pool:
+never = "import time; time.sleep(600)"
+with RuntimePool({{"a": lambda: [sys.executable, "-c", never]}}) as pool:
+    pool.start(["a"])
+    pathlib.Path(sys.argv[1]).touch()
     pool.process("a")
 """
 

@@ -95,7 +95,7 @@ def _command(name: str) -> list[str]:
 
 def _runtime(name: str, kind: str, *packages: str) -> Runtime:
     find, command = partial(_find, name, packages), partial(_command, name)
-    return Runtime(name, (kind,), find, command, install_packages, automatic=False)
+    return Runtime(name, (kind,), find, command, install_packages, automatic=False, confined=False)
 
 
 RUNTIMES = (

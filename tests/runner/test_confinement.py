@@ -1,0 +1,122 @@
+"""A runtime's process reads, computes, writes to its own folder; it has no network and no more memory than is fair."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.runtimes.confinement import in_force
+from converters.runtimes.memory import FREE
+from converters.runtimes.process import RunFailedError, RuntimeProcess
+from converters.runtimes.python import child_command, confined
+from signatures.errors import RuntimeUnavailableError
+
+pytestmark = pytest.mark.skipif(not all(in_force().values()), reason="this kernel lacks Landlock or seccomp")
+
+ATTEMPTS = {
+    "write": "open({outside!r} + '/new', 'w')",
+    "write over": "open({outside!r} + '/there', 'w')",
+    "append": "open({outside!r} + '/there', 'a').write('x')",
+    "cut off": "import os; os.truncate({outside!r} + '/there', 0)",
+    "remove": "import os; os.unlink({outside!r} + '/there')",
+    "rename": "import os; os.rename({outside!r} + '/there', {outside!r} + '/gone')",
+    "make a folder": "import os; os.mkdir({outside!r} + '/folder')",
+    "make a link": "import os; os.symlink('/etc', {outside!r} + '/link')",
+    "write by another program": "import subprocess; subprocess.run(['cp', '/etc/hostname', {outside!r}], check=True)",
+    "call": "import socket; socket.create_connection(('127.0.0.1', {port}), 2)",
+    "send a datagram": "import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'x', ('127.0.0.1', 9))",
+    "a local socket": "import socket; socket.socket(socket.AF_UNIX)",
+    "signal its parent": "import os; os.kill(os.getppid(), 0)",
+    "trace its parent": "import ctypes, os; exit(ctypes.CDLL(None).ptrace(16, os.getppid(), 0, 0) != 0)",
+}
+
+
+def tried(code: str, scratch: Path) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(confined([sys.executable, "-c", code], str(scratch)), capture_output=True, check=False)
+
+
+@pytest.mark.parametrize("name", ATTEMPTS)
+def test_it_cannot(name: str, tmp_path: Path) -> None:
+    outside, scratch = tmp_path / "outside", tmp_path / "scratch"
+    outside.mkdir()
+    scratch.mkdir()
+    (outside / "there").write_text("kept")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        code = ATTEMPTS[name].format(outside=str(outside), port=server.getsockname()[1])
+        assert tried(code, scratch).returncode != 0
+    assert [p.name for p in outside.iterdir()] == ["there"]
+    assert (outside / "there").read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "open({scratch!r} + '/new', 'w').write('x')",
+        "import os; os.mkdir({scratch!r} + '/a'); os.rmdir({scratch!r} + '/a')",
+        "open('/dev/null', 'w').write('x')",
+        "open('/etc/passwd').read()",
+        "import threading; t = threading.Thread(target=print); t.start(); t.join()",
+    ],
+)
+def test_it_can(code: str, tmp_path: Path) -> None:
+    done = tried(code.format(scratch=str(tmp_path)), tmp_path)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+def test_no_core_and_no_endless_file() -> None:
+    code = "import resource as r; print(r.getrlimit(r.RLIMIT_CORE)[0], r.getrlimit(r.RLIMIT_FSIZE)[0])"
+    done = tried(code, Path("/tmp"))
+    assert done.stdout.split() == [b"0", str(1 << 30).encode()]
+
+
+HUNGRY = """
+import numpy as np, sys
+from converters.runtimes.child import claim_stdout, serve
+class Model:
+    def run(self, feeds, fetch, request):
+        size = int(feeds["x"][0])
+        return {"y": np.full(size, 1, np.uint8)[:1]}
+serve("hungry", "1", lambda header: Model(), (MemoryError,), claim_stdout())
+"""
+
+
+def hungry() -> list[str]:
+    start = child_command("x")[2].partition(";")[0] + f"; sys.path.insert(0, {str(Path.cwd())!r})\n"
+    return [sys.executable, "-c", f"{start}{HUNGRY}"]
+
+
+def test_memory_is_bounded_by_what_it_is_given(tmp_path: Path) -> None:
+    with RuntimeProcess("hungry", hungry()) as process:
+        model = process.load(str(tmp_path))
+        assert model.run({"x": np.array([1 << 20], np.int64)}, ["y"])["y"][0] == 1
+        with pytest.raises(RunFailedError, match=r"MemoryError|ended while"):
+            model.run({"x": np.array([FREE * 2], np.int64)}, ["y"])
+
+
+def test_memory_grows_with_what_it_is_fed(tmp_path: Path) -> None:
+    with RuntimeProcess("hungry", hungry()) as process:
+        model = process.load(str(tmp_path))
+        fed = np.zeros(FREE // 16 // 8, np.int64)
+        fed[0] = FREE + (FREE >> 1)
+        assert model.run({"x": fed}, ["y"])["y"][0] == 1
+
+
+def test_its_folder_is_gone_when_it_is() -> None:
+    code = "from converters.runtimes.child import *; import os; out = claim_stdout(); "
+    code += "serve('a', os.environ['TMPDIR'], None, (), out)"
+    with RuntimeProcess(
+        "a", [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(Path.cwd())!r}); {code}"]
+    ) as process:
+        folder = Path(process.start())
+        assert folder.is_dir()
+    assert not folder.exists()
+
+
+def test_a_program_that_is_not_there_is_said() -> None:
+    with pytest.raises(RuntimeUnavailableError, match="did not start"):
+        RuntimeProcess("nothing", ["/no/such/program"]).launch()
