@@ -38,6 +38,11 @@ class Role(StrEnum):
     ACTION_PROBS = "action_probs"
     VALUE = "value_estimate"
     MEMORY_OUT = "memory_out"
+    #: the spread of a Gaussian policy whose action is the mean, [B, size]; and its logarithm
+    STD = "std"
+    LOG_STD = "log_std"
+    #: the log-probability of the action that was taken, one number a row
+    LOG_PROB = "log_prob"
     OTHER = "other"
 
 
@@ -52,7 +57,10 @@ INPUT_ROLES = (
     Role.SEQUENCE_LENGTH,
     Role.BATCH_SIZE,
 )
-OUTPUT_ROLES = (Role.ACTION, Role.ACTION_PROBS, Role.VALUE, Role.MEMORY_OUT, Role.OTHER)
+OUTPUT_ROLES = (
+    *(Role.ACTION, Role.ACTION_PROBS, Role.VALUE, Role.MEMORY_OUT),
+    *(Role.STD, Role.LOG_STD, Role.LOG_PROB, Role.OTHER),
+)
 
 #: Canonical names that are accepted in place of a role on the command line.
 ALIASES = {
@@ -98,6 +106,9 @@ OUTPUT_NAMES = {
     "deterministic_action": Role.DETERMINISTIC,
     "deterministic_continuous_actions": Role.DETERMINISTIC,
     "deterministic_discrete_actions": Role.DETERMINISTIC,
+    "action_std": Role.STD,
+    "action_log_std": Role.LOG_STD,
+    "action_log_prob": Role.LOG_PROB,
 }
 
 #: What the action is called: alone, or (hybrid policies, torch exports) by its kind.
@@ -131,6 +142,9 @@ CANONICAL = {
     Role.MEMORY_OUT: "recurrent_out",
     Role.ACTION_PROBS: "action_probs",
     Role.VALUE: "value_estimate",
+    Role.STD: "action_std",
+    Role.LOG_STD: "action_log_std",
+    Role.LOG_PROB: "action_log_prob",
 }
 
 

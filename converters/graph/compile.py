@@ -94,7 +94,9 @@ class _Compiler:
     meanings: dict[str, ActionMeaning] = field(default_factory=dict)
 
     def run(self, name: str) -> Policy:
-        roles = classify_inputs(self.graph, self.brain, self.options.inputs, self.facts.roles)
+        roles = classify_inputs(
+            self.graph, self.brain, self.options.inputs, self.facts.roles, declared=bool(self.facts.outputs)
+        )
         canonical = self.brain.canonical
         outputs = [(canonical[base], reference) for base, _, reference in self.brain.outputs if base in canonical]
         upstream = self.graph.pruned([reference for _, reference in outputs])

@@ -17,6 +17,7 @@ from converters.onnx.importer.importer import Importer, joined_errors
 from converters.onnx.importer.node import DTYPES, STANDARD
 from converters.onnx.importer.table import TABLE
 from converters.onnx.memories import OnnxMemory, separate_memories
+from converters.onnx.one_row import check_rows
 from converters.onnx.proto import array_of, load_external, tensors
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
@@ -71,13 +72,11 @@ def read_onnx(given: Fetched) -> OnnxModel:
     memories, axes = _memories(graph, declared)
     batch = _fixed_batch(declared, axes)
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
-    reserved = [v.name for v in (*declared, *graph.output)] + [c for c in CONSTANT_NAMES if c in constants]
-    importer = Importer(TABLE, opsets, reserved, batch)
-    for value in declared:
-        _input(importer, value, batch, axes.get(value.name, 0))
-    for tensor in graph.initializer:
-        importer.initializer(tensor.name, array_of(tensor))
-    importer.run(graph.node)
+    importer = _imported(graph, opsets, declared, batch, axes)
+    if batch is None and _baked(importer, graph.output):
+        batch = 1
+        importer = _imported(graph, opsets, declared, batch, axes)
+        check_rows(importer.graph(), [importer.values[v.name] for v in graph.output if v.name in importer.values])
     outputs, left_out = _outputs(importer, [v.name for v in graph.output])
     return OnnxModel(
         importer.graph(),
@@ -96,6 +95,28 @@ def read_onnx(given: Fetched) -> OnnxModel:
         {n: importer.type_of(n).shape for n in (*(importer.values[v.name] for v in declared), *outputs.values())},
         _joint(importer, memories, outputs),
     )
+
+
+def _imported(
+    graph: Any, opsets: Mapping[str, int], declared: Sequence[Any], batch: int | None, axes: Mapping[str, int]
+) -> Importer:
+    """The nodes of a GraphProto, imported; ``axes`` are the batch axes of memories."""
+    constants = {t.name for t in graph.initializer}
+    reserved = [v.name for v in (*declared, *graph.output)] + [c for c in CONSTANT_NAMES if c in constants]
+    importer = Importer(TABLE, opsets, reserved, batch)
+    for value in declared:
+        _input(importer, value, batch, axes.get(value.name, 0))
+    for tensor in graph.initializer:
+        importer.initializer(tensor.name, array_of(tensor))
+    importer.run(graph.node)
+    return importer
+
+
+def _baked(importer: Importer, outputs: Sequence[Any]) -> bool:
+    """Whether a model that says it takes any number of rows takes one: a Reshape inside kept the 1 of its export."""
+    made = {v.name: importer.type_of(importer.values[v.name]).shape for v in outputs if v.name in importer.values}
+    free = [v.name for v in outputs if (_dims(v) or (0,))[0] is None]
+    return any((made.get(name) or (0,))[0] == 1 for name in free)
 
 
 def parse(given: Fetched) -> tuple[Any, list[Path]]:
@@ -257,6 +278,9 @@ def _fixed_batch(declared: Sequence[Any], axes: Mapping[str, int]) -> int | None
     if any(dims is None or None in dims for dims in shapes):
         return None
     leading = {dims[0] for dims in shapes if dims is not None and len(dims) > 1}
+    if not leading:  # a discrete state: one number a row
+        numbers = (v for v in declared if DTYPES.get(v.type.tensor_type.elem_type, np.dtype("f4")).kind in "iu")
+        leading = {dims[0] for v in numbers if (dims := _dims(v)) is not None and len(dims) == 1}
     return leading.pop() if len(leading) == 1 else None
 
 
@@ -275,7 +299,7 @@ def _input(importer: Importer, value: Any, batch: int | None, axis: int) -> None
     assumed = None
     if value.name.split(":")[0].rpartition("/")[2] == _SEQUENCE_LENGTH and dtype.kind in "iu" and not dims:
         assumed, dims = np.ones((), dtype), ()
-    elif batch is not None and dims is not None and len(dims) > 1 and dims[axis] == batch:
+    elif batch is not None and dims and (len(dims) > 1 or dtype.kind in "iu") and dims[axis] == batch:
         dims = (*dims[:axis], None, *dims[axis + 1 :])
     node = importer.placeholder(value.name, dtype, TensorShape(dims), assumed)
     if axis and dims is not None:

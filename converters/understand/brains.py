@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from converters.graph.nodes import Graph, node_of, normal_ref, split_ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
 from converters.graph.ops.table import is_fed
+from converters.understand.state_names import looks_like_state
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.roles import (
     ACTION_NAMES,
@@ -26,6 +27,9 @@ from signatures.roles import (
     Role,
 )
 
+#: Names that inputs get; an output is called otherwise, since both may be nodes of one graph.
+INPUT_NAMES = ("state", "epsilon", "action_masks", "prev_action", "recurrent_in")
+_NUMBERED = re.compile(r"(state|observation|entities|epsilon)_\d+")
 #: A constant that lists sizes has no more of them.
 _MAX_LISTED = 1024
 
@@ -105,8 +109,8 @@ def find_brains(
     if Role.ACTION in given.values():
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
         scope = _scope_of(graph, [n for n, role in given.items() if role is Role.ACTION])
-        rest = tuple(n for n in declared or () if n in fed - set(given))
-        return (Brain(scope, outputs, _constants(graph, scope), rest),)
+        rest = [n for n in declared or () if n in fed - set(given)]
+        return (Brain(scope, (*outputs, *_others(outputs, rest)), _constants(graph, scope)),)
     if declared:
         fed &= set(declared)
     scopes: dict[str, int] = {}
@@ -172,8 +176,9 @@ def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Rol
         scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
         return (Brain(scope, tuple(outputs), _constants(graph, scope)),)
     # Naming one output is enough to say that the rest is where it always is.
-    brains = find_brains(graph, declared=declared)
     named = {reference for _, _, reference in outputs}
+    rest = {n: role for n, role in (declared or {}).items() if n not in named}
+    brains = find_brains(graph, declared=rest or declared)
     owners = [
         max((b for b in brains if o[2].startswith(b.scope)), key=lambda b: len(b.scope), default=brains[0])
         for o in outputs
@@ -218,6 +223,8 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
         )
     likely = [n for n in sinks if re.search(r"action|policy|^pi$|/pi$", n.name.lower())]
     chosen = sinks if len(sinks) == 1 else likely
+    if declared and not chosen:  # where no name says anything: the one output that is a choice
+        chosen = [n for n in sinks if _is_choice(graph, n)]
     if len(chosen) != 1:
         shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
         raise SignatureError(
@@ -227,5 +234,39 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
         )
     node = chosen[0]
     output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
-    others = tuple((name.rsplit("/", 1)[-1], role, name) for name, role in known.items())
-    return Brain("", (output, *others), _constants(graph, ""), tuple(n.name for n in sinks if n is not node))
+    outputs = (output, *((name.rsplit("/", 1)[-1], role, name) for name, role in known.items()))
+    rest = [n.name for n in sinks if n is not node]
+    if declared:
+        return Brain("", (*outputs, *_others(outputs, rest)), _constants(graph, ""))
+    return Brain("", outputs, _constants(graph, ""), tuple(rest))
+
+
+def _is_choice(graph: Graph, node: Node) -> bool:
+    while node.op in ("Identity", "Cast", "Reshape", "Squeeze", "ExpandDims") and node.inputs:
+        node = graph.producer(node.inputs[0])
+    return node.op in ("ArgMax", "Multinomial")
+
+
+def _others(outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str]) -> list[tuple[str, Role, str]]:
+    """Outputs that the format declares and no name explains: kept as they are, under names that nothing else has.
+
+    Raises SignatureError where one looks like a memory: a policy that forgets is another policy.
+    """
+    taken = {*INPUT_NAMES, *CANONICAL.values(), *OUTPUT_NAMES, *(base for base, _, _ in outputs)}
+    found = []
+    for name in rest:
+        if looks_like_state(name):
+            raise SignatureError(
+                f"the output {name!r} looks like a memory, and it is not clear which input it is fed back to",
+                why="a pair agrees in name and shape (h_in and h_out); without its memory the policy acts otherwise",
+                fix=f"--input NAME=memory_in --output {name}=memory_out, or --output {name}=other if it is none",
+            )
+        wish = name.rsplit("/", 1)[-1]
+        wish = f"output_{wish}" if wish.isdigit() or wish in taken or _NUMBERED.fullmatch(wish) else wish
+        base, number = wish, 0
+        while base in taken:
+            number += 1
+            base = f"{wish}_{number}"
+        taken.add(base)
+        found.append((base, Role.OTHER, name))
+    return found

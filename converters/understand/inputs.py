@@ -12,17 +12,25 @@ import numpy as np
 from converters.graph.nodes import Graph, Node, TensorShape, node_of
 from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.brains import Brain, close_names
+from converters.understand.state_names import looks_like_state
 from signatures.errors import SignatureError, UsageError
 from signatures.roles import INPUT_PATTERNS, INPUT_ROLES, OBSERVATIONS, Role
 
 
 def classify_inputs(
-    graph: Graph, brain: Brain, wanted: Mapping[str, Role] | None = None, known: Mapping[str, Role] | None = None
+    graph: Graph,
+    brain: Brain,
+    wanted: Mapping[str, Role] | None = None,
+    known: Mapping[str, Role] | None = None,
+    *,
+    declared: bool = False,
 ) -> dict[str, Role]:
     """Placeholder name → role, in graph order, for everything upstream of the brain's outputs.
 
-    ``wanted`` comes from ``--input``, ``known`` from the reader. A PlaceholderWithDefault that is neither named there
-    nor by ML-Agents is left out: its default is used. Raises SignatureError when no observation can be told.
+    ``wanted`` comes from ``--input``, ``known`` from the reader; ``declared``: the format says what its inputs are, so
+    that numbers with the batch axis are observations (a graph's placeholders may be parameters of the trainer). A
+    PlaceholderWithDefault that is neither named there nor by ML-Agents is left out: its default is used. Raises
+    SignatureError when no observation can be told.
     """
     upstream = graph.ancestors(brain.roots)
     found = [n for n in graph.nodes if is_fed(n) and n.name in upstream]
@@ -51,7 +59,7 @@ def classify_inputs(
             why=close_names(name, [n.name for n in found]) or f"its inputs are {', '.join(n.name for n in found)}",
             fix="export-model inspect FILE lists them",
         )
-    _by_structure(graph, found, roles, decided)
+    _by_structure(graph, found, roles, decided, declared=declared)
     if not any(r in OBSERVATIONS for r in roles.values()):
         names = ", ".join(f"{n.name} {_shape_text(n)}" for n in found) or "none"
         raise SignatureError(
@@ -91,7 +99,9 @@ def role_by_name(base: str, node: Node) -> Role | None:
     return None
 
 
-def _by_structure(graph: Graph, found: Sequence[Node], roles: dict[str, Role], decided: set[str]) -> None:
+def _by_structure(
+    graph: Graph, found: Sequence[Node], roles: dict[str, Role], decided: set[str], *, declared: bool
+) -> None:
     """Decide placeholders whose names say nothing, from what reads them."""
     consumers = graph.consumers()
     recurrent = Role.MEMORY_IN in roles.values()
@@ -99,7 +109,7 @@ def _by_structure(graph: Graph, found: Sequence[Node], roles: dict[str, Role], d
     for node in unknown:
         dtype = node.attrs.get("dtype")
         integer = isinstance(dtype, np.dtype) and dtype.kind in "iu"
-        if placeholder_rank(node) == 4 and not integer:
+        if placeholder_rank(node) == 4 and (not integer or dtype == np.uint8):
             roles[node.name] = Role.VISUAL
         elif integer and placeholder_rank(node) in (1, 2) and _feeds_one_hot(node, consumers):
             if recurrent and any(r in OBSERVATIONS for r in roles.values()):
@@ -108,6 +118,8 @@ def _by_structure(graph: Graph, found: Sequence[Node], roles: dict[str, Role], d
                 roles[node.name] = Role.VECTOR
         elif placeholder_rank(node) == 2 and not integer and _is_mask(graph, node, consumers):
             roles[node.name] = Role.MASKS
+        elif declared and _has_rows(node) and not integer and not looks_like_state(node.name):
+            roles[node.name] = Role.VECTOR if placeholder_rank(node) == 2 else Role.ENTITIES
     if any(r in OBSERVATIONS for r in roles.values()):
         return
     floats = [
@@ -119,6 +131,16 @@ def _by_structure(graph: Graph, found: Sequence[Node], roles: dict[str, Role], d
     ]
     if len(floats) == 1:
         roles[floats[0].name] = Role.VECTOR
+    numbered = [n for n in unknown if declared and roles[n.name] is Role.PARAMETER and placeholder_rank(n) in (1, 2)]
+    if not floats and len(numbered) == 1:  # a discrete state, given as its number
+        roles[numbered[0].name] = Role.VECTOR
+
+
+def _has_rows(node: Node) -> bool:
+    """Whether a placeholder is [B, n] or [B, T, n]."""
+    shape: TensorShape | None = node.attrs.get("shape")
+    dims = () if shape is None or shape.dims is None else shape.dims
+    return len(dims) in (2, 3) and dims[0] is None and dims[-1] is not None
 
 
 def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Callable[[Node], bool]) -> list[Node]:

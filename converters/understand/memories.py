@@ -1,15 +1,57 @@
-"""The parts of a memory: which columns are cell states, which hidden ones."""
+"""Memories: inputs and outputs that belong together by their names; the parts of one, cell states and hidden ones."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types, run_kernel
+from converters.graph.types import FLOAT32, TensorType, static_shape
+from converters.understand.state_names import looks_like_state, part_of, stem_of
 from signatures.errors import GraphError
+from signatures.memories import SeparateMemory
+
+Shape = tuple[int | None, ...]
+
+
+def paired_memories(graph: Graph, inputs: Iterable[str], outputs: Iterable[str]) -> tuple[SeparateMemory, ...]:
+    """Inputs that are fed what an output gave, in the order of ``inputs``: they agree in name and shape.
+
+    ``h_in`` and ``h_out``, ``hx`` and ``new_hx``, ``h0`` and ``hn``, ``state_in_0`` and ``state_out_0``: names that are
+    the same once the words for the step's two ends are left out, one of them the word of a memory. What is not plain is
+    no pair: the output that is left over then asks.
+    """
+    ends: dict[tuple[str, ...], list[str]] = {}
+    for name in outputs:
+        if looks_like_state(name):
+            ends.setdefault(stem_of(name), []).append(name)
+    pairs = [(name, ends[stem]) for name in inputs if (stem := stem_of(name)) in ends]
+    if not pairs:
+        return ()
+    types = infer_types(graph, partial=True)
+    found = []
+    for name, candidates in pairs:
+        taken = _float_rows(types.get(name))
+        fitting = [(o, given) for o in candidates if (given := _float_rows(types.get(o))) is not None]
+        fitting = [(o, given) for o, given in fitting if taken is not None and _numbers(taken) == _numbers(given)]
+        if taken is not None and len(fitting) == 1:
+            output, given = fitting[0]
+            found.append(SeparateMemory(name, output, taken, given, part_of(stem_of(name))))
+    outputs_taken = [m.output for m in found]
+    return tuple(m for m in found if outputs_taken.count(m.output) == 1)
+
+
+def _float_rows(kind: TensorType | None) -> Shape | None:
+    """The shape of a float32 tensor with one free axis, the batch."""
+    shape = None if kind is None or kind.dtype != FLOAT32 else static_shape(kind.shape)
+    return shape if shape is not None and shape.count(None) == 1 else None
+
+
+def _numbers(shape: Shape) -> list[int]:
+    return [d for d in shape if d is not None]
 
 
 def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ ML-Agents' PyTorch exporter (model_serialization.py, 0.20 to 1.1), tf2onnx insid
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,10 @@ from signatures.roles import OUTPUT_NAMES, Role
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
 _ACTION = re.compile(r"actions?|action_mean|mean_actions?|outputs?|mean|mu|pi|policy")
 _VALUE = re.compile(r"values?|value_estimate|critic")
+#: ... and the spread of a Gaussian action (rl_games, skrl, tianshou, CleanRL), its logarithm, the log-probability.
+_STD = re.compile(r"(action_?)?(std|stddev|std_dev|sigma|scale)s?")
+_LOG_STD = re.compile(r"(action_?)?log_?(std|stddev|std_dev|sigma|scale)s?")
+_LOG_PROB = re.compile(r"(action_?)?log_?probs?")
 _COLOURS = (1, 3, 4)
 _IMAGE = 4
 
@@ -50,7 +55,9 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     elif number:
         facts = _of_torch(model, facts, number)
     else:
-        facts = replace(facts, family="own model", outputs=_roles_by_name(model), notes=_notes_of_others(model))
+        roles = _roles_by_name(model)
+        graph = _with_spreads(model, graph, roles)
+        facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model))
         if _positional(model):
             facts = replace(facts, family="Stable-Baselines3")
     return graph, replace(facts, notes=(*facts.notes, *notes, *_common_notes(model)))
@@ -150,7 +157,7 @@ def _with_rows_first(model: OnnxModel) -> tuple[Graph, list[str]]:
 def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
     """Output node → role, by the names that other trainers use; by position where no name says anything."""
     if _positional(model):
-        return dict(zip(model.outputs.values(), (Role.ACTION, Role.VALUE, None), strict=False))
+        return dict(zip(model.outputs.values(), (Role.ACTION, Role.VALUE, Role.LOG_PROB), strict=False))
     roles: dict[str, Role | None] = {}
     for name, node in model.outputs.items():
         base = node.rpartition("/")[2].lower()
@@ -161,6 +168,19 @@ def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
     actions = [n for n, role in roles.items() if role is Role.ACTION]
     if len(actions) != 1:  # none, or more than one: names and structure decide, or ask
         return dict.fromkeys(roles)
+    width = (model.shapes.get(actions[0]) or ())[1:]
+    for node in (n for n, role in roles.items() if role is None):
+        base, shape = node.rpartition("/")[2].lower(), model.shapes.get(node) or ()
+        if shape[-1:] == width and shape[1:] in ((), width):  # [size], as a parameter of the network has it, too
+            roles[node] = Role.STD if _STD.fullmatch(base) else Role.LOG_STD if _LOG_STD.fullmatch(base) else None
+        if (
+            roles[node] is None
+            and _LOG_PROB.fullmatch(base)
+            and len(shape) in (1, 2)
+            and shape[1:] in ((), (1,))
+            and shape != (1,)
+        ):
+            roles[node] = Role.LOG_PROB
     return roles
 
 
@@ -175,6 +195,28 @@ def _positional(model: OnnxModel) -> bool:
         return False
     ranks = [len(model.shapes.get(n) or ()) for n in model.outputs.values()]
     return _columns(model, names[1]) == 1 and ranks[1] == 2 and ranks[2:] in ([], [1])
+
+
+def _with_spreads(model: OnnxModel, graph: Graph, roles: Mapping[str, Role | None]) -> Graph:
+    """The graph with spreads that depend on no input as rows: a parameter of the network has none of its own.
+
+    A row is the constant added to 0 times the action, which every runtime computes for any number of rows.
+    """
+    action = next((n for n, role in roles.items() if role is Role.ACTION), None)
+    names = NameScope(n.name for n in graph.nodes)
+    for node, role in roles.items():
+        shape = model.shapes.get(node)
+        if role not in (Role.STD, Role.LOG_STD) or action is None or (shape and isinstance(shape[0], str)):
+            continue
+        inner, zero, rows = (names.fresh(f"{node}/{word}") for word in ("constant", "zero", "rows"))
+        graph = renamed(graph, {node: inner})
+        made = (
+            Node(zero, "Const", value=np.zeros((), np.float32)),
+            Node(rows, "Mul", (action, zero)),
+            Node(node, "AddV2", (rows, inner)),
+        )
+        graph = Graph(topological([*graph.nodes, *made]))
+    return graph
 
 
 def _columns(model: OnnxModel, name: str) -> int | str | None:

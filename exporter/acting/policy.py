@@ -58,6 +58,9 @@ class LoadedPolicy:
         plain = {s.dtype == "float32": s for s in signature.outputs[heads:] if s.role is Role.DETERMINISTIC}
         self._plain = {h.name: plain[c] for h in self._heads if (c := _is_continuous(h)) in plain}
         self._scores = next((s for s in signature.outputs if s.role is Role.LOG_PROBS), None)
+        # A mean beside its spread is drawn from here, unless the graph has drawn already.
+        spread = next((s for s in signature.outputs if s.role in (Role.STD, Role.LOG_STD)), None)
+        self._spread = None if signature.noise else spread
 
     def seed(self, seed: int) -> None:
         """Start the draws anew: the same seed gives the same actions for the same inputs, here and in policy.mjs."""
@@ -86,8 +89,9 @@ class LoadedPolicy:
         action, 0 forbids it; all are allowed without it. ``memory`` is that of the last Decision, zero at the start of
         an episode. ``previous`` are the discrete actions of the last step [agents, branches], for a policy that asks
         for them. ``parameters`` are the source's own placeholders. ``deterministic`` takes the likeliest action and the
-        mean. ``seed`` starts the draws anew before this decision. Raises UsageError where something is missing, is of
-        the wrong shape or is not taken, where masks forbid all actions of a branch, and where nothing can be drawn.
+        mean; without it, a policy that gives its mean and σ (``action_std``, ``action_log_std``) is drawn from.
+        ``seed`` starts the draws anew before this decision. Raises UsageError where something is missing, is of the
+        wrong shape or is not taken, where masks forbid all actions of a branch, and where nothing can be drawn.
         """
         if seed is not None:
             self.seed(seed)
@@ -192,6 +196,8 @@ class LoadedPolicy:
             if _is_continuous(head):
                 plain = self._plain.get(head.name) if deterministic else None
                 taken[head.name] = continuous = outputs[(plain or head).name]
+                if self._spread is not None and not deterministic:
+                    taken[head.name] = continuous = self._drawn(continuous, outputs[self._spread.name])
             else:
                 discrete = self._discrete(head, outputs, deterministic)
                 if head.role is Role.SAMPLED:
@@ -199,6 +205,12 @@ class LoadedPolicy:
         memory = self.signature.memory
         kept = None if memory is None or memory.output is None else outputs[memory.output]
         return Decision(continuous, discrete, kept, {**outputs, **taken})
+
+    def _drawn(self, mean: Array, spread: Array) -> Array:
+        """A draw from N(mean, σ²), as the trainer's own distribution makes it: not squashed, not clipped."""
+        assert self._spread is not None
+        std = np.exp(spread) if self._spread.role is Role.LOG_STD else spread
+        return np.asarray(mean + std * self._generator.normals(mean.shape), np.float32)
 
     def _discrete(self, head: TensorSpec, outputs: Mapping[str, Array], deterministic: bool) -> Array:
         if head.role is Role.DETERMINISTIC:

@@ -303,3 +303,22 @@ def test_a_single_step_may_be_without_chance(bundles: Bundles) -> None:
     best = policy.decide(np.zeros(8), deterministic=True)
     np.testing.assert_array_equal(agent.decide(np.zeros(8), deterministic=True).action, best.action)
     assert not np.array_equal(agent.decide(np.zeros(8)).action, best.action)
+
+
+@pytest.mark.parametrize(("role", "value"), [(Role.STD, 0.5), (Role.LOG_STD, np.log(0.5))])
+def test_a_mean_with_its_spread_is_drawn_from(role: Role, value: float) -> None:
+    rows = 4000
+    outputs = [
+        TensorSpec("action", Role.CONTINUOUS, "float32", (None, 1)),
+        TensorSpec(f"action_{role.value}", role, "float32", (None, 1)),
+    ]
+    mean, spread = np.full((rows, 1), 3, np.float32), np.full((rows, 1), value, np.float32)
+    answers = {"action": mean, f"action_{role.value}": spread}
+    made = stub([STATE], outputs, answers, action_space="continuous")
+    drawn = made.policy.decide(np.zeros((rows, 2)))
+    assert drawn.continuous is not None
+    assert abs(drawn.continuous.mean() - 3) < 4 * 0.5 / rows**0.5
+    assert abs(drawn.continuous.std() - 0.5) < 0.03
+    np.testing.assert_array_equal(drawn.outputs["action"], drawn.continuous)
+    best = made.policy.decide(np.zeros((rows, 2)), deterministic=True)
+    np.testing.assert_array_equal(best.continuous, answers["action"])

@@ -63,9 +63,9 @@ def test_gives_the_numbers_of_pytorch(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "role", "outputs"),
     [
-        ("sb3_continuous", "continuous", {"action", "deterministic_action", "value_estimate"}),
-        ("sb3_discrete", "deterministic", {"action", "deterministic_action", "value_estimate"}),
-        ("sb3_stochastic", "continuous", {"action", "deterministic_action", "value_estimate"}),
+        ("sb3_continuous", "continuous", {"action", "deterministic_action", "value_estimate", "action_log_prob"}),
+        ("sb3_discrete", "deterministic", {"action", "deterministic_action", "value_estimate", "action_log_prob"}),
+        ("sb3_stochastic", "continuous", {"action", "deterministic_action", "value_estimate", "action_log_prob"}),
         ("torch_actor", "continuous", {"action", "deterministic_action"}),
         ("torch_actor_legacy", "continuous", {"action", "deterministic_action"}),
     ],

@@ -14,6 +14,8 @@ from converters.graph.options import CompileOptions
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
 from converters.understand.facts import SourceFacts
+from converters.understand.inputs import role_by_name
+from converters.understand.memories import paired_memories
 from signatures.errors import SignatureError
 from signatures.memories import SeparateMemory, SourcePart
 from signatures.roles import CANONICAL, Role
@@ -67,7 +69,7 @@ def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tupl
     given_out = {normal_ref(n): r for n, r in options.outputs.items()}
     told = tuple(
         m
-        for m in facts.memories
+        for m in facts.memories or _paired(graph, facts)
         if m.input not in options.values
         and given_in.get(m.input) in (None, Role.MEMORY_IN)
         and given_out.get(m.output) in (None, Role.MEMORY_OUT)
@@ -81,6 +83,13 @@ def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tupl
     if not facts.outputs or (max(len(inputs), len(outputs)) < 2 and all(_has_rows_first(graph[n]) for n in inputs)):
         return ()
     return _named(graph, inputs, outputs)
+
+
+def _paired(graph: Graph, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
+    """The memories that names and shapes tell, of inputs that nothing else is known of."""
+    named = (n for n in graph.nodes if n.op == "Placeholder" and n.name not in facts.roles)
+    unknown = [n.name for n in named if role_by_name(n.name.rsplit("/", 1)[-1], n) is None]
+    return paired_memories(graph, unknown, [n for n, role in facts.outputs.items() if role is None])
 
 
 def _named(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[SeparateMemory, ...]:

@@ -157,6 +157,7 @@ export class Policy {
   #heads;
   #plain;
   #scores;
+  #spread;
 
   constructor(contract, run, dispose, seed) {
     this.contract = contract;
@@ -169,6 +170,9 @@ export class Policy {
     const companion = (head) => plain.find(({ dtype }) => (dtype === "float32") === isContinuous(head));
     this.#plain = new Map(this.#heads.map((head) => [head.name, companion(head)]).filter(([, spec]) => spec));
     this.#scores = contract.outputs.find(({ role }) => role === "log_probs");
+    // A mean beside its spread is drawn from here, unless the graph has drawn already.
+    const noisy = contract.inputs.some(({ role }) => role === "noise");
+    this.#spread = noisy ? undefined : contract.outputs.find(({ role }) => role === "std" || role === "log_std");
   }
 
   get name() {
@@ -283,6 +287,7 @@ export class Policy {
       if (isContinuous(head)) {
         const plain = deterministic ? this.#plain.get(head.name) : undefined;
         taken[head.name] = outputs[(plain ?? head).name];
+        if (this.#spread && !deterministic) taken[head.name] = this.#drawn(taken[head.name], outputs[this.#spread.name]);
         continuous = rowsOf(taken[head.name]);
       } else {
         discrete = this.#discrete(head, outputs, deterministic);
@@ -292,6 +297,13 @@ export class Policy {
     }
     const kept = this.contract.memory?.output;
     return { continuous, discrete, memory: kept == null ? null : outputs[kept], outputs: { ...outputs, ...taken } };
+  }
+
+  /** A draw from N(mean, σ²), as the trainer's own distribution makes it: not squashed, not clipped. */
+  #drawn({ data, shape }, { data: spread }) {
+    const std = this.#spread.role === "log_std" ? Math.exp : (v) => v;
+    const draw = (mean, i) => mean + std(spread[i]) * Math.fround(this.#generator.normal());
+    return { data: Float32Array.from(data, draw), shape };
   }
 
   #discrete(head, outputs, deterministic) {

@@ -1,0 +1,196 @@
+"""What other trainers' models give beside the action is kept: memories by name, spreads, and the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from converters.graph.run import run_graph
+from converters.policy import Policy
+from converters.understand.state_names import looks_like_state, stem_of
+from exporter import export_model, load_policy
+from exporter.export.sources import read_source
+from signatures.errors import SignatureError
+from signatures.roles import Role
+
+WEIGHTS = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
+
+
+def model(
+    path: Path,
+    inputs: dict[str, list[int | str]],
+    nodes: list[onnx.NodeProto],
+    outputs: list[str],
+    constants: dict[str, np.ndarray] | None = None,
+) -> Path:
+    """An ONNX model of these nodes; ``w`` is a 3 x 3 matrix."""
+    arrays = {"w": WEIGHTS, **(constants or {})}
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in inputs.items()],
+        [helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in outputs],
+        [numpy_helper.from_array(a, n) for n, a in arrays.items()],
+    )
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 15)], ir_version=8)
+    path.write_bytes(made.SerializeToString())
+    return path
+
+
+def only(path: Path) -> Policy:
+    (policy,) = read_source(path).policies()
+    return policy
+
+
+CELL = [
+    helper.make_node("MatMul", ["obs", "w"], ["x"]),
+    helper.make_node("Add", ["x", "IN"], ["sum"]),
+    helper.make_node("Tanh", ["sum"], ["OUT"]),
+    helper.make_node("MatMul", ["OUT", "w"], ["action"]),
+]
+
+
+def cell(path: Path, given: str, taken: str, width: int = 3) -> Path:
+    names = {"IN": taken, "OUT": given}
+    nodes = []
+    for node in CELL:
+        copy = onnx.NodeProto()
+        copy.CopyFrom(node)
+        for field in (copy.input, copy.output):
+            field[:] = [names.get(n, n) for n in field]
+        nodes.append(copy)
+    return model(path, {"obs": ["batch", 3], taken: ["batch", width]}, nodes, ["action", given])
+
+
+@pytest.mark.parametrize(
+    ("taken", "given"),
+    [
+        *(("h_in", "h_out"), ("hx", "new_hx"), ("h0", "hn"), ("state_in_0", "state_out_0"), ("hidden", "next_hidden")),
+        *(("rnn_state_in", "rnn_state_out"), ("hiddenIn", "hiddenOut"), ("memory", "memory_out")),
+    ],
+)
+def test_a_cell_without_a_recurrent_op_keeps_its_memory(taken: str, given: str, tmp_path: Path) -> None:
+    policy = only(cell(tmp_path / "cell.onnx", given, taken))
+    memory = policy.signature.memory
+    assert memory is not None
+    assert (memory.input, memory.output, memory.size) == ("recurrent_in", "recurrent_out", 3)
+    assert [s.role for s in policy.signature.inputs] == [Role.VECTOR, Role.MEMORY_IN]
+    obs, state = np.ones((2, 3), np.float32), np.full((2, 3), 0.25, np.float32)
+    out = run_graph(policy.graph, {"state": obs, "recurrent_in": state}, ["recurrent_out"])["recurrent_out"]
+    np.testing.assert_allclose(out, np.tanh(obs @ WEIGHTS + state), rtol=1e-5)
+
+
+def test_a_state_without_its_input_is_an_error(tmp_path: Path) -> None:
+    path = model(
+        tmp_path / "lost.onnx",
+        {"obs": ["batch", 3]},
+        [helper.make_node("MatMul", ["obs", "w"], ["action"]), helper.make_node("Tanh", ["action"], ["h_out"])],
+        ["action", "h_out"],
+    )
+    with pytest.raises(SignatureError, match="'h_out' looks like a memory"):
+        only(path)
+    (result,) = export_model(path, tmp_path / "out", outputs={"h_out": "other"}, verify="none")
+    assert [s.name for s in result.policy.signature.outputs if s.role is Role.OTHER] == ["h_out"]
+
+
+@pytest.mark.parametrize("name", ["sigma", "std", "action_std"])
+@pytest.mark.parametrize("shape", [(3,), (1, 3)])
+def test_a_spread_that_is_a_parameter_of_the_network_is_kept_for_every_row(
+    name: str, shape: tuple[int, ...], tmp_path: Path
+) -> None:
+    spread = np.array([0.1, 0.2, 0.3], np.float32).reshape(shape)
+    path = model(
+        tmp_path / "gauss.onnx",
+        {"obs": ["batch", 3]},
+        [helper.make_node("MatMul", ["obs", "w"], ["mean"]), helper.make_node("Identity", ["sigma0"], [name])],
+        ["mean", name],
+        {"sigma0": spread},
+    )
+    policy = only(path)
+    assert policy.signature.output("action_std").role is Role.STD
+    out = run_graph(policy.graph, {"state": np.zeros((4, 3), np.float32)}, ["action_std"])["action_std"]
+    np.testing.assert_array_equal(out, np.repeat(spread.reshape(1, 3), 4, axis=0))
+    (result,) = export_model(path, tmp_path / "out", verify="none")
+    acting = load_policy(result.folder, runtime="numpy", seed=1)
+    first, second = (acting.decide(np.zeros((1, 3))).action for _ in range(2))
+    assert not np.array_equal(first, second)
+
+
+def test_outputs_that_no_name_explains_are_kept_under_names_of_their_own(tmp_path: Path) -> None:
+    names = ["logits_0", "state_1", "7"]
+    path = model(
+        tmp_path / "more.onnx",
+        {"obs": ["batch", 3]},
+        [
+            helper.make_node("MatMul", ["obs", "w"], ["action"]),
+            *(helper.make_node(op, ["action"], [n]) for op, n in zip(("Tanh", "Sigmoid", "Neg"), names, strict=True)),
+        ],
+        ["action", *names[:1], *names[2:]],
+    )
+    policy = only(path)
+    others = {s.name: s.source for s in policy.signature.outputs if s.role is Role.OTHER}
+    assert others == {"logits_0": "logits_0", "output_7": "7"}
+    assert not [n for n in policy.signature.notes if "not exported" in n]
+
+
+def test_two_vectors_are_two_observations(tmp_path: Path) -> None:
+    path = model(
+        tmp_path / "goal.onnx",
+        {"vec": ["batch", 3], "goal": ["batch", 3]},
+        [helper.make_node("Add", ["vec", "goal"], ["sum"]), helper.make_node("MatMul", ["sum", "w"], ["action"])],
+        ["action"],
+    )
+    assert [(s.name, s.source) for s in only(path).signature.inputs] == [("state", "vec"), ("state_1", "goal")]
+
+
+def test_a_batch_that_was_baked_in_is_freed_only_where_the_numbers_stay_right(tmp_path: Path) -> None:
+    """A Reshape to [1, 3] in a model that says its batch is free: torch wrote the 1 of its example."""
+    target = numpy_helper.from_array(np.array([1, 3]), "target")
+    right = [
+        helper.make_node("MatMul", ["obs", "w"], ["x"]),
+        helper.make_node("Reshape", ["x", "target"], ["action"]),
+    ]
+    constants = {"target": numpy_helper.to_array(target)}
+    path = model(tmp_path / "right.onnx", {"obs": ["batch", 3]}, right, ["action"], constants)
+    free(path, "action", 2)
+    policy = only(path)
+    assert policy.source.rows == 1
+    wrong = [
+        right[0],
+        helper.make_node("Reshape", ["x", "target"], ["r"]),
+        helper.make_node("Gather", ["r", "zero"], ["g"], axis=0),
+        helper.make_node("Add", ["r", "g"], ["action"]),
+    ]
+    path = model(
+        tmp_path / "wrong.onnx",
+        {"obs": ["batch", 3]},
+        wrong,
+        ["action"],
+        {"target": numpy_helper.to_array(target), "zero": np.array([0])},
+    )
+    free(path, "action", 2)
+    with pytest.raises(SignatureError, match="for one row only"):
+        only(path)
+
+
+def free(path: Path, output: str, rank: int) -> None:
+    """Declare an output with a free batch."""
+    made = onnx.load(path)
+    shape = ["batch", *([3] * (rank - 1))]
+    value = helper.make_tensor_value_info(output, TensorProto.FLOAT, shape)
+    made.graph.output[0].CopyFrom(value)
+    path.write_bytes(made.SerializeToString())
+
+
+@pytest.mark.parametrize("name", ["action", "value", "logits", "next_obs", "observation"])
+def test_other_names_are_no_states(name: str) -> None:
+    assert not looks_like_state(name)
+
+
+def test_a_stem_is_what_both_ends_share() -> None:
+    assert stem_of("lstm_h_in") == stem_of("lstm_h_out") == ("lstm", "h")
+    assert stem_of("scope/c0") == stem_of("cn") == ("c",)
