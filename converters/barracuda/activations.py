@@ -9,7 +9,7 @@ from converters.barracuda.layer_builder import LayerBuilder, Value
 from converters.barracuda.vocabulary import Activation, activation_label
 from converters.graph.builder import Builder
 from converters.graph.nn import activations as nn
-from converters.graph.nn import trigonometry
+from converters.graph.nn import reduction, trigonometry
 
 #: Activations that are one op.
 _OPS = MappingProxyType(
@@ -59,7 +59,13 @@ _PARAMETRIC: MappingProxyType[int, Callable[[Builder, str, float, float], str]] 
         Activation.POW: lambda b, x, alpha, beta: b.add("Pow", [x, b.number(x, alpha)]),
     }
 )
-_ROWS = (Activation.SOFTMAX, Activation.LOG_SOFTMAX, Activation.HARDMAX)
+_ROWS: MappingProxyType[int, Callable[[Builder, str], str]] = MappingProxyType(
+    {
+        Activation.SOFTMAX: lambda b, x: reduction.over_last_axis(b, "Softmax", x),
+        Activation.LOG_SOFTMAX: lambda b, x: reduction.over_last_axis(b, "LogSoftmax", x),
+        Activation.HARDMAX: reduction.hardmax,
+    }
+)
 
 
 def activate(b: LayerBuilder, number: int, x: Value, version: int, *, axis: int = -1, fused: bool = False) -> Value:
@@ -106,15 +112,7 @@ def _over_rows(b: LayerBuilder, kind: Activation, x: Value, version: int, axis: 
                 f"{activation_label(kind)} of a tensor of shape {list(x.shape)}, axis {axis}",
                 "Barracuda 1.x took the whole row, later versions an axis; only an axis of channels is known for sure",
             )
-        rows = b.add("Reshape", [x.reference, b.ints([-1, x.c], "rows")], name="rows")
-        return b.shaped(_row_op(b, kind, rows, x.c), x.shape)
+        return Value(_ROWS[kind](b, x.reference), x.shape)
     if version > 16 and not along_channels:
         raise b.unsupported(f"{activation_label(kind)} along axis {axis}", "that axis is not the channels'")
-    return b.rows(_row_op(b, kind, b.as_matrix(x), x.size), x.shape[0], x.size)
-
-
-def _row_op(b: LayerBuilder, kind: Activation, rows: str, width: int) -> str:
-    if kind is not Activation.HARDMAX:
-        return b.add("Softmax" if kind is Activation.SOFTMAX else "LogSoftmax", [rows])
-    best = b.add("ArgMax", [rows, b.ints(1, "axis")])
-    return b.add("OneHot", [best, b.ints(width, "depth"), b.floats(1, "on"), b.floats(0, "off")], axis=-1)
+    return b.rows(_ROWS[kind](b, b.as_matrix(x)), x.shape[0], x.size)

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from converters.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
 from converters.barracuda.shaping import axis_of
 from converters.barracuda.vocabulary import C, LayerType, N
+from converters.graph.nn import reduction
 from converters.graph.types import FLOAT32
 
 _FOLDED = MappingProxyType(
@@ -31,13 +32,18 @@ _COMPARED = MappingProxyType(
         LayerType.EQUAL: "Equal",
     }
 )
-_REDUCED = MappingProxyType(
+_REDUCED: MappingProxyType[int, reduction.Reduction] = MappingProxyType(
     {
-        LayerType.REDUCE_MAX: "Max",
-        LayerType.REDUCE_MEAN: "Mean",
-        LayerType.REDUCE_MIN: "Min",
-        LayerType.REDUCE_PROD: "Prod",
-        LayerType.REDUCE_SUM: "Sum",
+        LayerType.REDUCE_MAX: reduction.of_kind("Max"),
+        LayerType.REDUCE_MEAN: reduction.of_kind("Mean"),
+        LayerType.REDUCE_MIN: reduction.of_kind("Min"),
+        LayerType.REDUCE_PROD: reduction.of_kind("Prod"),
+        LayerType.REDUCE_SUM: reduction.of_kind("Sum"),
+        LayerType.REDUCE_L1: reduction.l1,
+        LayerType.REDUCE_L2: reduction.l2,
+        LayerType.REDUCE_SUM_SQUARE: reduction.sum_square,
+        LayerType.REDUCE_LOG_SUM: reduction.log_sum,
+        LayerType.REDUCE_LOG_SUM_EXP: reduction.log_sum_exp,
     }
 )
 
@@ -67,8 +73,7 @@ def logical(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if kind is LayerType.LOGICAL_NOT:
         result = b.add("LogicalNot", truths)
     elif kind is LayerType.LOGICAL_XOR:
-        neither = b.add("LogicalNot", [b.add("LogicalAnd", truths)])
-        result = b.add("LogicalAnd", [b.add("LogicalOr", truths), neither])
+        result = b.add("NotEqual", truths)
     else:
         result = b.add("LogicalAnd" if kind is LayerType.LOGICAL_AND else "LogicalOr", truths)
     return _as_float(b, result, shape)
@@ -103,24 +108,8 @@ def reduced(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
     data, along = (b.as_matrix(x), 1) if small and axis == C else (b.as_image(x), axis)
     shape = with_length(x.shape, axis, 1)
     kind = LayerType(b.layer.type)
-    operand = b.ints(along, "axis")
     if kind in (LayerType.ARG_MAX, LayerType.ARG_MIN):
-        best = b.add("ArgMax" if kind is LayerType.ARG_MAX else "ArgMin", [data, operand])
+        best = b.add("ArgMax" if kind is LayerType.ARG_MAX else "ArgMin", [data, b.ints(along, "axis")])
         return b.shaped(b.add("Cast", [best], DstT=FLOAT32), shape, best if small else None)
-    result = _reduction(b, kind, data, b.ints([along], "axes"))
+    result = _REDUCED[kind](b, data, [along], True)
     return b.rows(result, shape[0], shape[3]) if small and axis == C else b.shaped(result, shape)
-
-
-def _reduction(b: LayerBuilder, kind: LayerType, data: str, axes: str) -> str:
-    if kind in _REDUCED:
-        return b.add(_REDUCED[kind], [data, axes], keep_dims=True)
-    if kind is LayerType.REDUCE_LOG_SUM_EXP:
-        top = b.add("Max", [data, axes], keep_dims=True)
-        total = b.add("Sum", [b.add("Exp", [b.add("Sub", [data, top])]), axes], keep_dims=True)
-        return b.add("Add", [b.add("Log", [total]), top])
-    if kind is LayerType.REDUCE_L1:
-        return b.add("Sum", [b.add("Abs", [data]), axes], keep_dims=True)
-    if kind is LayerType.REDUCE_LOG_SUM:
-        return b.add("Log", [b.add("Sum", [data, axes], keep_dims=True)])
-    squares = b.add("Sum", [b.add("Square", [data]), axes], keep_dims=True)
-    return squares if kind is LayerType.REDUCE_SUM_SQUARE else b.add("Sqrt", [squares])

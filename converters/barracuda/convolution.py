@@ -7,14 +7,16 @@ TensorFlow's SAME, −2 for the same with the odd element of padding in front.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from converters.barracuda.dense import biased
 from converters.barracuda.layer_builder import LayerBuilder, Value
 from converters.barracuda.vocabulary import LayerType
-from converters.graph.ops.convolution import window_padding
+from converters.graph.nn import convolution as nn
+from converters.graph.nn import normalisation, pooling
+from converters.graph.nn.shaping import padded, taken
 
 _SAME, _SAME_LOWER = -1, -2
 #: What Unity's maximum starts from; a border of it never wins.
@@ -23,22 +25,7 @@ _LOWEST = float(np.finfo(np.float32).min)
 _TINY = float(np.finfo(np.float32).tiny)
 
 
-@dataclass(frozen=True, slots=True)
-class _Window:
-    """A window over (height, width): its size, its steps, what is padded before and after."""
-
-    size: tuple[int, int]
-    stride: tuple[int, int]
-    before: tuple[int, int]
-    after: tuple[int, int]
-    same: bool
-
-    def length(self, axis: int, length: int) -> int:
-        """The result's length on an axis (0 height, 1 width) of an image of ``length``."""
-        return (length + self.before[axis] + self.after[axis] - self.size[axis]) // self.stride[axis] + 1
-
-
-def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[int]) -> _Window:
+def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[int]) -> nn.Window:
     """The window of the current layer over an image; ``size`` is (height, width). Raises GraphError."""
     if len(stride) != 2 or min(stride) < 1 or min(size) < 1:
         raise b.damaged(f"a window of {list(size)} with strides {list(stride)}", "both have two numbers above 0")
@@ -47,40 +34,20 @@ def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[i
             f"layer {b.layer.name} has the strides {list(stride)}: read as [width, height], as Unity does; "
             "ML-Agents' converter wrote [height, width]"
         )
-    steps = (stride[1], stride[0])
+    window = nn.Window((int(size[0]), int(size[1])), (stride[1], stride[0]))
     pad = tuple(b.layer.pad) or (0, 0, 0, 0)
-    same = pad[0] == _SAME
     if pad[0] in (_SAME, _SAME_LOWER):
-        pads = [window_padding(x.shape[1:3][i], size[i], steps[i], "SAME")[1:] for i in (0, 1)]
-        if not same:
-            pads = [(after, before) for before, after in pads]
+        top, left = window.same_pads(x.shape[1:3])
+        same = pad[0] == _SAME
+        window = replace(window, pads=(top, left) if same else (top[::-1], left[::-1]), same=same)
     elif len(pad) == 4 and min(pad) >= 0:
-        pads = [(pad[1], pad[3]), (pad[0], pad[2])]
+        window = replace(window, pads=((pad[1], pad[3]), (pad[0], pad[2])))
     else:
         raise b.unsupported(f"the pads are {list(pad)}", "four lengths from 0 on, −1 (SAME) and −2 are known")
-    window = _Window(size, steps, (pads[0][0], pads[1][0]), (pads[0][1], pads[1][1]), same)
-    b.sized(*(length + sum(p) for length, p in zip(x.shape[1:3], pads, strict=True)), x.c)
-    if min(window.length(0, x.h), window.length(1, x.w)) < 1:
+    b.sized(*(length + sum(pair) for length, pair in zip(x.shape[1:3], window.pads, strict=True)), x.c)
+    if min(window.lengths(x.shape[1:3])) < 1:
         raise b.damaged(f"a window of {list(size)} over {list(x.shape)}", "the window is larger than the image")
     return window
-
-
-def _slide(b: LayerBuilder, op: str, x: Value, window: _Window, kernel: str | None, fill: float) -> str:
-    """A window op: SAME where it is, else VALID over an image that is padded with ``fill`` first."""
-    data, padding = b.as_image(x), "SAME" if window.same else "VALID"
-    if not window.same and any(window.before + window.after):
-        pads = [[0, 0], *([lo, hi] for lo, hi in zip(window.before, window.after, strict=True)), [0, 0]]
-        data = padded(b, data, pads, fill)
-    strides = (1, *window.stride, 1)
-    if kernel is None:
-        return b.add(op, [data], ksize=(1, *window.size, 1), strides=strides, padding=padding)
-    return b.add(op, [data, kernel], strides=strides, padding=padding)
-
-
-def padded(b: LayerBuilder, x: str, pads: Sequence[Sequence[int]], fill: float) -> str:
-    """``x`` with ``pads`` (a pair per axis) of ``fill`` around it."""
-    operand = b.ints(pads, "pads")
-    return b.add("Pad", [x, operand]) if fill == 0 else b.add("PadV2", [x, operand, b.floats(fill, "fill")])
 
 
 # ------------------------------------------------------------------ convolutions
@@ -93,12 +60,12 @@ def conv2d(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if array.shape[2] != x.c or bias.size != array.shape[3]:
         raise _channels(b, x, kernel, bias)
     window = _window(b, x, array.shape[:2], b.layer.stride)
-    product = _slide(b, "Conv2D", x, window, b.as_image(kernel), 0)
+    product = nn.conv2d(b, b.as_image(x), b.as_image(kernel), window)
     return _image_of(b, x, window, biased(b, product, bias), array.shape[3])
 
 
 def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
-    """A kernel [height, width, 1, C] that keeps the channels apart; TensorFlow's is [height, width, C, 1]."""
+    """A kernel [height, width, 1, C] that keeps the channels apart."""
     x, kernel, bias = args
     array = _kernel(b, kernel)
     if array.shape[2] != 1:
@@ -106,13 +73,12 @@ def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if array.shape[3] != x.c or bias.size != array.shape[3]:
         raise _channels(b, x, kernel, bias)
     window = _window(b, x, array.shape[:2], b.layer.stride)
-    turned = b.floats(array.transpose(0, 1, 3, 2), "kernel")
-    product = _slide(b, "DepthwiseConv2dNative", x, window, turned, 0)
+    product = nn.conv2d(b, b.as_image(x), array, window, x.c)
     return _image_of(b, x, window, biased(b, product, bias), array.shape[3])
 
 
 def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
-    """A transposed convolution: zeros between the pixels, a border, and a plain convolution with K turned round.
+    """A transposed convolution by K [height, width, in, out].
 
     ``pool`` is the output adjustment [width, height]; where it is empty, Unity takes (in + pads − kernel) mod stride.
     """
@@ -125,61 +91,24 @@ def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
         )
     if bias.size != array.shape[3]:
         raise _channels(b, x, kernel, bias)
-    size = (int(array.shape[0]), int(array.shape[1]))
-    stride, pad, adjust = b.layer.stride, tuple(b.layer.pad), tuple(b.layer.pool)
+    stride, adjust = b.layer.stride, tuple(b.layer.pool)
     if len(stride) != 2 or min(stride) < 1 or stride[0] != stride[1]:
         raise b.unsupported(f"the strides {list(stride)}", "Unity takes the width's stride for both axes")
-    if pad[:1] in ((_SAME,), (_SAME_LOWER,)):
-        window = _window(b, x, size, stride)
-        pad = (window.before[1], window.before[0], window.after[1], window.after[0])
-    if len(pad) != 4 or min(pad) < 0 or pad[:2] != pad[2:]:
-        raise b.unsupported(f"the pads {list(pad)}", "Unity runs pads that are equal on both sides alone")
-    step = stride[0]
-    lengths, borders = [], []
+    window = replace(_window(b, x, array.shape[:2], stride), same=False)
+    if any(before != after for before, after in window.pads):
+        raise b.unsupported(f"the pads {list(b.layer.pad)}", "Unity runs pads that are equal on both sides alone")
+    step, extra, lengths = stride[0], [], []
     for axis, length in enumerate(x.shape[1:3]):
-        low, extent = pad[1 - axis], size[axis]
-        given = adjust[1 - axis] if len(adjust) == 2 else (length + 2 * low - extent) % step
-        result = (length - 1) * step - 2 * low + extent + given
-        before = extent - 1 - low
-        # Of the image with zeros between its pixels, ``before`` is added (or cut off) in front, the rest behind.
-        borders.append((before, result + extent - 1 - before - ((length - 1) * step + 1)))
-        lengths.append(result)
+        around = sum(window.pads[axis]) - window.size[axis]
+        extra.append(adjust[1 - axis] if len(adjust) == 2 else (length + around) % step)
+        lengths.append((length - 1) * step - around + extra[axis])
     if min(lengths) < 1:
         raise b.damaged(f"a result of {lengths}", "pads and adjustment leave nothing of the image")
-    b.sized(
-        *(max(step * length, r) + sum(map(abs, f)) for length, r, f in zip(x.shape[1:3], lengths, borders, strict=True))
-    )
-    spread = _spread(b, x, step)
-    framed = _framed(b, spread, [1 + (length - 1) * step for length in x.shape[1:3]], borders)
-    turned = b.floats(array[::-1, ::-1], "kernel")
-    product = b.add("Conv2D", [framed, turned], strides=(1, 1, 1, 1), padding="VALID")
+    b.sized(*(step * length + 2 * size for length, size in zip(x.shape[1:3], window.size, strict=True)), x.c)
+    b.sized(*lengths, array.shape[3])
+    product = biased(b, nn.conv2d_transposed(b, b.as_image(x), array, window, (extra[0], extra[1])), bias)
     shape = (x.n, lengths[0], lengths[1], int(array.shape[3]))
-    return b.shaped(biased(b, product, bias), shape) if shape[1:3] == (1, 1) else Value(biased(b, product, bias), shape)
-
-
-def _spread(b: LayerBuilder, x: Value, step: int) -> str:
-    """The image with ``step`` − 1 zeros after every pixel of both axes, as [N, H·step, W·step, C]."""
-    data = b.as_image(x)
-    if step == 1:
-        return data
-    n, h, w, c = x.shape
-    rows = -1 if n is None else n
-    gaps = [[0, 0], [0, 0], [0, step - 1], [0, 0]]
-    data = b.add("Reshape", [data, b.ints([rows, h, 1, w * c], "lines")], name="lines")
-    data = padded(b, data, gaps, 0)
-    data = b.add("Reshape", [data, b.ints([rows, h * step * w, 1, c], "pixels")], name="pixels")
-    data = padded(b, data, gaps, 0)
-    return b.add("Reshape", [data, b.ints([rows, h * step, w * step, c], "spread")], name="spread")
-
-
-def _framed(b: LayerBuilder, x: str, lengths: Sequence[int], borders: Sequence[tuple[int, int]]) -> str:
-    """An image cut to ``lengths``, and then given borders of zeros; a negative border cuts more off."""
-    begin = [0, *(max(-low, 0) for low, _ in borders), 0]
-    end = [0, *(length - max(-high, 0) for length, (_, high) in zip(lengths, borders, strict=True)), 0]
-    operands = [b.ints(begin, "begin"), b.ints(end, "end"), b.ints([1, 1, 1, 1], "steps")]
-    cut = b.add("StridedSlice", [x, *operands], begin_mask=0b1001, end_mask=0b1001)
-    pads = [[0, 0], *([max(low, 0), max(high, 0)] for low, high in borders), [0, 0]]
-    return padded(b, cut, pads, 0) if any(map(any, pads)) else cut
+    return b.shaped(product, shape) if shape[1:3] == (1, 1) else Value(product, shape)
 
 
 def _kernel(b: LayerBuilder, kernel: Value) -> np.ndarray:
@@ -195,8 +124,8 @@ def _channels(b: LayerBuilder, x: Value, kernel: Value, bias: Value) -> Exceptio
     )
 
 
-def _image_of(b: LayerBuilder, x: Value, window: _Window, reference: str, channels: int) -> Value:
-    shape = (x.n, window.length(0, x.h), window.length(1, x.w), channels)
+def _image_of(b: LayerBuilder, x: Value, window: nn.Window, reference: str, channels: int) -> Value:
+    shape = (x.n, *window.lengths(x.shape[1:3]), channels)
     return b.shaped(reference, shape) if shape[1:3] == (1, 1) else Value(reference, shape)
 
 
@@ -208,23 +137,11 @@ def pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
     (x,) = args
     if len(b.layer.pool) != 2:
         raise b.damaged(f"the window is {list(b.layer.pool)}", "it must be [width, height]")
-    size = (b.layer.pool[1], b.layer.pool[0])
-    window = _window(b, x, size, b.layer.stride)
+    window = _window(b, x, (b.layer.pool[1], b.layer.pool[0]), b.layer.stride)
+    image = b.as_image(x)
     if b.layer.type == LayerType.MAX_POOL2D:
-        return _image_of(b, x, window, _slide(b, "MaxPool", x, window, None, _LOWEST), x.c)
-    mean = _slide(b, "AvgPool", x, window, None, 0)
-    counts = [_counts(window, i, length) for i, length in enumerate(x.shape[1:3])]
-    if not window.same and any((c != size[i]).any() for i, c in enumerate(counts)):
-        factor = size[0] * size[1] / np.outer(*counts)
-        mean = b.add("Mul", [mean, b.floats(factor[None, :, :, None], "share")])
-    return _image_of(b, x, window, mean, x.c)
-
-
-def _counts(window: _Window, axis: int, length: int) -> np.ndarray:
-    """How many elements of the image each window holds along an axis."""
-    start = np.arange(window.length(axis, length)) * window.stride[axis] - window.before[axis]
-    stop = np.minimum(start + window.size[axis], length)
-    return np.asarray(np.maximum(stop - np.maximum(start, 0), 1))
+        return _image_of(b, x, window, pooling.max_pool(b, image, window, _LOWEST), x.c)
+    return _image_of(b, x, window, pooling.average_pool(b, image, window), x.c)
 
 
 def global_pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -254,21 +171,14 @@ def border(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if min(h, w, c) < 1:
         raise b.damaged(f"a border of {list(pad)} around {list(x.shape)}", "nothing is left of the image")
     b.sized(h, w, c)
+    if b.layer.type == LayerType.BORDER2D:
+        return b.shaped(padded(b, b.as_image(x), pairs, b.layer.beta), (n, h, w, c))
     data = b.as_image(x)
     for axis, (low, high) in enumerate(pairs):
         if (low, high) == (0, 0):
             continue
-        length = lengths[axis - 1]
-        index = np.arange(-low, length + high)
-        if b.layer.type == LayerType.BORDER2D:
-            cut = [i for i in index.tolist() if 0 <= i < length]
-            if len(cut) != length:
-                data = taken(b, data, cut, axis)
-            ends = [[0, 0], [0, 0], [0, 0], [0, 0]]
-            ends[axis] = [max(low, 0), max(high, 0)]
-            data = padded(b, data, ends, b.layer.beta) if any(ends[axis]) else data
-        else:
-            data = taken(b, data, _mirrored(b.layer.type, index, length).tolist(), axis)
+        index = np.arange(-low, lengths[axis - 1] + high)
+        data = taken(b, data, _mirrored(b.layer.type, index, lengths[axis - 1]).tolist(), axis)
     return b.shaped(data, (n, h, w, c))
 
 
@@ -280,11 +190,6 @@ def _mirrored(kind: int, index: np.ndarray, length: int) -> np.ndarray:
     elif kind == LayerType.PAD2D_SYMMETRIC:
         index = np.where(index < 0, -index - 1, np.where(index > last, 2 * last - index + 1, index))
     return np.asarray(np.clip(index, 0, last))
-
-
-def taken(b: LayerBuilder, x: str, index: Sequence[int], axis: int) -> str:
-    """Elements ``index`` of an axis."""
-    return b.add("GatherV2", [x, b.ints(list(index), "index"), b.ints(axis, "axis")])
 
 
 def upsample(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -317,10 +222,6 @@ def normalization(b: LayerBuilder, args: Sequence[Value]) -> Value:
         raise b.unsupported(f"the axis is {b.layer.axis}", "only the channels' axis is known")
     if scale.size != x.c or bias.size != x.c:
         raise b.damaged(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
-    data, axes = b.as_image(x), b.ints([1, 2], "axes")
-    mean = b.add("Mean", [data, axes], keep_dims=True)
-    centred = b.add("Sub", [data, mean])
-    variance = b.add("Mean", [b.add("Square", [centred]), axes], keep_dims=True)
-    deviation = b.add("Sqrt", [b.add("Add", [variance, b.floats(b.layer.beta or _TINY, "epsilon")])])
-    scaled = b.add("Mul", [b.add("RealDiv", [centred, deviation]), b.as_image(scale)])
-    return b.shaped(b.add("Add", [scaled, b.as_image(bias)]), x.shape)
+    epsilon = b.layer.beta or _TINY
+    made = normalisation.instance(b, b.as_image(x), b.as_vector(scale), b.as_vector(bias), epsilon, channels=3)
+    return b.shaped(made, x.shape)

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.barracuda.convolution import taken
 from converters.barracuda.format import EIGHT_AXES
 from converters.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
 from converters.barracuda.vocabulary import EIGHT, C, H, N, W
+from converters.graph.nn.shaping import taken
 from converters.graph.types import INT32
 
 _NAMES = "NHWC"

@@ -10,6 +10,7 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nn.activations import clip
+from converters.graph.nn.recurrent import lstm
 from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32
 from converters.torch_checkpoint.state import State
@@ -78,19 +79,9 @@ class Network(Builder):
         self.at(module)
         flat = self.reshape(memory, (-1, 2 * hidden))
         h, c = self.slice(flat, 1, 0, hidden), self.slice(flat, 1, hidden, 2 * hidden)
-        total = self.add(
-            "Add",
-            [
-                self.add("MatMul", [x, self.const(kernel.T.copy(), "kernel")]),
-                self.add("MatMul", [h, self.const(inner.T.copy(), "recurrent_kernel")]),
-            ],
-        )
-        total = self.add("BiasAdd", [total, self.const(np.asarray(bias, FLOAT32), "bias")])
-        split = self.add("Split", [self.ints(1, "axis"), total], num_split=4)
-        i, f, g, o = split, f"{split}:1", f"{split}:2", f"{split}:3"
-        new = self.add("Mul", [self.add("Sigmoid", [i]), self.add("Tanh", [g])])
-        cell = self.add("Add", [self.add("Mul", [self.add("Sigmoid", [f]), c]), new])
-        result = self.add("Mul", [self.add("Sigmoid", [o]), self.add("Tanh", [cell])])
+        product = self.add("MatMul", [x, self.const(kernel.T.copy(), "kernel")])
+        recurrent = self.const(inner.T.copy(), "recurrent_kernel")
+        result, cell = lstm(self, product, h, c, recurrent, np.asarray(bias, FLOAT32), "ifgo")
         return result, self.reshape(self.concat([result, cell], 1), (-1, 1, 2 * hidden))
 
     # ------------------------------------------------------------------ images, NHWC inside

@@ -232,6 +232,10 @@ def _arithmetic() -> Iterator[Case]:
             return m.layer("y", kind, X1, m.load("y/reduction_indices", 1.0))
 
         yield _case(f"reduce-{kind}-row", row_of, positive)
+        if kind == 123:
+            low = VECTOR.copy()
+            low[0] = -np.inf
+            yield _case("reduce-123-minus-infinity", row_of, low)
         yield _case(f"reduce-{kind}-eight", lambda m, kind=kind: m.layer("y", kind, X4, axis=6), np.abs(IMAGE), 18)
 
 

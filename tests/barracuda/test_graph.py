@@ -343,3 +343,15 @@ def test_a_model_without_an_action_names_its_candidates(tmp_path: Path) -> None:
         policy_of(model)
     policy = policy_of(model, outputs={"right": Role.ACTION})
     assert policy.signature.output("action").source == "right"
+
+
+def test_a_depthwise_convolution_of_uneven_strides_has_no_op_that_tensorflow_refuses() -> None:
+    """TensorFlow's CPU kernel of DepthwiseConv2dNative takes equal strides alone; the ONNX reader knew."""
+    for stride, op in (((2, 2), "DepthwiseConv2dNative"), ((2, 1), "Conv2D")):
+        m = Maker()
+        m.input("visual_observation_0", 6, 6, 3)
+        data = {"k": draw(2, 2, 1, 3), "b": draw(1, 1, 1, 3)}
+        m.layer("seen", 21, "visual_observation_0", stride=stride, pad=(0, 0, 0, 0), data=data)
+        m.layer("action", 200, "seen")
+        found = {n.op for n in graph_of(m.model()).nodes if "Conv" in n.op}
+        assert found == {op}

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
-import numpy as np
-
+from converters.graph.nn import reduction
 from converters.graph.types import INT64, Dim, product
 from converters.onnx.importer.elementwise import is_bias
 from converters.onnx.importer.importer import Importer
@@ -147,46 +146,8 @@ def _axes(op: Op, net: Importer, since: int) -> list[int] | None:
     return sorted({net.axis(x, a) for a in axes})
 
 
-def _reduction(build: Callable[[Importer, str, list[int], bool], str], since: int = 18) -> Translate:
-    def function(op: Op, net: Importer) -> str:
-        axes, keep = _axes(op, net, since), bool(op.integer("keepdims", 1))
-        if axes is None:
-            axes = []
-        return build(net, op.need(0), axes, keep)
-
-    return function
-
-
-def _plain(kind: str) -> Callable[[Importer, str, list[int], bool], str]:
-    def build(net: Importer, x: str, axes: list[int], keep: bool) -> str:
-        return net.reduce(kind, x, axes, keep=keep) if axes else x
-
-    return build
-
-
-def _log_sum_exp(net: Importer, x: str, axes: list[int], keep: bool) -> str:
-    """The logarithm of Σ exp(x), the largest element taken out first (zero where all are −∞, as onnxruntime does)."""
-    top = net.reduce("Max", x, axes, keep=True)
-    finite = net.add("Less", [net.add("Abs", [top]), net.number(top, np.inf)])
-    top = net.add("Select", [finite, top, net.add("ZerosLike", [top])])
-    total = net.reduce("Sum", net.add("Exp", [net.add("Sub", [x, top])]), axes, keep=True)
-    value = net.add("Add", [net.add("Log", [total]), top])
-    return value if keep else net.squeeze(value, axes)
-
-
-_REDUCTIONS: Mapping[str, Callable[[Importer, str, list[int], bool], str]] = {
-    "ReduceMean": _plain("Mean"),
-    "ReduceMax": _plain("Max"),
-    "ReduceMin": _plain("Min"),
-    "ReduceProd": _plain("Prod"),
-    "ReduceL1": lambda net, x, axes, keep: net.reduce("Sum", net.add("Abs", [x]), axes, keep=keep),
-    "ReduceL2": lambda net, x, axes, keep: net.add(
-        "Sqrt", [net.reduce("Sum", net.add("Square", [x]), axes, keep=keep)]
-    ),
-    "ReduceSumSquare": lambda net, x, axes, keep: net.reduce("Sum", net.add("Square", [x]), axes, keep=keep),
-    "ReduceLogSum": lambda net, x, axes, keep: net.add("Log", [net.reduce("Sum", x, axes, keep=keep)]),
-    "ReduceLogSumExp": _log_sum_exp,
-}
+def _reduction(build: reduction.Reduction, since: int = 18) -> Translate:
+    return lambda op, net: build(net, op.need(0), _axes(op, net, since) or [], bool(op.integer("keepdims", 1)))
 
 
 def _arg(kind: str) -> Translate:
@@ -235,15 +196,8 @@ def _softmax(op: Op, net: Importer) -> str:
         return net.reshape(net.add(op.kind, [net.reshape(x, (-1, size))]), dims)
     order = [i for i in range(len(dims)) if i != axis] + [axis]
     turned = net.transpose(x, order)
-    value = _on_rows(op, net, turned)
+    value = reduction.over_last_axis(net, op.kind, turned)
     return net.transpose(value, [order.index(i) for i in range(len(dims))]) if axis != last else value
-
-
-def _on_rows(op: Op, net: Importer, x: str) -> str:
-    dims = net.shape(x)
-    if len(dims) == _MATRIX:
-        return net.add(op.kind, [x])
-    return net.reshape(net.add(op.kind, [net.reshape(x, (-1, net.length(x, -1)))]), dims)
 
 
 def _hardmax(op: Op, net: Importer) -> str:
@@ -252,17 +206,20 @@ def _hardmax(op: Op, net: Importer) -> str:
     axis = net.axis(x, op.integer("axis", 1 if op.opset < 13 else -1))
     if axis != net.rank(x) - 1:
         raise op.refused("it is taken over an axis that is not the last")
-    best = net.add("ArgMax", [x, net.ints(axis, "axis")], output_type=INT64)
-    depth = net.ints(net.length(x, axis), "depth")
-    return net.add("OneHot", [best, depth, net.number(x, 1, "on"), net.number(x, 0, "off")], axis=-1)
+    return reduction.hardmax(net, x)
 
 
 OPS: Mapping[str, Translate] = {
     "Gemm": _gemm,
     "MatMul": _matmul,
     "Einsum": _einsum,
-    "ReduceSum": _reduction(_plain("Sum"), since=13),
-    **{kind: _reduction(build) for kind, build in _REDUCTIONS.items()},
+    "ReduceSum": _reduction(reduction.of_kind("Sum"), since=13),
+    **{f"Reduce{kind}": _reduction(reduction.of_kind(kind)) for kind in ("Mean", "Max", "Min", "Prod")},
+    "ReduceL1": _reduction(reduction.l1),
+    "ReduceL2": _reduction(reduction.l2),
+    "ReduceSumSquare": _reduction(reduction.sum_square),
+    "ReduceLogSum": _reduction(reduction.log_sum),
+    "ReduceLogSumExp": _reduction(reduction.log_sum_exp),
     "ArgMax": _arg("ArgMax"),
     "ArgMin": _arg("ArgMin"),
     "TopK": _top_k,

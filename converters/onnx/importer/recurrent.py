@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from converters.graph.nn import recurrent as nn
 from converters.graph.types import FLOAT32, Dim
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
@@ -73,33 +74,29 @@ def _zeros(net: Importer, step: _Step) -> str:
     return net.add("Fill", [net.vector([step.rows, step.hidden]), net.const(np.zeros((), FLOAT32), "zero")])
 
 
-def _weights(op: Op, net: Importer, position: int, parts: Sequence[slice] | None = None) -> list[str]:
-    """The kernel [1, gates·H, n] at ``position``, turned to [n, gates·H]; cut into ``parts`` of its columns."""
-    matrix = net.needed_constant(op.need(position), "the kernel")[0].T
-    return [net.const(matrix[:, part].copy(), "kernel") for part in parts or [slice(None)]]
-
-
-def _product(net: Importer, x: str, kernel: str, bias: str | None) -> str:
-    value = net.add("MatMul", [x, kernel])
-    return value if bias is None else net.add("BiasAdd", [value, bias])
-
-
-def _biases(op: Op, net: Importer, gates: int, hidden: int) -> tuple[list[str], list[str]] | None:
-    """Per gate the input's and the state's bias, None where the layer has none."""
+def _weights(op: Op, net: Importer, gates: int, hidden: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """The kernels [n, gates·H] and [H, gates·H], and the biases [2·gates·H] of the input and the state."""
+    kernel, inner = (net.needed_constant(op.need(i), "the kernel")[0].T for i in (1, 2))
     operand = op.get(3)
-    if operand is None:
-        return None
-    value = net.needed_constant(operand, "the bias")[0]
-    parts = [net.const(value[i * hidden : (i + 1) * hidden].copy(), "bias") for i in range(2 * gates)]
-    return parts[:gates], parts[gates:]
+    biases = None if operand is None else net.needed_constant(operand, "the bias")[0]
+    if {kernel.shape[1], inner.shape[1]} != {gates * hidden} or (
+        biases is not None and len(biases) != 2 * gates * hidden
+    ):
+        raise op.refused("its kernels and biases do not fit together", "the model is damaged")
+    return kernel, inner, biases
 
 
-def _sum_bias(op: Op, net: Importer, gates: int, hidden: int) -> str | None:
-    operand = op.get(3)
-    if operand is None:
-        return None
-    value = net.needed_constant(operand, "the bias")[0]
-    return net.const(value[: gates * hidden] + value[gates * hidden :], "bias")
+def _parts(array: np.ndarray, hidden: int) -> list[np.ndarray]:
+    """The columns of each gate."""
+    return [array[..., i : i + hidden].copy() for i in range(0, array.shape[-1], hidden)]
+
+
+def _product(op: Op, net: Importer, gates: int, step: _Step) -> tuple[str, str, np.ndarray | None]:
+    """The input times its kernel, the state's kernel, and the sum of both biases."""
+    kernel, inner, biases = _weights(op, net, gates, step.hidden)
+    weights = [net.const(k.copy(), "kernel") for k in (kernel, inner)]
+    bias = None if biases is None else biases[: len(biases) // 2] + biases[len(biases) // 2 :]
+    return net.add("MatMul", [step.x, weights[0]]), weights[1], bias
 
 
 def _outputs(net: Importer, step: _Step, states: Sequence[str]) -> list[str | None]:
@@ -110,68 +107,32 @@ def _outputs(net: Importer, step: _Step, states: Sequence[str]) -> list[str | No
     return [net.reshape(states[0], sequence), *(net.reshape(s, state) for s in states)]
 
 
-def _gates(net: Importer, value: str, count: int) -> list[str]:
-    split = net.add("Split", [net.ints(1, "axis"), value], num_split=count)
-    return [split if i == 0 else f"{split}:{i}" for i in range(count)]
-
-
 def _lstm(op: Op, net: Importer) -> list[str | None]:
-    """The cell: c' = f·c + i·tanh(g), h' = o·tanh(c')."""
     step = _step(op, net)
     peepholes = op.get(7)
     if peepholes is not None and net.needed_constant(peepholes, "what its gates see of the cell").any():
         raise op.refused("it has peepholes", "no trainer writes such a layer")
-    (kernel,), (inner,) = _weights(op, net, 1), _weights(op, net, 2)
-    total = net.add("MatMul", [step.x, kernel])
+    product, inner, bias = _product(op, net, 4, step)
     h, c = _rows_of(op, net, 5, step), _rows_of(op, net, 6, step)
-    if h is not None:
-        total = net.add("Add", [total, net.add("MatMul", [h, inner])])
-    bias = _sum_bias(op, net, 4, step.hidden)
-    if bias is not None:
-        total = net.add("BiasAdd", [total, bias])
-    i, o, f, g = _gates(net, total, 4)
-    cell = net.add("Mul", [net.add("Sigmoid", [i]), net.add("Tanh", [g])])
-    if c is not None:
-        cell = net.add("Add", [net.add("Mul", [net.add("Sigmoid", [f]), c]), cell])
-    hidden = net.add("Mul", [net.add("Sigmoid", [o]), net.add("Tanh", [cell])])
-    return _outputs(net, step, [hidden, cell])
+    return _outputs(net, step, nn.lstm(net, product, h, c, inner, bias, "iofg"))
 
 
 def _gru(op: Op, net: Importer) -> list[str | None]:
-    """The state: h' = (1 − z)·tanh(…) + z·h; ``linear_before_reset`` (PyTorch) resets after the product."""
     step = _step(op, net)
     size = step.hidden
-    cuts = [slice(i * size, (i + 1) * size) for i in range(3)]
-    kernels, inner = _weights(op, net, 1, cuts), _weights(op, net, 2, cuts)
+    kernel, inner, biases = _weights(op, net, 3, size)
+    kernels, recurrent = ([net.const(k, "kernel") for k in _parts(w, size)] for w in (kernel, inner))
     h = _rows_of(op, net, 5, step) or _zeros(net, step)
-    biases = _biases(op, net, 3, size)
-    of_x: list[str | None] = [*biases[0]] if biases else [None] * 3
-    of_h: list[str | None] = [*biases[1]] if biases else [None] * 3
-    inputs = [_product(net, step.x, k, b) for k, b in zip(kernels, of_x, strict=True)]
-    z, reset = (
-        net.add("Sigmoid", [net.add("Add", [inputs[i], _product(net, h, inner[i], of_h[i])])]) for i in range(2)
-    )
-    if op.integer("linear_before_reset", 0):
-        state = net.add("Mul", [reset, _product(net, h, inner[2], of_h[2])])
-    else:
-        state = _product(net, net.add("Mul", [reset, h]), inner[2], of_h[2])
-    candidate = net.add("Tanh", [net.add("Add", [inputs[2], state])])
-    rest = net.add("Mul", [net.add("Sub", [net.number(z, 1), z]), candidate])
-    return _outputs(net, step, [net.add("Add", [rest, net.add("Mul", [z, h])])])
+    parts = None if biases is None else _parts(biases, size)
+    after = bool(op.integer("linear_before_reset", 0))
+    state = nn.gru(net, step.x, h, kernels, recurrent, parts, linear_before_reset=after)
+    return _outputs(net, step, [state])
 
 
 def _rnn(op: Op, net: Importer) -> list[str | None]:
-    """The state: h' = tanh(x·W + h·R + b)."""
     step = _step(op, net)
-    (kernel,), (inner,) = _weights(op, net, 1), _weights(op, net, 2)
-    total = net.add("MatMul", [step.x, kernel])
-    h = _rows_of(op, net, 5, step)
-    if h is not None:
-        total = net.add("Add", [total, net.add("MatMul", [h, inner])])
-    bias = _sum_bias(op, net, 1, step.hidden)
-    if bias is not None:
-        total = net.add("BiasAdd", [total, bias])
-    return _outputs(net, step, [net.add("Tanh", [total])])
+    product, inner, bias = _product(op, net, 1, step)
+    return _outputs(net, step, [nn.rnn(net, product, _rows_of(op, net, 5, step), inner, bias)])
 
 
 OPS: Mapping[str, Translate] = {"LSTM": _lstm, "GRU": _gru, "RNN": _rnn}

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.nn.shaping import padded
 from converters.graph.types import BOOL, INT32, INT64, Dim
 from converters.onnx.importer.arrays import MAX_ELEMENTS
 from converters.onnx.importer.importer import Importer
@@ -186,19 +187,7 @@ def _pad(op: Op, net: Importer) -> str:
     if len(pads) != 2 * len(axes):
         raise op.refused("it does not give two paddings for each axis", "the model is damaged")
     pairs = dict(zip(axes, zip(pads[: len(axes)], pads[len(axes) :], strict=True), strict=True))
-    return padded(op, net, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
-
-
-def padded(op: Op, net: Importer, x: str, pairs: Sequence[tuple[int, int]], fill: str | None = None) -> str:
-    """Padded at both ends of each axis, with zero or ``fill``; a negative padding cuts off."""
-    for axis, (before, after) in enumerate(pairs):
-        if min(before, after) < 0:
-            x = net.slice(x, axis, -before if before < 0 else None, after if after < 0 else None)
-    wide = [(max(a, 0), max(b, 0)) for a, b in pairs]
-    if not any(a or b for a, b in wide):
-        return x
-    operand = net.const(np.array(wide, INT32).reshape(-1, 2), "paddings")
-    return net.add("Pad", [x, operand]) if fill is None else net.add("PadV2", [x, operand, fill])
+    return padded(net, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
 
 
 # ------------------------------------------------------------------ indices

@@ -69,6 +69,8 @@ CASES = [
     pool("AveragePool", "paddings do not count", kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1]),
     pool("AveragePool", "other paddings", kernel_shape=[3, 3], strides=[2, 2], pads=[0, 1, 2, 0]),
     pool("AveragePool", "paddings count", kernel_shape=[3, 3], pads=[1, 1, 1, 1], count_include_pad=1),
+    pool("AveragePool", "SAME that counts", kernel_shape=[3, 3], strides=[2, 2], auto_pad="SAME_UPPER",
+         count_include_pad=1),
     pool("AveragePool", "rounded up", kernel_shape=[2, 2], strides=[2, 2], ceil_mode=1, opsets=(13, 15, 18)),
     pool("GlobalAveragePool", "plain", (9, *POOLS)),
     pool("GlobalMaxPool", "plain", (9, *POOLS)),

@@ -1,0 +1,60 @@
+"""Pools of images [B, H, W, C]; windows as in convolution.py. Definition: onnx/docs/Operators.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.builder import Builder
+from converters.graph.nn.convolution import Pair, Window, framed
+from converters.graph.nn.shaping import padded
+from converters.graph.types import FLOAT32
+from signatures.errors import UnsupportedOpError
+
+
+def max_pool(b: Builder, image: str, window: Window, lowest: float = -np.inf) -> str:
+    """The largest element under each window; ``lowest`` stands where the image is not."""
+    _check(window)
+    data, padding = framed(b, image, window, lowest)
+    return b.add("MaxPool", [data], **_attrs(window, padding))
+
+
+def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pair] | None = None) -> str:
+    """The mean of the image's elements under each window; ``counted`` paddings count as zeros."""
+    _check(window)
+    data, padding = image, "VALID"
+    if counted is None or not any(map(any, window.pads)):
+        if window.same or not any(map(any, window.pads)):
+            return b.add("AvgPool", [image], **_attrs(window, "SAME" if window.same else "VALID"))
+        counted = ((0, 0), (0, 0))
+    lengths = [b.length(image, axis) for axis in (1, 2)]
+    if not any(map(any, counted)) and window.pads == window.same_pads(lengths):
+        return b.add("AvgPool", [image], **_attrs(window, "SAME"))
+    counts = _counts(lengths, window, counted)
+    data = padded(b, image, [(0, 0), *window.pads, (0, 0)])
+    mean = b.add("AvgPool", [data], **_attrs(window, padding))
+    factor = (window.size[0] * window.size[1] / counts).astype(FLOAT32)
+    return b.add("Mul", [mean, b.const(factor[None, :, :, None], "share")])
+
+
+def _check(window: Window) -> None:
+    if set(window.dilations) != {1}:
+        raise UnsupportedOpError("its window is dilated", why="no target has dilated pools")
+
+
+def _attrs(window: Window, padding: str) -> dict[str, Any]:
+    return {"ksize": (1, *window.size, 1), "strides": (1, *window.strides, 1), "padding": padding}
+
+
+def _counts(lengths: Sequence[int], window: Window, counted: tuple[Pair, Pair]) -> np.ndarray:
+    """How many elements each window has that count: the image's, and the padding's in ``counted``."""
+    sums = []
+    for length, size, stride, (before, after), (first, last) in zip(
+        lengths, window.size, window.strides, window.pads, counted, strict=True
+    ):
+        line = np.zeros(before + length + after)
+        line[before - first : before + length + last] = 1
+        sums.append(np.lib.stride_tricks.sliding_window_view(line, size)[::stride].sum(axis=1))
+    return np.maximum(np.outer(sums[0], sums[1]), 1)
