@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from converters.graph.nodes import Graph
 from signatures.spec import PolicySignature, SourceMap
 
@@ -14,7 +16,8 @@ class Policy:
     """A graph with its signature: the hub between all readers and all writers.
 
     ``feeds`` maps an input's canonical name to the Placeholder that takes it, ``fetches`` an output's canonical name
-    to the tensor that gives it. After the naming pass both map names to themselves.
+    to the tensor that gives it. After the naming pass both map names to themselves. ``constants`` are outputs that are
+    the same in every run and that a consumer reads beside the actions (``version_number``); only ONNX has them.
     """
 
     name: str
@@ -23,3 +26,4 @@ class Policy:
     feeds: Mapping[str, str]
     fetches: Mapping[str, str]
     source: SourceMap = field(default_factory=SourceMap)
+    constants: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -81,6 +81,7 @@ def export_model(
     parity: VerifyOptions | None = None,
     labels: Labels | None = None,
     strict: bool = True,
+    for_: str | None = None,
 ) -> list[ExportResult]:
     """Export every policy of a source to ``out/<policy>/``.
 
@@ -89,8 +90,9 @@ def export_model(
     or a ConcreteFunction; ``keras_model``. Nothing of a live object is changed. Its policy is called ``policy``, or as
     the function or the model is; ``name`` gives another.
 
-    The other parameters are the flags of the command line. Raises ExportModelError and its subclasses; ParityError
-    (after everything is written) when formats disagree and ``strict`` is set.
+    ``for_`` names the consumer that the files are made for (``--for``). The other parameters are the flags of the
+    command line. Raises ExportModelError and its subclasses; ParityError (after everything is written) when formats
+    disagree and ``strict`` is set.
     """
     options = ExportOptions(
         Path(out),
@@ -102,6 +104,7 @@ def export_model(
         verify,
         parity or VerifyOptions(),
         labels,
+        for_,
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, step) as sources:

@@ -109,6 +109,10 @@ class SignatureError(ExportModelError):
     """Inputs and outputs cannot be given their roles; the text lists the candidates and the flags that decide."""
 
 
+class ProfileError(ExportModelError):
+    """A policy cannot be what the consumer that ``--for`` names takes; the text says what that one lacks."""
+
+
 class BundleError(ExportModelError):
     """A bundle is missing, incomplete, or its files are not the ones its policy.json names."""
 

@@ -25,7 +25,9 @@ from signatures.errors import GraphError, UsageError
 from signatures.spec import TensorSpec
 
 #: Opset → the IR version of the same ONNX release (onnx/helper.py, OP_SET_ID_VERSION_MAP).
-IR_VERSIONS = {13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
+IR_VERSIONS = {11: 6, 12: 7, 13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
+#: What people may ask for; profiles of old importers ask for less.
+ASKED_FOR = range(13, 22)
 PRODUCER = "export-model"
 CONTRACT_KEY = "export_model_contract"
 
@@ -33,12 +35,13 @@ CONTRACT_KEY = "export_model_contract"
 class _Builder:
     """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
 
-    def __init__(self, types: Types, opset: int, outputs: Collection[str]) -> None:
+    def __init__(self, graph: Graph, opset: int, outputs: Collection[str]) -> None:
         import onnx
 
         self.onnx = onnx
         self.opset = opset
-        self.types = types
+        self.types: Types = infer_types(graph)
+        self._graph = graph
         self.outputs = frozenset(outputs)
         self.nodes: list[Any] = []
         self.initializers: list[Any] = []
@@ -53,6 +56,9 @@ class _Builder:
 
     def type_of(self, reference: str) -> TensorType:
         return self.types[reference]
+
+    def producer(self, reference: str) -> Node:
+        return self._graph.producer(reference)
 
     def holds(self, value: str, reference: str, axes: Sequence[int]) -> None:
         self.turned[reference] = View(value, tuple(axes))
@@ -88,9 +94,22 @@ class _Builder:
             self.initializers.append(self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
         return self._constants[key]
 
+    def begin(self, prefix: str) -> None:
+        """Let the names of what is made from here on begin with ``prefix``."""
+        self._prefix = prefix
+
+    def prune(self, wanted: Collection[str]) -> None:
+        """Take out nodes that nothing reads (the pieces of a Split that are not used, a Shape for its dtype alone)."""
+        needed, kept = set(wanted), []
+        for node in reversed(self.nodes):
+            if needed.intersection(node.output):
+                needed.update(node.input)
+                kept.append(node)
+        self.nodes = kept[::-1]
+
     def lower(self, node: Node) -> None:
         """Append what a node of the graph becomes, its result under the node's own name."""
-        self._prefix = node.name
+        self.begin(node.name)
         if node.op == "Const":
             assert node.value is not None
             # An initializer that is an output is no valid model: that one gets another name, and an Identity.
@@ -163,6 +182,11 @@ def _value_info(onnx: Any, spec: TensorSpec, batch: str = "batch") -> Any:
     )
 
 
+def _constant_info(onnx: Any, name: str, value: np.ndarray) -> Any:
+    kind = onnx.helper.np_dtype_to_tensor_dtype(value.dtype)
+    return onnx.helper.make_tensor_value_info(name, kind, list(value.shape))
+
+
 def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     """The ONNX artefact. Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering,
     GraphError when the checker refuses the result (a fault of this tool).
@@ -172,14 +196,14 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     import onnx.helper
     import onnx.numpy_helper
 
-    if options.opset not in IR_VERSIONS:
+    if options.opset not in (IR_VERSIONS if options.profile else ASKED_FOR):
         raise UsageError(
             f"opset {options.opset} is not written",
-            why=f"the lowerings are made for opsets {min(IR_VERSIONS)} to {max(IR_VERSIONS)}",
+            why=f"the lowerings are made for opsets {min(ASKED_FOR)} to {max(ASKED_FOR)}",
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
     graph = fuse(policy.graph, policy.fetches.values(), activations=False)
-    builder = _Builder(infer_types(graph), options.opset, [s.name for s in policy.signature.outputs])
+    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs])
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)
     for node in graph.nodes:
@@ -187,13 +211,21 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
             builder.lower(node)
     for spec in policy.signature.outputs:
         builder.give(spec.name)
+    builder.begin("")
+    for name, value in policy.constants.items():
+        source = builder.const(value, f"{name}/value")
+        builder.nodes.append(onnx.helper.make_node("Identity", [source], [name]))
+    builder.prune([*(s.name for s in policy.signature.outputs), *policy.constants])
     used = {name for node in builder.nodes for name in node.input}
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
             builder.nodes,
             policy.name,
             [_value_info(onnx, s) for s in policy.signature.inputs],
-            [_value_info(onnx, s) for s in policy.signature.outputs],
+            [
+                *(_value_info(onnx, s) for s in policy.signature.outputs),
+                *(_constant_info(onnx, name, value) for name, value in policy.constants.items()),
+            ],
             [i for i in builder.initializers if i.name in used],
         ),
         producer_name=PRODUCER,

@@ -179,7 +179,27 @@ class Console:
                 click.echo(line)
         _say(click.style(verdict(report), fg=_COLOURS[report.passed]))
 
-    def next_step(self, results: Sequence[ExportResult], names: str, targets: Sequence[str]) -> None:
+    def profiles(self) -> None:
+        """Every profile with what it is for (``--for help``)."""
+        from converters.targets.profiles import PROFILES
+
+        if self.as_json:
+            entries = [
+                {"name": p.name, "aliases": list(p.aliases), "for": p.purpose, "formats": list(p.formats)}
+                for p in PROFILES
+            ]
+            self.json({"profiles": entries})
+            return
+        width = max(len(p.name) for p in PROFILES)
+        for profile in PROFILES:
+            click.echo(f"{profile.name:{width}}  {profile.purpose}")
+            details = [f"writes {', '.join(profile.formats)}"]
+            details += [f"also called {', '.join(profile.aliases)}"] if profile.aliases else []
+            click.echo(f"{'':{width}}  {'; '.join(details)}")
+
+    def next_step(
+        self, results: Sequence[ExportResult], names: str, targets: Sequence[str], profile: str | None = None
+    ) -> None:
         """What to do next, in a line or two."""
         if not results or self._silent or self.quiet:
             return
@@ -187,6 +207,13 @@ class Console:
         if failed is not None:
             click.echo(
                 f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree"
+            )
+            return
+        if profile is not None:
+            last = results[-1]
+            files = ", ".join(sorted(p.name for p in last.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
+            click.echo(
+                f"next: put {files} of {last.folder} into the project, for the agent's Model    (docs/tasks/unity.md)"
             )
             return
         if "bytes" in targets and names == "canonical":

@@ -52,6 +52,7 @@ def _formats() -> str:
     metavar="FORMATS",
     help="Formats to write.",
 )
+@click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
 @click.option(
     "--names",
@@ -88,6 +89,7 @@ def export_command(
     sources: tuple[Path, ...],
     out: Path,
     targets: str,
+    profile: str | None,
     name: str | None,
     opset: int,
     runtimes: str,
@@ -103,6 +105,9 @@ def export_command(
     from converters.source import ReadOptions
     from exporter.export.pipeline import ExportOptions, export
 
+    if profile == "help":
+        console.profiles()
+        return
     console.prepare(verifies=runtimes != "none")
     job = ExportOptions(
         out,
@@ -114,6 +119,7 @@ def export_command(
         runtimes,
         options,
         labels,
+        profile,
     )
     results = []
     with console.progress() as progress:
@@ -123,7 +129,7 @@ def export_command(
             console.result(result)
     console.check_rules([r.report for r in results if r.report is not None])
     console.json({"policies": [_result_dict(r) for r in results]})
-    console.next_step(results, compiling.names, job.targets)
+    console.next_step(results, compiling.names, job.targets, profile)
     console.write_reports(lambda: _entries(results, options.steps))
     if any(r.passed is False for r in results):
         sys.exit(1)

@@ -21,6 +21,8 @@ from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.targets.profile import Profile
+from converters.targets.profiles import profile
 from exporter.export import bundle
 from exporter.export.labels import Labels, labelled, read_labels
 from exporter.export.sources import Source, naming, read_source
@@ -48,6 +50,8 @@ class ExportOptions:
     verify: str | Sequence[str] = "auto"
     parity: VerifyOptions = field(default_factory=VerifyOptions)
     labels: Labels | None = None
+    #: the consumer that the files are made for (``--for``); its own formats where ``targets`` are the usual ones
+    profile: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +77,7 @@ class _Job:
     source: Source
     model: SourceModel
     policy: Policy
+    profile: Profile | None = None
 
 
 def export(
@@ -89,7 +94,8 @@ def export(
     """
     if not paths:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
-    formats = [written(target) for target in dict.fromkeys(options.targets)]
+    wanted = None if options.profile is None else profile(options.profile)
+    formats = _formats(options, wanted)
     if not formats:
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
     runtimes, known = chosen_runtimes(options.verify, formats)
@@ -101,7 +107,8 @@ def export(
         source = path if isinstance(path, Source) else read_source(path, options.read)
         compiled = list(source.compiled(options.compile))
         named = _named([policy for _, policy in compiled], options, len(paths))
-        jobs.extend(_Job(source, model, p) for (model, _), p in zip(compiled, named, strict=True))
+        dressed = [p if wanted is None else wanted.dress(p) for p in named]
+        jobs.extend(_Job(source, model, p, wanted) for (model, _), p in zip(compiled, dressed, strict=True))
         origins.extend((p.name, f"{source.path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
     bundle.distinct_names(origins)
     jobs = [replace(j, policy=p) for j, p in zip(jobs, labelled([j.policy for j in jobs], labels), strict=True)]
@@ -125,6 +132,29 @@ def export(
             yield ExportResult(policy, place, content, {a.format.key: a.size for a in artifacts}, report)
 
 
+def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
+    """What to write: ``--to``, or what the consumer of ``--for`` loads. Raises UsageError."""
+    targets = tuple(dict.fromkeys(options.targets))
+    if wanted is None:
+        return [written(target) for target in targets]
+    if targets == DEFAULTS:
+        targets = wanted.formats[:1]
+    for target in targets:
+        if written(target).key not in wanted.formats:
+            raise UsageError(
+                f"--to {target} does not go with --for {wanted.name}",
+                why=f"{wanted.purpose}: it loads {', '.join(wanted.formats)}",
+                fix="leave --to out",
+            )
+    if options.compile.names != "canonical":
+        raise UsageError(
+            f"--names {options.compile.names} does not go with --for {wanted.name}",
+            why="the consumer decides the names",
+            fix="leave --names out",
+        )
+    return [written(target) for target in targets]
+
+
 def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list[Policy]:
     if options.name is not None:
         if len(policies) > 1 or sources > 1:
@@ -143,8 +173,15 @@ def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tupl
         origin["sensors"] = [list(shape) for shape in options.read.sensors]
     content = bundle.contract(job.policy, origin)
     with naming(job.source.path):
-        how = WriteOptions(bundle.compact(content), options.opset)
-        return content, [f.artifact(job.policy, how) for f in formats]
+        if job.profile is None:
+            how = WriteOptions(bundle.compact(content), options.opset)
+            return content, [f.artifact(job.policy, how) for f in formats]
+        how = WriteOptions(bundle.compact(content), job.profile.opset, job.profile.name)
+        artifacts = [f.artifact(job.policy, how) for f in formats]
+        for artifact in artifacts:
+            if job.profile.check is not None:
+                job.profile.check(job.profile, artifact.files, job.policy.name)
+        return content, artifacts
 
 
 @contextmanager
@@ -174,7 +211,7 @@ def _tested(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path
         paths,
         {a.format.key: a.size for a in artifacts},
         reference,
-        job.model.original,
+        job.model.original if job.profile is None else None,
         policy.source,
         keys,
     )

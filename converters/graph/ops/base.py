@@ -48,6 +48,10 @@ class OnnxBuilder(Protocol):
         """An initializer; equal arrays share one."""
         ...
 
+    def producer(self, reference: str) -> Node:
+        """The node of the graph that makes a tensor."""
+        ...
+
     def holds(self, value: str, reference: str, axes: Sequence[int]) -> None:
         """Note that ``value`` is a tensor of the graph with its axes in another order (numpy's ``transpose``)."""
         ...
@@ -300,7 +304,10 @@ def reshaped(builder: OnnxBuilder, value: str, result: Shape) -> str:
 
 
 def _with_axes(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[int]) -> str:
-    made: str = builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
+    if builder.opset < 13:
+        made: str = builder.emit(onnx_op, [value], axes=[int(a) for a in axes])
+    else:
+        made = builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
     return made
 
 

@@ -193,8 +193,9 @@ def _lower_cast(node: Node, builder: OnnxBuilder) -> Any:
     if target == BOOL and source != BOOL:
         return builder.emit("Not", [builder.emit("Equal", [value, scalar(builder, node, 0.0)])])
     if source.kind == "f" and target.kind in "iu":
-        whole = builder.emit("Floor", [builder.emit("Abs", [value])])
-        value = builder.emit("Mul", [builder.emit("Sign", [value]), whole])
+        zero = scalar(builder, node, 0.0)
+        above = builder.emit("Floor", [builder.emit("Max", [value, zero])])
+        value = builder.emit("Add", [above, builder.emit("Ceil", [builder.emit("Min", [value, zero])])])
     return builder.emit("Cast", [value], to=target)
 
 

@@ -68,6 +68,9 @@ def _truncated(node: Node, shape: np.ndarray) -> np.ndarray:
 
 def _lower_random(onnx_op: str) -> Any:
     def lower(node: Node, builder: OnnxBuilder) -> Any:
+        source = builder.producer(node.inputs[0])
+        if source.op == "Shape" and builder.type_of(source.inputs[0]).dtype == node.attrs["dtype"]:
+            return builder.emit(onnx_op, [builder.value(source.inputs[0])])
         shape = builder.emit("ConstantOfShape", [as_int64(node, builder, 0)], value=np.zeros(1, node.attrs["dtype"]))
         return builder.emit(onnx_op, [shape])
 

@@ -1,0 +1,37 @@
+"""Whether every construct of an ONNX is read rightly by a profile's importers; what is not is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from converters.targets.profile import Profile
+from converters.targets.unity.constructs import constructs
+from converters.targets.unity.readings import MEASURED, misreadings
+from signatures.errors import ProfileError
+
+
+def importable(profile: Profile, files: Mapping[str, bytes], name: str) -> None:
+    """Raise ProfileError where an importer misreads or refuses a construct, or none is known to read it."""
+    import onnx
+
+    for path, data in files.items():
+        if not path.endswith(".onnx"):
+            continue
+        model = constructs(onnx.ModelProto.FromString(data))
+        found = list(misreadings(model, profile.importers))
+        unknown = [c for c in model if c.op not in MEASURED]
+        if found:
+            first = found[0]
+            raise ProfileError(
+                f"{name!r} cannot be made for {profile.name}: {first.importer} does not read its {first.construct.op}",
+                where=f"node {first.construct.name}",
+                why=f"{first.rule.reading.value}: {first.rule.says} (measured: {first.rule.evidence})",
+                fix="export for a later consumer (--for help lists them)",
+            )
+        if unknown:
+            raise ProfileError(
+                f"{name!r} cannot be made for {profile.name}: nobody has seen its importer read {unknown[0].op}",
+                where=f"node {unknown[0].name}",
+                why="no construct with that operator was run in Unity's importers",
+                fix="export without --for, and try the file in Unity yourself",
+            )

@@ -1,0 +1,36 @@
+"""What a profile is: one consumer, and how a policy is made into what that one looks up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NoReturn
+
+from converters.policy import Policy
+from signatures.errors import ProfileError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Profile:
+    """A consumer of policies: ``--for NAME``.
+
+    ``formats`` are those that it loads, the usual one first. ``dress`` gives the policy under the names, dtypes and
+    layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
+    ``converters/targets/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
+    releases of ``converters/targets/unity/consumers.py`` that must accept it. ``opset`` is the ONNX opset.
+    """
+
+    name: str
+    aliases: tuple[str, ...] = ()
+    purpose: str
+    formats: tuple[str, ...]
+    dress: Callable[[Policy], Policy]
+    opset: int = 15
+    importers: tuple[str, ...] = ()
+    checkers: tuple[str, ...] = ()
+    check: Callable[[Profile, Mapping[str, bytes], str], None] | None = None
+
+
+def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:
+    """Raise the ProfileError of a policy that a profile cannot hold."""
+    raise ProfileError(f"{policy.name!r} cannot be made for {profile}: {what}", why=why, fix=fix)

@@ -1,0 +1,181 @@
+"""Policies under the profiles of ``--for``: accepted by our checker, and the same actions under mapped names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+
+from converters.targets.profile import Profile
+from converters.targets.profiles import PROFILES, profile
+from exporter import export_model
+from signatures.errors import ExportModelError, ProfileError, UsageError
+from tests import commands
+from tests.handmade import graph_bytes, sampled_policy
+from tests.targets.dressed import Pair, compiled, run
+
+pytest.importorskip("onnxruntime")
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = ROOT.parent / "shared"
+FIXTURES = [
+    *sorted((ROOT / "fixtures").glob("*.bytes")),
+    *(p for room in ("sb3", "torch_checkpoint") for p in sorted((ROOT / "fixtures" / room).glob("*.onnx"))),
+]
+BATCHES = (1, 3, 16)
+
+#: Policies that a profile cannot hold: (file, what the refusal names).
+CANNOT = {
+    "lstmcell__legacy.onnx": "h_in, c_in",
+    "grucell__dynamo.onnx": "h_in",
+    "lidar_conv1d__dynamo.onnx": "lidar",
+    "entity_attention__legacy.onnx": "entities",
+}
+#: Policies that one profile cannot hold.
+CANNOT_IN = {("sb3_ppo_gelu__dynamo_dyn.onnx", "barracuda-1.4"): "Erf"}
+
+
+def held(path: Path, wanted: Profile, folder: Path) -> int:
+    """Hold each policy of a file under a profile; returns how many are held."""
+    try:
+        policies = compiled(path)
+    except ExportModelError:
+        return 0  # other tests say which files are no policies
+    count = 0
+    for policy in policies:
+        named = CANNOT.get(path.name) or CANNOT_IN.get((path.name, wanted.name))
+        if policy.signature.memory is not None and policy.signature.memory.output is None:
+            named = "not given back"
+        if named:
+            with pytest.raises(ProfileError, match=named):
+                Pair.of(policy, wanted)
+            continue
+        pair = Pair.of(policy, wanted)
+        for seed, rows in enumerate(BATCHES):
+            assert pair.difference(rows, seed) is None, (policy.name, rows)
+        for name, verdict in pair.verdicts(folder).items():
+            assert all(verdict.accepted.values()), (policy.name, name, verdict.to_dict())
+        count += 1
+    return count
+
+
+@pytest.mark.parametrize("wanted", PROFILES, ids=lambda p: p.name)
+@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
+def test_a_fixture_acts_the_same_and_is_accepted(path: Path, wanted: Profile, tmp_path: Path) -> None:
+    lost = path.name == "ppo_0_22_lstm.onnx"  # ML-Agents 0.20 to 0.24 exported no recurrent_out
+    assert (held(path, wanted, tmp_path) == 0) == lost
+
+
+def _sources() -> list[Path]:
+    files = [p for room in ("genuine", "corpus", "foreign") for p in sorted((SHARED / room).rglob("*"))]
+    return [p for p in files if p.suffix in (".bytes", ".pb", ".nn", ".onnx", ".pt", ".keras") and p.is_file()]
+
+
+def _known(every: bool) -> list[Any]:
+    pairs = [
+        pytest.param(path, wanted, id=f"{path.parent.name}/{path.name}-{wanted.name}")
+        for number, path in enumerate(_sources())
+        for turn, wanted in enumerate(PROFILES)
+        if (number % len(PROFILES) != turn) == every
+    ]
+    return pairs or [pytest.param(Path("absent"), PROFILES[0], id="shared-is-absent")]
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize(("path", "wanted"), _known(every=False))
+def test_a_known_policy_acts_the_same_and_is_accepted(path: Path, wanted: Profile, tmp_path: Path) -> None:
+    if not path.is_file():
+        pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
+    held(path, wanted, tmp_path)
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize(("path", "wanted"), _known(every=True))
+def test_every_known_policy_does_so_under_every_profile(path: Path, wanted: Profile, tmp_path: Path) -> None:
+    if not path.is_file():
+        pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
+    held(path, wanted, tmp_path)
+
+
+# ------------------------------------------------------------------ what is supplied
+
+
+@pytest.mark.parametrize("draws", [False, True])
+def test_masks_that_a_policy_lacks_are_supplied_and_applied(draws: bool, tmp_path: Path) -> None:
+    """Of Stable-Baselines3, and of ML-Agents 0.1 to 0.4: a forbidden action is not given, even where it is the best."""
+    path = ROOT / "fixtures" / "sb3" / "sb3_discrete.onnx"
+    if draws:
+        path = tmp_path / "drawing.bytes"
+        path.write_bytes(graph_bytes(sampled_policy(actions=4)))
+    (policy,) = compiled(path)
+    assert not policy.signature.has_input("action_masks")
+    pair = Pair.of(policy, profile("unity6"))
+    assert any("action_masks was added" in note for note in pair.dressed.signature.notes)
+    ((width, *_),) = pair.made_constant("discrete_action_output_shape").tolist()
+    width = int(width)
+    rng = np.random.default_rng(0)
+    feeds = {
+        s.name: rng.standard_normal([width * 50, *(d or 1 for d in s.shape[1:])]).astype(np.float32)
+        for s in pair.dressed.signature.observations
+    }
+    allowed = np.arange(width * 50) % width
+    feeds["action_masks"] = np.eye(width, dtype=np.float32)[allowed]
+    given = run(pair.made, feeds, None)
+    assert given["discrete_actions"][:, 0].tolist() == allowed.tolist()
+    assert given["deterministic_discrete_actions"][:, 0].tolist() == allowed.tolist()
+
+
+def test_what_unity_reads_is_float32_and_constants_are_outputs(tmp_path: Path) -> None:
+    for name in ("recurrent", "visual", "sampled", "continuous"):
+        (result,) = export_model(ROOT / "fixtures" / f"{name}.bytes", tmp_path, for_="sentis", verify="none")
+        graph = onnx.load(next(result.folder.glob("*.onnx"))).graph
+        assert {i.type.tensor_type.elem_type for i in graph.input} == {onnx.TensorProto.FLOAT}
+        outputs = {o.name: o.type.tensor_type.elem_type for o in graph.output}
+        assert outputs["version_number"] == outputs["memory_size"] == onnx.TensorProto.FLOAT
+        made = {name for node in graph.node for name in node.output}
+        assert set(outputs) <= made
+        assert not any(name.endswith(":0") for node in graph.node for name in node.output)
+
+
+def test_the_draws_of_a_continuous_policy_are_put_back() -> None:
+    """In the model, as the trainers of PyTorch do it: with the noise lifted out again, the same action comes of it."""
+    (policy,) = compiled(ROOT / "fixtures" / "continuous.bytes")
+    pair = Pair.of(policy, profile("barracuda-3"))
+    assert [n.op_type for n in pair.made.graph.node].count("RandomNormalLike") == 1
+    assert not pair.dressed.signature.noise
+    assert pair.difference(16, 0) is None
+
+
+# ------------------------------------------------------------------ the command
+
+
+def test_help_lists_every_profile_with_its_purpose() -> None:
+    ran = commands.export_model("--for", "help")
+    assert ran.status == 0
+    for known in PROFILES:
+        assert known.name in ran.out and known.purpose in ran.out
+    assert [p["name"] for p in commands.export_model("--for", "help", "--json").json["profiles"]] == [
+        p.name for p in PROFILES
+    ]
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"for_": "unity7"}, "did you mean unity6"),
+        ({"for_": "unity6", "to": "bytes"}, "does not go with --for unity6"),
+        ({"for_": "unity6", "names": "source"}, "the consumer decides the names"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(how: dict[str, str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=said):
+        export_model(ROOT / "fixtures" / "continuous.bytes", tmp_path, verify="none", **how)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_export_for_unity_is_verified_in_theruntimes(tmp_path: Path) -> None:
+    (result,) = export_model(ROOT / "fixtures" / "recurrent.bytes", tmp_path, for_="unity6", verify="onnxruntime")
+    assert result.passed
