@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.formats import DEFAULTS
-from converters.graph.options import CompileOptions
-from converters.graph.passes.noise import NoiseMode
+from converters.graph.options import CompileOptions, NoiseMode
 from converters.source import ReadOptions
 from exporter.export.labels import Labels
 from exporter.export.pipeline import ExportOptions, ExportResult, export, verify_folder

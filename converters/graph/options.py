@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
-from converters.graph.passes.noise import NoiseMode
 from signatures.roles import Role
+
+#: What becomes of the normals that are drawn inside the graph: an input, they stay, or zeros.
+NoiseMode = Literal["lift", "keep", "zero"]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
-from converters.graph.ops.table import is_fed
+from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.state_names import looks_like_state
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.roles import (
@@ -242,9 +242,9 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
 
 
 def _is_choice(graph: Graph, node: Node) -> bool:
-    while node.op in ("Identity", "Cast", "Reshape", "Squeeze", "ExpandDims") and node.inputs:
+    while passes_on(node) or node.op == "Cast":
         node = graph.producer(node.inputs[0])
-    return node.op in ("ArgMax", "Multinomial")
+    return node.op == "ArgMax" or traits(node).sampler == "categorical"
 
 
 def _others(outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str]) -> list[tuple[str, Role, str]]:

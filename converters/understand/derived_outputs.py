@@ -8,19 +8,71 @@ policy (continuous: the action at zero noise; discrete: int64 [B, branches], the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from converters.graph.compilation import Compilation
 from converters.graph.editor import Editor
-from converters.graph.nodes import Graph
+from converters.graph.nodes import Graph, Node
+from converters.graph.ops.table import traits
 from converters.graph.passes.noise import without_noise
 from converters.graph.shapes import infer_types
-from converters.graph.types import INT32, INT64
+from converters.graph.types import INT32, INT64, static_shape
 from converters.understand.action import ActionMeaning
 from converters.understand.brains import Head
+from signatures.errors import SignatureError
 from signatures.roles import Role
 
 LOG_PROBS = "action_log_probs"
+
+
+def derive_outputs(c: Compilation) -> Compilation:
+    """Every action's companions. Raises SignatureError where an output without chance is drawn after all."""
+    graph, fetches = c.graph, dict(c.fetches)
+    truncated = [n.name for n in graph.nodes if traits(n).sampler == "truncated normal"]
+    types = infer_types(graph) if truncated else {}
+    noise = {**c.draws, **c.fed, **{n: static_shape(types[n].shape) or () for n in truncated}}
+    for head in c.brain.heads:
+        graph, fetches = add_companions(graph, fetches, head, c.meanings[head.name], noise)
+    for head in c.brain.heads:
+        _check_no_chance(graph, fetches[head.deterministic], head.deterministic)
+        if c.meanings[head.name].role is Role.DETERMINISTIC:
+            _check_no_chance(graph, fetches[head.name], head.name)
+    return replace(c, graph=graph, fetches=fetches)
+
+
+def drawn_by(graph: Graph, reference: str) -> list[Node]:
+    """The samplers that a tensor depends on."""
+    upstream = graph.ancestors([reference])
+    return [n for n in graph.nodes if n.name in upstream and traits(n).sampler]
+
+
+def _check_no_chance(graph: Graph, reference: str, name: str) -> None:
+    samplers = drawn_by(graph, reference)
+    if samplers:
+        raise SignatureError(
+            f"{name} would be another one in every run: it depends on {samplers[0].name!r} ({samplers[0].op})",
+            why="there is no value of such a draw that stands for no chance, as 0 does for N(0, 1)",
+            fix="name the tensor before the draw: --output NAME=deterministic",
+        )
+
+
+def without_chance(c: Compilation) -> Compilation:
+    """``--deterministic``: the actions are the ones without chance. A discrete one is then made here."""
+    if not c.options.deterministic:
+        return c
+    fetches, meanings, sources = dict(c.fetches), dict(c.meanings), dict(c.sources)
+    for head in c.brain.heads:
+        meaning = meanings[head.name]
+        if meaning.role is Role.DETERMINISTIC:
+            continue
+        fetches[head.name] = fetches[head.deterministic]
+        if meaning.role is not Role.CONTINUOUS:
+            meanings[head.name] = ActionMeaning(Role.DETERMINISTIC, meaning.branches)
+            sources[head.name] = None
+    fetches.pop(LOG_PROBS, None)
+    return replace(c, fetches=fetches, meanings=meanings, sources=sources)
 
 
 def add_companions(
@@ -39,6 +91,13 @@ def add_companions(
         if name not in fetches:
             graph, added[name] = without_noise(graph, fetches[head.name], noise, name)
         return graph, added
+    scores = list(meaning.branches)
+    action = fetches[head.name]
+    if name not in fetches:
+        for i, branch in enumerate(scores):
+            graph, scores[i] = without_noise(graph, branch, noise, name)
+        if not scores:
+            graph, action = without_noise(graph, action, noise, name)
     editor = Editor(graph)
     for node in graph.nodes:
         editor.keep(node)
@@ -46,10 +105,10 @@ def add_companions(
         parts = [editor.add("LogSoftmax", [b], f"{LOG_PROBS}/branch_{i}") for i, b in enumerate(meaning.branches)]
         added[LOG_PROBS] = _joined(editor, parts, LOG_PROBS)
     if name not in fetches:
-        if meaning.branches:
-            added[name] = _argmax(editor, meaning.branches, name)
+        if scores:
+            added[name] = _argmax(editor, scores, name)
         else:
-            added[name] = _as_columns(editor, graph, fetches[head.name], name)
+            added[name] = _as_columns(editor, graph, action, name)
     return editor.graph(), added
 
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
+from converters.graph.compilation import Compilation
 from converters.graph.nodes import Graph, Node, TensorShape, node_of
-from converters.graph.options import CompileOptions
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
-from converters.understand.action import ActionMeaning
-from converters.understand.brains import Brain, Head
+from converters.understand.action import action_meaning
+from converters.understand.brains import Head
 from converters.understand.derived_outputs import LOG_PROBS
-from converters.understand.facts import SourceFacts
 from converters.understand.generations import generation
 from converters.understand.images import highest_colour
 from converters.understand.memories import memory_layout
 from converters.understand.normaliser import normaliser
+from converters.understand.source_map import branch_origins
 from signatures.errors import SignatureError
 from signatures.labels import remaining
 from signatures.roles import OBSERVATIONS, Role, canonical_name, numbers
@@ -36,31 +36,37 @@ _OUTPUT_ORDER = (
 )
 
 
-@dataclass(frozen=True)
-class Compiled:
-    """What the passes leave behind: the graph before naming, and what was found on the way."""
+def understand_actions(c: Compilation) -> Compilation:
+    """What each action is, and the sizes of its branches."""
+    types = infer_types(c.graph)
+    masked = Role.MASKS in c.roles.values()
+    meanings = {
+        head.name: action_meaning(
+            c.graph,
+            c.fetches[head.name],
+            types[c.fetches[head.name]].dtype,
+            masked and head.base != "continuous_actions",
+        )
+        for head in c.brain.heads
+    }
+    branches = [b for m in meanings.values() for b in m.branches]
+    squashed = c.graph.producer(c.fetches[c.brain.heads[0].name]).op == "Tanh"
+    return replace(
+        c,
+        meanings=meanings,
+        branches=branch_sizes(types, branches),
+        branch_origins=branch_origins(c, branches),
+        squashed=squashed,
+    )
 
-    graph: Graph
-    #: canonical output → tensor
-    fetches: Mapping[str, str]
-    #: canonical output → its name in the source
-    sources: Mapping[str, str | tuple[str, ...] | None]
-    brain: Brain
-    options: CompileOptions
-    facts: SourceFacts
-    roles: Mapping[str, Role]
-    meanings: Mapping[str, ActionMeaning]
-    #: samplers of normals that the source drew from
-    draws: Mapping[str, tuple[int | None, ...]]
-    #: op types of the source
-    ops: set[str]
-    #: sizes of a discrete action's branches
-    branches: tuple[int, ...] = ()
-    #: whether the source's action, chance included, is a tanh
-    squashed: bool = False
+
+def sign(c: Compilation) -> Compilation:
+    """The signature, and its inputs and outputs. Raises SignatureError."""
+    signature, feeds, fetches = build_signature(c)
+    return replace(c, signature=signature, feeds=feeds, fetches=fetches)
 
 
-def build_signature(compiled: Compiled) -> tuple[PolicySignature, dict[str, str], dict[str, str]]:
+def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, str], dict[str, str]]:
     """(signature, name → placeholder, name → tensor). Raises SignatureError."""
     types = infer_types(compiled.graph)
     notes: list[str] = []
@@ -79,7 +85,7 @@ def build_signature(compiled: Compiled) -> tuple[PolicySignature, dict[str, str]
     signature = PolicySignature(
         inputs=tuple(inputs),
         outputs=tuple(outputs),
-        family=facts.family or generation(numbers(constants), bare, compiled.ops),
+        family=facts.family or generation(numbers(constants), bare, {n.op for n in compiled.source.nodes}),
         action_space="hybrid" if len(kinds) > 1 else "continuous" if True in kinds else "discrete",
         branches=compiled.branches,
         algorithm=_algorithm(compiled) if facts.algorithm is None else facts.algorithm or None,
@@ -148,7 +154,7 @@ def derived_notes(signature: PolicySignature) -> set[str]:
 # ------------------------------------------------------------------ outputs
 
 
-def _outputs(compiled: Compiled, types: Types) -> tuple[list[TensorSpec], dict[str, str]]:
+def _outputs(compiled: Compilation, types: Types) -> tuple[list[TensorSpec], dict[str, str]]:
     roles = _output_roles(compiled)
     fetches = compiled.fetches
     order = sorted(fetches, key=lambda n: _OUTPUT_ORDER.index(n) if n in _OUTPUT_ORDER else len(_OUTPUT_ORDER))
@@ -168,7 +174,7 @@ def _outputs(compiled: Compiled, types: Types) -> tuple[list[TensorSpec], dict[s
     return specs, {spec.name: fetches[name] for spec, name in zip(specs, order, strict=True)}
 
 
-def _output_roles(compiled: Compiled) -> dict[str, Role]:
+def _output_roles(compiled: Compilation) -> dict[str, Role]:
     canonical = compiled.brain.canonical
     roles = {canonical[base]: role for base, role, _ in compiled.brain.outputs if base in canonical}
     for head in compiled.brain.heads:
@@ -178,7 +184,7 @@ def _output_roles(compiled: Compiled) -> dict[str, Role]:
     return roles
 
 
-def _output_name(compiled: Compiled, name: str) -> str:
+def _output_name(compiled: Compilation, name: str) -> str:
     """The output's name in the artefacts: canonical, or what the trainer called it."""
     if compiled.options.names == "canonical":
         return name
@@ -213,7 +219,7 @@ def branch_sizes(types: Types, branches: Sequence[str]) -> tuple[int, ...]:
 # ------------------------------------------------------------------ inputs
 
 
-def _inputs(compiled: Compiled, types: Types, notes: list[str]) -> tuple[dict[str, str], list[TensorSpec]]:
+def _inputs(compiled: Compilation, types: Types, notes: list[str]) -> tuple[dict[str, str], list[TensorSpec]]:
     """(name → placeholder, specs) of what is left to feed, in the contract's order."""
     graph, roles, scope = compiled.graph, compiled.roles, compiled.brain.scope
     needed = graph.ancestors([compiled.fetches[head.name] for head in compiled.brain.heads])
@@ -293,7 +299,7 @@ def _one_hot_depth(graph: Graph, types: Types, node: Node) -> int | None:
 # ------------------------------------------------------------------ facts
 
 
-def _algorithm(compiled: Compiled) -> str | None:
+def _algorithm(compiled: Compilation) -> str | None:
     """The trainer that writes such a graph, where only one does.
 
     SAC squashes its sample with tanh and has no critic in the export; PPO clips it (0.4 on) or not (0.1-0.3); cloned
@@ -313,7 +319,7 @@ def _algorithm(compiled: Compiled) -> str | None:
 
 
 def _memory(
-    compiled: Compiled,
+    compiled: Compilation,
     inputs: list[TensorSpec],
     outputs: list[TensorSpec],
     feeds: Mapping[str, str],

@@ -5,8 +5,42 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
+from converters.graph.compilation import Compilation
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, split_ref, topological
 from converters.graph.ops.table import traits
+from signatures.roles import Constant, Role
+
+#: The name of the string constant in which our GraphDefs carry their contract.
+CONTRACT_NODE = "export_model_contract"
+
+
+def name_ports(c: Compilation) -> Compilation:
+    """Inputs and outputs under the signature's names.
+
+    With ``--names source`` the trainer's constants are kept too, and ``sequence_length``, read by nothing: Unity's
+    internal brain of 0.3 to 0.5 feeds it to every recurrent policy without asking whether it is there.
+    """
+    scope, source = c.brain.scope, c.options.names == "source"
+    kept = {**c.facts.constants, **c.brain.constants} if source else {}
+    unread = [n for n, r in c.roles.items() if r is Role.SEQUENCE_LENGTH and source]
+    reserved = (CONTRACT_NODE, *(scope + k for k in kept), *unread)
+    graph = name_tensors(c.graph, c.feeds, c.fetches, reserved)
+    torch = c.facts.family is not None and "PyTorch" in c.facts.family
+    constants = [
+        Node(scope + key, "Const", value=_constant(value, torch=torch), origin=f"{scope}{key}:0")
+        for key, value in kept.items()
+    ]
+    graph = Graph((*graph.nodes, *constants, *(c.original[n] for n in unread)))
+    return replace(c, graph=graph, feeds={n: n for n in c.feeds}, fetches={n: n for n in c.fetches})
+
+
+def _constant(value: Constant, *, torch: bool) -> np.ndarray:
+    """A constant as the trainer writes it: TensorFlow's are int32 scalars, torch's rows of float32."""
+    if isinstance(value, list):
+        return np.array([value], np.float32)
+    return np.array([value], np.float32) if torch else np.array(value, np.int32)
 
 
 def name_tensors(

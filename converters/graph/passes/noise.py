@@ -1,4 +1,4 @@
-"""In-graph samplers of N(0, 1) become an input, a zero, or stay.
+"""Samplers: those of N(0, 1) become an input, a zero, or stay; none keeps the seed of a trainer's run.
 
 Lifted, the policy is a pure function of its inputs: TFJS has no RandomStandardNormal (tfjs #4156), and a run can be
 repeated in any runtime by feeding the same draws.
@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
+from converters.graph.compilation import Compilation, Dims
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.table import traits
-from converters.graph.shapes import infer_types
+from converters.graph.options import NoiseMode
+from converters.graph.shapes import Types, infer_types
 from converters.graph.types import FLOAT32, static_shape
 from signatures.errors import UnsupportedOpError
-
-NoiseMode = Literal["lift", "keep", "zero"]
+from signatures.roles import Role
 
 
 def samplers(graph: Graph) -> list[Node]:
@@ -33,6 +33,47 @@ def unseeded(graph: Graph) -> Graph:
     """
     nodes = [replace(n, attrs={**n.attrs, "seed": 0, "seed2": 0}) if traits(n).sampler else n for n in graph.nodes]
     return Graph(tuple(nodes))
+
+
+def settle_noise(c: Compilation) -> Compilation:
+    """Noise as the options say, and a note of what it was."""
+    types = infer_types(c.graph)
+    draws = {n.name: _dims(types, n.name) for n in samplers(c.graph)}
+    fed = {n: _dims(types, n) for n, r in c.roles.items() if r is Role.NOISE and n in c.graph}
+    graph = lift_noise(c.graph, "zero" if c.options.deterministic else c.options.noise, fed)
+    noise = {tensor_of(c.graph[name]): dims for name, dims in (draws | fed).items()}
+    return replace(c, graph=graph, draws=draws, fed=fed, noise=noise)
+
+
+def _dims(types: Types, name: str) -> Dims:
+    return static_shape(types[name].shape) or ()
+
+
+def tensor_of(node: Node) -> str:
+    """The source's name for what a placeholder or a sampler gives."""
+    return node.origin if isinstance(node.origin, str) else f"{node.name}:0"
+
+
+def settle_single_draws(c: Compilation) -> Compilation:
+    """A draw from a single class is always class 0: an ArgMax says so (TensorFlow.js refuses to draw from one)."""
+    pairs = [pair for meaning in c.meanings.values() for pair in zip(meaning.samplers, meaning.branches, strict=False)]
+    if not pairs:
+        return c
+    types = infer_types(c.graph)
+    single = {sampler for sampler, branch in pairs if (types[branch].shape or (None,))[-1] == 1}
+    if not single:
+        return c
+    editor = Editor(c.graph)
+    for node in c.graph.nodes:
+        if node.name not in single:
+            editor.keep(node)
+            continue
+        axis = editor.const(np.array(1, np.int32), f"{node.name}/axis")
+        best = editor.add("ArgMax", [node.inputs[0], axis], f"{node.name}/only", output_type=node.attrs["output_dtype"])
+        shape = editor.const(np.array([-1, 1], np.int32), f"{node.name}/column_shape")
+        editor.redirect(node.name, editor.add("Reshape", [best, shape], f"{node.name}/column", node.origin))
+    fetches = {out: editor.resolve(reference) for out, reference in c.fetches.items()}
+    return replace(c, graph=editor.graph(), fetches=fetches)
 
 
 def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> Graph:
