@@ -36,6 +36,9 @@ def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: boo
         if all(traits(p).sampler == "categorical" for p in producers):
             return ActionMeaning(Role.SAMPLED, tuple(p.inputs[0] for p in producers), tuple(p.name for p in producers))
         if all(p.op == "ArgMax" for p in producers):
+            logits = [_without_gumbel(graph, p.inputs[0]) for p in producers]
+            if all(logits):
+                return ActionMeaning(Role.SAMPLED, tuple(r for r in logits if r))
             return ActionMeaning(Role.DETERMINISTIC, tuple(p.inputs[0] for p in producers))
         return ActionMeaning(Role.DETERMINISTIC)
     if all(p.op == "Log" or p.op == "LogSoftmax" for p in producers):
@@ -45,6 +48,34 @@ def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: boo
     if has_masks:
         return ActionMeaning(Role.LOG_PROBS, tuple(leaves))
     return ActionMeaning(Role.CONTINUOUS)
+
+
+def _without_gumbel(graph: Graph, scores: str) -> str | None:
+    """The logits, where ``scores`` are logits − log(−log(u)) of a uniform u: their argmax is a draw (OpenAI Baselines,
+    CategoricalPd.sample). None where they are not.
+    """
+    node = graph.producer(scores)
+    if node.op == "Sub":
+        pairs = [(node.inputs[0], node.inputs[1])]
+    elif node.op == "Add":
+        pairs = [
+            (logits, graph.producer(noise).inputs[0])
+            for logits, noise in (node.inputs, node.inputs[::-1])
+            if graph.producer(noise).op == "Neg"
+        ]
+    else:
+        return None
+    return next((logits for logits, noise in pairs if _is_gumbel(graph, noise)), None)
+
+
+def _is_gumbel(graph: Graph, reference: str) -> bool:
+    """Whether a tensor is log(−log(u)), u drawn from 0 to 1."""
+    for op in ("Log", "Neg", "Log"):
+        node = graph.producer(reference)
+        if node.op != op:
+            return False
+        reference = node.inputs[0]
+    return traits(graph.producer(reference)).sampler == "uniform"
 
 
 def _leaves(graph: Graph, reference: str) -> list[str]:

@@ -1,0 +1,105 @@
+"""Actions that are drawn in ways of their own: what has no chance in it, or a refusal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from converters.graph.compile import compile_graph
+from converters.graph.nodes import Graph, Node
+from converters.graph.options import CompileOptions
+from converters.graph.run import run_graph
+from converters.policy import Policy
+from signatures.errors import SignatureError
+from signatures.roles import Role
+from tests.graph.making import const, graph, node, placeholder
+
+STATE = np.array([[0.5, -1.0, 2.0], [0.1, 0.2, -0.3]], np.float32)
+OBSERVATION = placeholder("vector_observation", (None, 3))
+
+
+def drawn(sampler: str) -> list[Node]:
+    """``draw``, of the observation's shape."""
+    return [OBSERVATION, node("shape", "Shape", OBSERVATION.name), node("draw", sampler, "shape", dtype=np.dtype("f4"))]
+
+
+def compiled(made: Graph, **options: object) -> Policy:
+    (policy,) = compile_graph(made, "p", CompileOptions(**options))  # type: ignore[arg-type]
+    return policy
+
+
+def run(policy: Policy, *outputs: str) -> list[np.ndarray]:
+    feeds = {s.name: STATE if s.name == "state" else np.ones_like(STATE) for s in policy.signature.inputs}
+    results = run_graph(policy.graph, feeds, outputs)
+    return [results[name] for name in outputs]
+
+
+@pytest.mark.parametrize("sampler", ["RandomStandardNormal", "TruncatedNormal"])
+@pytest.mark.parametrize("noise", ["lift", "keep", "zero"])
+def test_the_middle_of_a_normal_is_the_action_without_chance(sampler: str, noise: str) -> None:
+    made = graph(*drawn(sampler), node("action", "Add", OBSERVATION.name, "draw"))
+    policy = compiled(made, noise=noise)
+    np.testing.assert_array_equal(run(policy, "deterministic_action")[0], STATE)
+    deterministic = compiled(made, deterministic=True)
+    np.testing.assert_array_equal(run(deterministic, "action")[0], STATE)
+
+
+def test_a_uniform_draw_has_no_middle_that_is_no_chance() -> None:
+    made = graph(*drawn("RandomUniform"), node("action", "Add", OBSERVATION.name, "draw"))
+    with pytest.raises(SignatureError, match=r"deterministic_action .*'draw' \(RandomUniform\)"):
+        compiled(made)
+
+
+def test_the_tensor_before_the_draw_can_be_the_action() -> None:
+    made = graph(*drawn("RandomUniform"), node("mean", "Tanh", OBSERVATION.name), node("action", "Add", "mean", "draw"))
+    policy = compiled(made, outputs={"mean": Role.ACTION})
+    np.testing.assert_allclose(run(policy, "action")[0], np.tanh(STATE), rtol=1e-6)
+
+
+def test_a_tensor_that_is_said_to_be_without_chance_and_is_drawn_is_refused() -> None:
+    made = graph(
+        *drawn("RandomUniform"),
+        node("deterministic_action", "Add", OBSERVATION.name, "draw"),
+        node("action", "Tanh", "deterministic_action"),
+    )
+    with pytest.raises(SignatureError, match="another one in every run"):
+        compiled(made)
+
+
+def test_an_argmax_of_drawn_scores_is_no_action_without_chance() -> None:
+    made = graph(
+        *drawn("RandomUniform"),
+        node("noisy", "Mul", OBSERVATION.name, "draw"),
+        const("axis", 1),
+        node("action", "ArgMax", "noisy", "axis"),
+    )
+    with pytest.raises(SignatureError, match="another one in every run"):
+        compiled(made)
+
+
+@pytest.mark.parametrize("form", ["Sub", "Add"])
+def test_a_gumbel_draw_is_a_draw(form: str) -> None:
+    """OpenAI Baselines draws so: argmax(logits − log(−log(u)))."""
+    tail = [node("gumbel", "Neg", "outer")] if form == "Add" else []
+    made = graph(
+        *drawn("RandomUniform"),
+        node("inner", "Log", "draw"),
+        node("negative", "Neg", "inner"),
+        node("outer", "Log", "negative"),
+        *tail,
+        node("scores", form, OBSERVATION.name, tail[0].name if tail else "outer"),
+        const("axis", 1),
+        node("action", "ArgMax", "scores", "axis"),
+    )
+    policy = compiled(made)
+    roles = {s.name: s.role for s in policy.signature.outputs}
+    assert roles == {
+        "action": Role.SAMPLED, "deterministic_action": Role.DETERMINISTIC, "action_log_probs": Role.LOG_PROBS,
+    }  # fmt: skip
+    best, scores = run(policy, "deterministic_action", "action_log_probs")
+    np.testing.assert_array_equal(best, STATE.argmax(axis=1)[:, None])
+    np.testing.assert_allclose(np.exp(scores).sum(axis=1), 1, rtol=1e-6)
+    assert policy.signature.branches == (3,)
+    draws = np.concatenate([run(policy, "action")[0][:1] for _ in range(400)])
+    frequencies = np.bincount(draws, minlength=3) / len(draws)
+    np.testing.assert_allclose(frequencies, np.exp(scores[0]), atol=0.11)

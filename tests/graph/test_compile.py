@@ -1,0 +1,89 @@
+"""The compiler's passes in their order: each finds what it requires, and leaves what it ensures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from converters.graph.compilation import Compilation, Condition
+from converters.graph.compile import PASSES, compilations, compile_graph
+from converters.graph.nodes import Graph, Node
+from converters.graph.options import CompileOptions
+from converters.graph.passes import conditions as has
+from converters.understand.facts import SourceFacts
+from exporter.export.sources import read_source
+from fixtures import FIXTURES
+from fixtures import path as fixture
+from signatures.roles import Role
+from tests.graph.making import const, graph, node, placeholder
+
+OPTIONS = {
+    "as it is": CompileOptions(),
+    "noise kept": CompileOptions(noise="keep"),
+    "noise zero": CompileOptions(noise="zero"),
+    "deterministic": CompileOptions(deterministic=True),
+    "the trainer's names": CompileOptions(names="source"),
+}
+
+
+def contradictions(place: str, conditions: tuple[Condition, ...], c: Compilation) -> list[str]:
+    found = ((condition.__name__, condition(c)) for condition in conditions)
+    return [f"{place} {name}: {what}" for name, what in found if what is not None]
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+@pytest.mark.parametrize("name", FIXTURES)
+def test_every_pass_keeps_its_word(name: str, options: CompileOptions) -> None:
+    for source in read_source(fixture(name)).models:
+        for _, c in compilations(source.graph, options, source.facts):
+            for step in PASSES:
+                assert contradictions(f"before {step.name}:", step.requires, c) == []
+                c = step.run(c)
+                assert contradictions(f"after {step.name}:", step.ensures, c) == []
+
+
+def test_what_a_pass_requires_an_earlier_one_ensures() -> None:
+    ensured: set[Condition] = {has.pinned_outputs}
+    for step in PASSES:
+        assert set(step.requires) <= ensured, step.name
+        ensured |= set(step.ensures)
+
+
+def test_every_condition_can_be_contradicted() -> None:
+    """A condition that always holds would hold nothing."""
+    nodes = (
+        placeholder("state", (None, 2)),
+        Node("loop", "Enter", ("state",)),
+        Node("new", "SelectV2"),
+        const("one", np.ones(2, np.float32)),
+        node("two", "Neg", "one"),
+        node("same", "Identity", "state"),
+        node("shape", "Shape", "state"),
+        node("draw", "RandomStandardNormal", "shape", dtype="float32", seed=3),
+        node("action", "Add", "same", "draw"),
+    )
+    (c,) = (c for _, c in compilations(graph(*nodes[:1], *nodes[3:]), CompileOptions(), SourceFacts()))
+    assert has.constants_folded(replace(c, graph=graph(*nodes[:1], *nodes[3:])))
+    broken = replace(c, graph=Graph(nodes), fetches={"action": "action", "deterministic_action": "draw"})
+    broken = replace(broken, roles={"state": Role.SEQUENCE_LENGTH}, feeds={"other": "state"})
+    for name in (
+        "settled_inputs", "one_spelling", "no_control_flow", "no_identities", "no_dead_nodes", "meanings",
+        "noise_as_asked", "no_seeds", "actions_without_chance", "signature", "names_of_the_signature",
+    ):  # fmt: skip
+        assert getattr(has, name)(broken) is not None, name
+    assert has.pinned_outputs(replace(c, fetches={"action": "gone"})) is not None
+
+
+def test_brains_are_compiled_one_by_one() -> None:
+    nodes = [
+        made
+        for scope in ("A/", "B/")
+        for made in (
+            placeholder(f"{scope}vector_observation", (None, 2)),
+            node(f"{scope}action", "Tanh", f"{scope}vector_observation"),
+        )
+    ]
+    assert [p.name for p in compile_graph(graph(*nodes), "p")] == ["p-A", "p-B"]
+    assert [p.name for p in compile_graph(graph(*nodes), "p", CompileOptions(brain="B"))] == ["p-B"]
