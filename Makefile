@@ -6,11 +6,12 @@ STAMP := $(VENV)/.installed
 JS := converters/runtimes/javascript/js
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: install browser demo test lint types docs figures bench train clean help
+.PHONY: install browser demo check test lint types docs figures bench train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
 	@echo "make demo      two trained policies in four formats, compared in every runtime, with a report to look at"
+	@echo "make check     lint, types and the tests that start no runtime: two minutes, for the daily loop"
 	@echo "make test      lint, types and all tests (installs Chromium where apt-get can, for those in a browser)"
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes)"
@@ -52,6 +53,9 @@ lint: install
 
 types: install
 	$(BIN)/mypy
+
+check: lint types
+	$(PYTEST) -n 2 --dist worksteal -q -m "not (runtimes or slow or corpus or legacy or browser or peers)"
 
 test: install browser lint types
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90

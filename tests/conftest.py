@@ -6,6 +6,7 @@ Every policy.json and parity.json that a test in this process writes is held aga
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,15 +22,38 @@ NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm
 settings.register_profile("busy", deadline=None)
 settings.load_profile("busy")
 
+#: Rooms whose tests start runtimes, browsers, servers or the program; and what tests of other rooms then ask for.
+_ROOMS = frozenset(
+    (
+        *("acting", "bench", "browser", "chains", "corpus", "docs", "faults", "install", "legacy", "live", "peers"),
+        *("runner", "serve", "trained"),
+    )
+)
+_FIXTURE = "processes"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what ``make check`` leaves out."""
+    for item in items:
+        rooms = set(item.path.relative_to(Path(__file__).parent).parts)
+        if rooms & _ROOMS or _FIXTURE in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.runtimes)
+
 
 @pytest.fixture(scope="session")
-def pool() -> Iterator[RuntimePool]:
-    """A pool in which all of NEEDED can be started; skips, with how to install it, where one is not there."""
+def processes() -> Iterator[RuntimePool]:
+    """The runtimes' processes: each is started when a test first asks for it, and only once per session."""
+    with RuntimePool() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="session")
+def pool(processes: RuntimePool) -> RuntimePool:
+    """The pool, where all of NEEDED can be started; skips, with how to install it, where one is not there."""
     missing = [i for i in available_runtimes() if i.name in NEEDED and not i.installed]
     if missing:
         pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
-    with RuntimePool() as opened:
-        yield opened
+    return processes
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -69,6 +69,15 @@ class _Candidate:
     #: outputs that export-model made for the reference, and that this one has none of
     spared: tuple[str, ...] = ()
 
+    def fed(self, feeds: Feeds) -> dict[str, np.ndarray]:
+        """What it is fed, by its own names, for the reference's inputs."""
+        rows = next((len(a) for a in feeds.values() if a.ndim), 1)
+        given = {p.name: _cast(feeds[name], p.dtype) for name, p in self.inputs.items()}
+        ranks = {p.name: len(p.shape or ()) for p in self.ports.inputs}
+        for name, value in self.constant.items():
+            given[name] = np.full([1] * ranks[name], rows, np.int32) if value is None else np.asarray(value)
+        return given
+
     @property
     def missing(self) -> list[str]:
         """Outputs of the reference that it has no name for."""
@@ -352,9 +361,16 @@ def _participants(
         for problem in candidate.problems:
             failure(candidate.label, runtime, RunFailedError(problem.text + hints.get(problem.name, "")), problem.name)
         if candidate.outputs and not blocked:
-            run = _renamed(model, candidate)
             yield Participant(
-                candidate.format.key, runtime, run, list(candidate.outputs), model, candidate.label, candidate.drawn
+                ":".join((candidate.format.key, *filter(None, [candidate.ports.options.get("signature")]))),
+                runtime,
+                _renamed(model, candidate),
+                list(candidate.outputs),
+                model,
+                candidate.label,
+                candidate.drawn,
+                candidate.ports.path,
+                candidate.fed,
             )
         unload(model)
 
@@ -386,12 +402,7 @@ def _renamed(model: LoadedModel, candidate: _Candidate) -> Callable[[Feeds, Sequ
     """A run under canonical names."""
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
-        rows = next((len(a) for a in feeds.values() if a.ndim), 1)
-        given = {p.name: _cast(feeds[name], p.dtype) for name, p in candidate.inputs.items()}
-        ranks = {p.name: len(p.shape or ()) for p in candidate.ports.inputs}
-        for name, value in candidate.constant.items():
-            given[name] = np.full([1] * ranks[name], rows, np.int32) if value is None else np.asarray(value)
-        answers = model.run(given, [candidate.outputs[n] for n in fetch])
+        answers = model.run(candidate.fed(feeds), [candidate.outputs[n] for n in fetch])
         return {n: answers[candidate.outputs[n]] for n in fetch}
 
     return run

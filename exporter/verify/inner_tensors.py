@@ -37,6 +37,8 @@ class InnerTensors:
 
     view: Callable[[str], View | None]
     run: Run
+    #: Another tool may have made it: what has a tensor's name may be another tensor.
+    foreign: bool = False
 
     def fetch(self, feeds: Feeds, tensors: Sequence[str]) -> dict[str, np.ndarray]:
         """Tensors of the graph by name, its own axes; raises RunFailedError."""
@@ -45,8 +47,29 @@ class InnerTensors:
         return {tensor: view.restored(values[view.name]) for tensor, view in views.items()}
 
 
-def inner_tensors(participant: Participant, path: Path, pool: RuntimePool) -> AbstractContextManager[InnerTensors]:
-    """Those of ``participant``, whose file is ``path``. To enter it raises RunFailedError where it is not loaded."""
+@contextmanager
+def inner_tensors(
+    participant: Participant, path: Path, pool: RuntimePool, origins: Mapping[str, str] | None = None
+) -> Iterator[InnerTensors]:
+    """Those of ``participant``, whose file is ``path``. To enter it raises RunFailedError where it is not loaded.
+
+    What any tool may have made is fed by its own names, and its tensors may be called as the source's (``origins``).
+    """
+    with _of_format(participant, path, pool) as found:
+        if participant.fed is None:
+            yield found
+            return
+        own, run, view, origins = participant.fed, found.run, found.view, origins or {}
+
+        def known(tensor: str) -> View | None:
+            source = origins.get(tensor, tensor)
+            names = (tensor, source, source.removesuffix(":0"), f"{source.removesuffix(':0')}:0")
+            return next((v for name in names if (v := view(name)) is not None), None)
+
+        yield InnerTensors(known, lambda feeds, fetch: run(own(feeds), fetch), foreign=True)
+
+
+def _of_format(participant: Participant, path: Path, pool: RuntimePool) -> AbstractContextManager[InnerTensors]:
     kind, _, key = participant.format.partition(":")
     if kind == "saved_model":
         return _saved_model(path, key or "serving_default", pool)

@@ -59,6 +59,8 @@ class Participant:
     drawn: frozenset[str] = frozenset()
     #: what the loader was given; None where there is nothing to look into when it fails
     path: Path | None = None
+    #: what the model itself is fed, where any tool may have made it: its own names for the policy's inputs
+    fed: Callable[[Feeds], Feeds] | None = None
 
     @property
     def name(self) -> str:
@@ -67,7 +69,7 @@ class Participant:
 
 
 def needed_runtimes(tested: PolicyUnderTest, runtimes: Sequence[str]) -> list[str]:
-    """Those of ``runtimes`` that run something of this tested, the reference's first."""
+    """Those of ``runtimes`` that run something of this policy, the reference's first."""
     source = () if tested.source is None else (tested.source.runtime,)
     useful = ["numpy", *source, *(r for kind in tested.artefacts for r in WRITTEN[kind].runtimes)]
     return [r for r in dict.fromkeys(useful) if r == "numpy" or r in runtimes]

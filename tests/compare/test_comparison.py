@@ -12,6 +12,9 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
+from converters import schema
+from converters.formats import WRITTEN
+from converters.frozen_graph.tensors import from_array, to_array
 from converters.runtimes.pool import RuntimePool
 from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportOptions, export
@@ -88,6 +91,33 @@ def test_last_weeks_bundle_against_todays(bundles: Bundles, tmp_path: Path, pool
     report = compare_artefacts(old, [new], runtimes=RUNTIMES, pool=pool)
     assert report.passed is False
     assert {(c.format, c.runtime) for c in report.failures} == {("onnx", "onnxruntime")}
+    begins = report.failures[0].bisection
+    assert begins is not None
+    assert (begins.op, begins.index) == ("Const", (0, 0))
+    assert begins.tensor in {t.name for t in onnx.load(new / "continuous.onnx").graph.initializer}
+
+
+@pytest.mark.parametrize("kind", ["bytes", "onnx", "saved_model", "tfjs"])
+def test_the_first_tensor_that_differs_is_named_in_every_format(
+    kind: str, bundles: Bundles, tmp_path: Path, pool: RuntimePool
+) -> None:
+    """The candidate's kernel of the first layer is another one; its outputs alone would not say so."""
+    source = tmp_path / "source.bytes"
+    graph = schema.parse(schema.GraphDef, fixture("continuous").read_bytes(), "GraphDef")
+    kernel = next(n for n in graph.node if n.op == "Const" and len(n.attr["value"].tensor.tensor_shape.dim) == 2)
+    values = to_array(kernel.attr["value"].tensor).copy()
+    values[1, 2] += 0.25
+    kernel.attr["value"].tensor.CopyFrom(from_array(values))
+    source.write_bytes(schema.serialise(graph))
+    (result,) = export([source], ExportOptions(tmp_path / "out", verify="none"))
+    reference = bundles("continuous")
+    candidate = result.folder / WRITTEN[kind].main_of(result.policy.name)
+    report = compare_artefacts(reference, [candidate], runtimes=RUNTIMES, pool=pool)
+    assert report.passed is False
+    for failure in report.failures:
+        assert failure.bisection is not None, failure
+        assert failure.bisection.tensor is not None, failure.bisection
+        assert failure.bisection.op in ("Const", "MatMul", "BiasAdd"), failure.bisection
 
 
 def test_candidates_of_one_format_are_told_apart(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:

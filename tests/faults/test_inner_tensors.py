@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("runtimes"), pytest.mark
 HIDDEN = {"MatMul", "BiasAdd", "Conv2D", "Const"}
 
 
-def tested_in(folder: object, monkeypatch: pytest.MonkeyPatch) -> PolicyUnderTest:
+def policy_under_test(folder: object, monkeypatch: pytest.MonkeyPatch) -> PolicyUnderTest:
     """What a verification of the bundle is about."""
     caught: list[PolicyUnderTest] = []
 
@@ -44,7 +44,7 @@ def tested_in(folder: object, monkeypatch: pytest.MonkeyPatch) -> PolicyUnderTes
 def test_every_tensor_that_a_format_has_is_the_graphs(
     name: str, bundle: Bundle, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tested = tested_in(bundle(name).folder, monkeypatch)
+    tested = policy_under_test(bundle(name).folder, monkeypatch)
     graph = plain(tested.graph)
     case = draw_cases(tested.signature, seed=3, samples=1)[1]
     read = outputs_read([n.name for n in graph.nodes], [r for n in graph.nodes for r in n.inputs])
@@ -74,7 +74,7 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
 
 
 def test_a_saved_model_has_the_same_graph_as_the_bytes(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    tested = tested_in(bundle("recurrent").folder, monkeypatch)
+    tested = policy_under_test(bundle("recurrent").folder, monkeypatch)
     ours, other = plain(tested.graph), plain(saved_graph(tested.artefacts["saved_model"]))
     assert [(n.name, n.op, n.inputs) for n in ours.nodes] == [(n.name, n.op, n.inputs) for n in other.nodes]
     assert all(

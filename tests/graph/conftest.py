@@ -1,8 +1,6 @@
-"""The runtimes' processes, started once per session."""
+"""Where models are run and written."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import pytest
 
@@ -11,6 +9,5 @@ from tests.graph.harness import Runtimes
 
 
 @pytest.fixture(scope="session")
-def runtimes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtimes]:
-    with RuntimePool() as pool:
-        yield Runtimes(pool, tmp_path_factory.mktemp("models"))
+def runtimes(processes: RuntimePool, tmp_path_factory: pytest.TempPathFactory) -> Runtimes:
+    return Runtimes(processes, tmp_path_factory.mktemp("models"))

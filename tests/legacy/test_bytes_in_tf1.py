@@ -6,7 +6,6 @@ and draws. The reference is numpy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +40,9 @@ def legacy(request: pytest.FixtureRequest) -> str:
     return ensure(request.param)
 
 
-@pytest.fixture(scope="module")
-def pool() -> Iterator[RuntimePool]:
-    with RuntimePool() as opened:
-        yield opened
+@pytest.fixture(scope="session")
+def pool(processes: RuntimePool) -> RuntimePool:
+    return processes
 
 
 def exported(source: Path, out: Path, **options: Any) -> list[ExportResult]:

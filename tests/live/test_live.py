@@ -50,17 +50,16 @@ def arrays(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
 
 
 def answers(
-    bundle: Path, feeds: dict[str, np.ndarray], wanted: list[str]
+    pool: RuntimePool, bundle: Path, feeds: dict[str, np.ndarray], wanted: list[str]
 ) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Every format's answer: ONNX by onnxruntime, the others by TensorFlow, in processes of their own."""
+    """Every format's answer: ONNX by onnxruntime, the others by TensorFlow."""
     name = json.loads((bundle / "policy.json").read_text())["name"]
-    with RuntimePool() as pool:
-        onnx = pool.process("onnxruntime").load(str(bundle / f"{name}.onnx"))
-        yield "onnx", onnx.run(feeds, wanted)
-        graph = pool.process("tensorflow").load(str(bundle / f"{name}.bytes"), kind="graph")
-        yield "bytes", graph.run(feeds, wanted)
-        saved = pool.process("tensorflow").load(str(bundle / "saved_model"), kind="saved_model")
-        yield "saved_model", saved.run(feeds, wanted)
+    onnx = pool.process("onnxruntime").load(str(bundle / f"{name}.onnx"))
+    yield "onnx", onnx.run(feeds, wanted)
+    graph = pool.process("tensorflow").load(str(bundle / f"{name}.bytes"), kind="graph")
+    yield "bytes", graph.run(feeds, wanted)
+    saved = pool.process("tensorflow").load(str(bundle / "saved_model"), kind="saved_model")
+    yield "saved_model", saved.run(feeds, wanted)
 
 
 def only(path: Path) -> Policy:
@@ -70,11 +69,11 @@ def only(path: Path) -> Policy:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_every_format_computes_what_tensorflow_did(trained: Trained, case: str) -> None:
+def test_every_format_computes_what_tensorflow_did(trained: Trained, case: str, processes: RuntimePool) -> None:
     name, _, _, _ = CASES[case]
     folder = trained(case)
     feeds, wanted = arrays(folder)
-    for kind, answer in answers(folder / "out" / name, feeds, list(wanted)):
+    for kind, answer in answers(processes, folder / "out" / name, feeds, list(wanted)):
         for output, value in wanted.items():
             np.testing.assert_allclose(answer[output], value, rtol=1e-5, atol=1e-6, err_msg=f"{kind}: {output}")
 

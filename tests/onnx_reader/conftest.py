@@ -1,8 +1,6 @@
-"""The runtimes' processes, started once per session."""
+"""Where models are run and written."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import pytest
 
@@ -11,8 +9,7 @@ from tests.onnx_reader.models import Bench
 
 
 @pytest.fixture(scope="session")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with RuntimePool() as pool:
-        opened = Bench(pool, tmp_path_factory.mktemp("onnx"))
-        opened.need("onnxruntime")
-        yield opened
+def bench(processes: RuntimePool, tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    opened = Bench(processes, tmp_path_factory.mktemp("onnx"))
+    opened.need("onnxruntime")
+    return opened

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +28,8 @@ CLOSE = Tolerance(5e-4, 1e-5)
 
 
 @pytest.fixture(scope="module", params=VERSIONS)
-def legacy(request: pytest.FixtureRequest) -> Iterator[RuntimeProcess]:
-    name = ensure(request.param)
-    with RuntimePool() as pool:
-        yield pool.process(name)
+def legacy(request: pytest.FixtureRequest, processes: RuntimePool) -> RuntimeProcess:
+    return processes.process(ensure(request.param))
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem[:80])

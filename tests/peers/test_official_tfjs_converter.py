@@ -7,7 +7,7 @@ The converter renames: where two outputs have the same dtype and shape, their ke
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peer
 
 
 @pytest.fixture(scope="module")
-def tfjs() -> Iterator[RuntimeProcess]:
+def tfjs(processes: RuntimePool) -> RuntimeProcess:
     info = next(i for i in available_runtimes() if i.name == "tfjs-cpu")
     if not info.installed:
         pytest.skip(f"TensorFlow.js is not installed: {info.how}")
-    with RuntimePool() as pool:
-        yield pool.process("tfjs-cpu")
+    return processes.process("tfjs-cpu")
 
 
 def convert(peers: Peers, bundle: ExportResult, out: Path, *options: str) -> dict[str, Any]:

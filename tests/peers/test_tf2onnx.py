@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +19,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peer
 
 
 @pytest.fixture(scope="module")
-def onnxruntime() -> Iterator[RuntimeProcess]:
+def onnxruntime(processes: RuntimePool) -> RuntimeProcess:
     info = next(i for i in available_runtimes() if i.name == "onnxruntime")
     if not info.installed:
         pytest.skip(f"onnxruntime is not installed: {info.how}")
-    with RuntimePool() as pool:
-        yield pool.process("onnxruntime")
+    return processes.process("onnxruntime")
 
 
 def by_tensor(model: LoadedModel) -> Run:

@@ -12,8 +12,8 @@ from typing import Any
 
 import onnx
 import pytest
-from converters.artifact import WriteOptions
 
+from converters.format import WriteOptions
 from converters.onnx.writer import write
 from converters.targets.unity.constructs import Model, constructs
 from converters.targets.unity.readings import IMPORTERS, MEASURED, Reading, misreadings
