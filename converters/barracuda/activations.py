@@ -32,12 +32,12 @@ _OPS = MappingProxyType(
         Activation.SIN: "Sin",
         Activation.TAN: "Tan",
         Activation.ERF: "Erf",
+        Activation.SOFTSIGN: "Softsign",
     }
 )
 _FUNCTIONS: MappingProxyType[int, Callable[[Builder, str], str]] = MappingProxyType(
     {
         Activation.SWISH: nn.swish,
-        Activation.SOFTSIGN: nn.softsign,
         Activation.ACOS: trigonometry.acos,
         Activation.ACOSH: trigonometry.acosh,
         Activation.ASIN: trigonometry.asin,

@@ -7,6 +7,7 @@ TensorFlow.js applies no defaults to some of them (``dilations``).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from signatures.errors import GraphError, UnsupportedOpError
 
 #: GraphDef version written: that of TF 1.4. (Graphs frozen by TF 1.x carry none, which TensorFlow.js cannot read.)
 PRODUCER = 24
+_RESOURCE = 20
 
 
 def encode(graph: Graph, *, explicit: bool = False) -> Any:
@@ -49,7 +51,7 @@ def encode(graph: Graph, *, explicit: bool = False) -> Any:
             if value is _OMIT or (not explicit and attr.since is not None and value == attr.default):
                 continue
             try:
-                _set(proto.attr[attr.name], attr, value)
+                _set(proto.attr[attr.name], attr.kind, value)
             except (AttributeError, TypeError, ValueError) as error:
                 raise GraphError(
                     f"node {node.name!r} ({node.op}) has {attr.name}={value!r}, which is no {attr.kind}",
@@ -73,25 +75,69 @@ def _value(node: Node, attr: Attr, types: Types) -> Any:
     return types[node.name].dtype
 
 
-def _set(proto: Any, attr: Attr, value: Any) -> None:
+def as_read(graph: Graph) -> Any:
+    """A GraphDef message of a graph that need not be compiled: nothing is asked of its ops, nothing is derived."""
+    message = schema.GraphDef()
+    message.versions.producer = PRODUCER
+    for node in graph.nodes:
+        proto = message.node.add(name=node.name, op=node.op)
+        proto.input.extend(node.inputs)
+        attrs = dict(node.attrs)
+        if node.value is not None:
+            attrs.update(dtype=node.value.dtype, value=node.value)
+        for key, value in sorted(attrs.items()):
+            kind = _kind(value)
+            if kind is not None:
+                _set(proto.attr[key], kind, value)
+    return message
+
+
+_PLAIN: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "int": ("i", int),
+    "float": ("f", float),
+    "bool": ("b", bool),
+    "str": ("s", lambda text: text if isinstance(text, bytes) else text.encode()),
+    "type": ("type", lambda dtype: schema.dtype_number(np.dtype(dtype))),
+    "resource": ("type", lambda dtype: _RESOURCE),
+}
+
+
+def _kind(value: Any) -> str | None:
+    """What a value is, where no entry of the op table says it; None: nothing that an attribute holds."""
+    if isinstance(value, tuple):
+        return _kind(value[0]) if value else "str"
+    if isinstance(value, np.dtype | type) and np.dtype(value).kind == "O":
+        return "resource"  # a resource or variant, which numpy has not
+    for kind, types in (
+        ("bool", bool),
+        ("int", int),
+        ("float", float),
+        ("str", (str, bytes)),
+        ("shape", TensorShape),
+        ("tensor", np.ndarray),
+        ("type", (np.dtype, type)),
+    ):
+        if isinstance(value, types):
+            return kind
+    return None
+
+
+def _set(proto: Any, kind: str, value: Any) -> None:
     if isinstance(value, tuple):
         proto.list.SetInParent()
-        if attr.kind == "int":
-            proto.list.i.extend(value)
-        else:
-            proto.list.s.extend(v.encode() for v in value)
-    elif attr.kind == "type":
-        proto.type = schema.dtype_number(np.dtype(value))
-    elif attr.kind == "int":
-        proto.i = int(value)
-    elif attr.kind == "float":
-        proto.f = float(value)
-    elif attr.kind == "bool":
-        proto.b = bool(value)
-    elif attr.kind == "str":
-        proto.s = value.encode()
-    else:
+        for item in value:
+            if kind == "shape":
+                _set_shape(proto.list.shape.add(), item)
+            else:
+                field, plain = _PLAIN[kind]
+                getattr(proto.list, field).append(plain(item))
+    elif kind == "shape":
         _set_shape(proto.shape, value)
+    elif kind == "tensor":
+        proto.tensor.CopyFrom(from_array(value))
+    else:
+        field, plain = _PLAIN[kind]
+        setattr(proto, field, plain(value))
 
 
 def _set_shape(proto: Any, value: TensorShape) -> None:

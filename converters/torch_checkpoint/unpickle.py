@@ -1,9 +1,11 @@
 """Pickles as data: a machine that knows plain containers and PyTorch's tensors, and calls nothing.
 
 A pickle is a program that may import and call anything, so the standard library's machine is not used: opcodes are
-taken apart by ``pickletools.genops`` (which runs nothing) and carried out here. The names that a pickle imports are
-looked up in a fixed table, whose entries make values of this module; any other name is refused by name. Opcodes:
-CPython Lib/pickletools.py; what torch.save writes: torch/serialization.py, torch/_utils.py, torch/storage.py.
+taken apart by ``pickletools.genops`` (which runs nothing) and carried out here. ``pickle.Unpickler`` with inert stubs
+in ``find_class`` would run nothing either, but it takes memory as the file says: four bytes of LONG_BINPUT make it
+allocate 32 GiB for its memo, a BYTEARRAY8 as many as it names, before anything of the file is read. The names that a
+pickle imports are looked up in a fixed table, whose entries make values of this module; any other name is refused by
+name. Opcodes: CPython Lib/pickletools.py; what torch.save writes: torch/serialization.py, torch/_utils.py.
 """
 
 from __future__ import annotations

@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters import schema
+from converters.frozen_graph.encode import as_read
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.tensorboard.events import FILE_NAME, event_file, graph_def
+from converters.tensorboard.events import FILE_NAME, event_file
 from exporter import export_model as export
 from exporter.export.sources import read_source
 from fixtures import path as fixture
@@ -131,7 +132,7 @@ ATTRIBUTE = (
 @given(st.dictionaries(st.text("abc_T", min_size=1, max_size=6).filter(lambda k: k[0] != "_"), ATTRIBUTE, max_size=5))
 def test_any_attribute_comes_back(attrs: dict[str, Any]) -> None:
     graph = Graph((Node("a/b", "Anything", (), attrs),))
-    data = schema.serialise(graph_def(graph))
+    data = schema.serialise(as_read(graph))
     assert read_graph(data)["a/b"].attrs == attrs
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from converters.graph.types import BATCH, Symbols
-from converters.onnx.importer.fixed_batch import FixedRows
+from converters.onnx.importer.fixed_batch import FixedBatch
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from tests.onnx_reader.models import Bench, floats, model, node
@@ -41,7 +41,7 @@ Shape = Sequence[int | str]
     ],
 )
 def test_where_the_batch_goes(rows: int, shape: Shape, target: Sequence[int], wanted: list[Any] | None) -> None:
-    found = FixedRows(rows, Symbols()).target(target, shape)
+    found = FixedBatch(rows, Symbols()).target(target, shape)
     if wanted is None:
         assert found is not None
         assert [isinstance(d, str) for d in found] == [True]  # joined with what stands beside it
@@ -50,7 +50,7 @@ def test_where_the_batch_goes(rows: int, shape: Shape, target: Sequence[int], wa
 
 
 def test_the_heads_of_an_attention_are_joined_to_the_batch_and_parted_again() -> None:
-    rows = FixedRows(1, Symbols())
+    rows = FixedBatch(1, Symbols())
     heads = rows.target([5, 2, 4], [5, BATCH, 8])
     assert heads is not None
     entities, joined, size = heads
@@ -64,7 +64,7 @@ def test_the_heads_of_an_attention_are_joined_to_the_batch_and_parted_again() ->
 
 
 def test_what_is_not_about_the_batch_is_left_alone() -> None:
-    rows = FixedRows(1, Symbols())
+    rows = FixedBatch(1, Symbols())
     assert rows.target([3, 4], [12]) is None
     assert rows.target([3, 4], [BATCH, 5]) is None
     assert rows.target([-1, 4], ["other", 8]) is None

@@ -115,8 +115,3 @@ def gelu(b: Builder, x: str, *, tanh: bool = False) -> str:
     else:
         bell = b.add("Erf", [b.add("Mul", [x, b.number(x, math.sqrt(0.5))])])
     return b.add("Mul", [half, b.add("Add", [bell, b.number(x, 1)])])
-
-
-def softsign(b: Builder, x: str) -> str:
-    """X / (1 + |x|); TensorFlow has an op for it, TensorFlow.js has not."""
-    return b.add("RealDiv", [x, b.add("Add", [b.add("Abs", [x]), b.number(x, 1)])])

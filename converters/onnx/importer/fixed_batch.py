@@ -21,7 +21,7 @@ class Axis:
     before: int = 1
 
 
-class FixedRows:
+class FixedBatch:
     """What the free axes of a model stand for: the batch, and those it was joined to (the heads of an attention)."""
 
     def __init__(self, batch: int, symbols: Symbols) -> None:

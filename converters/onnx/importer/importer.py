@@ -12,7 +12,7 @@ import numpy as np
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, TensorType
-from converters.onnx.importer.fixed_batch import FixedRows
+from converters.onnx.importer.fixed_batch import FixedBatch
 from converters.onnx.importer.node import STANDARD, Op, Translate
 from converters.onnx.proto import array_of, attribute_of
 from signatures.errors import DamagedFileError, UnsupportedOpError
@@ -49,7 +49,7 @@ class Importer(Builder):
         self.table = table
         self.opsets = opsets
         self.batch = batch
-        self.fixed = None if batch is None else FixedRows(batch, self.symbols)
+        self.fixed = None if batch is None else FixedBatch(batch, self.symbols)
         #: ONNX value → tensor
         self.values: dict[str, str] = {}
         #: ONNX value → why it could not be made

@@ -27,7 +27,6 @@ PLAIN: dict[Callable[..., str], Callable[[Array], Array]] = {
     nn.hard_swish: lambda x: x * np.clip(x / 6 + 0.5, 0, 1),
     nn.mish: lambda x: x * np.tanh(np.log1p(np.exp(x))),
     nn.gelu: lambda x: x * (1 + _erf(x / math.sqrt(2))) / 2,
-    nn.softsign: lambda x: x / (1 + abs(x)),
     nn.elu: lambda x: np.where(x < 0, np.expm1(x), x),
     nn.selu: lambda x: 1.0507009873554805 * np.where(x < 0, 1.6732632423543772 * np.expm1(x), x),
     trigonometry.sinh: np.sinh,
