@@ -7,7 +7,7 @@ that the list of formats (converters/formats.py) costs nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -105,6 +105,9 @@ class Format:
       ``takes`` are the options that mean something to it: ``step``, ``sensors``.
     - ``write`` gives the files of an artefact by their path in the bundle; ``main`` is the one that a loader is given,
       with ``{name}`` for the policy's name. A ``default`` is written unless ``--to`` says otherwise.
+    - ``vetted`` copies an artefact that anyone may have made to an empty folder, as far as a runtime may be given it:
+      what the wanted nodes (of a graph that any node can be asked of) or signatures need, no op that does more than
+      compute, no file from elsewhere.
     - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
       once; ``dtypes`` are the only ones that it has (empty: all).
@@ -123,6 +126,7 @@ class Format:
     main: str = ""
     default: bool = False
     ports: Callable[[Path], Ports] | None = None
+    vetted: Callable[[Path, Sequence[str], Path], Path] | None = None
     runtimes: tuple[str, ...] = ()
     signatures: bool = False
     predicts: bool = False

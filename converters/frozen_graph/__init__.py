@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,12 @@ def _ports(path: Path) -> Ports:
     return ports(path)
 
 
+def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    from converters.frozen_graph.vetted import vetted
+
+    return vetted(path, wanted, folder)
+
+
 FORMATS = (
     Format(
         key="bytes",
@@ -42,6 +48,7 @@ FORMATS = (
         main="{name}.bytes",
         default=True,
         ports=_ports,
+        vetted=_vetted,
         runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
     ),
 )

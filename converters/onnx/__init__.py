@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,12 @@ def _ports(path: Path) -> Ports:
     return ports(path)
 
 
+def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    from converters.onnx.vetted import vetted
+
+    return vetted(path, wanted, folder)
+
+
 FORMATS = (
     Format(
         key="onnx",
@@ -48,6 +54,7 @@ FORMATS = (
         main="{name}.onnx",
         default=True,
         ports=_ports,
+        vetted=_vetted,
         runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium"),
     ),
 )

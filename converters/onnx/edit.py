@@ -7,23 +7,10 @@ not depend on is taken out, so that inputs which only training needs do not have
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from pathlib import Path
 from typing import Any
-
-from converters.fetch import read_bytes
-from converters.onnx.proto import load_external
 
 _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
 _NORMAL = ("RandomNormal", "RandomNormalLike")
-
-
-def load(path: Path) -> Any:
-    """The ModelProto with the data of all its files."""
-    import onnx
-
-    model = onnx.ModelProto.FromString(read_bytes(path))
-    load_external(model.graph, path.parent)
-    return model
 
 
 def lifted(model: Any, draws: Collection[str]) -> Any:

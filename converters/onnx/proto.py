@@ -7,7 +7,7 @@ data is read from the model's own folder only.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -113,17 +113,28 @@ def _is_set(attribute: Any, field: str) -> bool:
 
 
 def tensors(graph: Any) -> Iterator[Any]:
-    """Every TensorProto of a graph: initializers, constants, and those of its subgraphs."""
-    yield from graph.initializer
+    """Every TensorProto of a graph or function: initializers, constants, and those of its subgraphs."""
+    if hasattr(graph, "initializer"):
+        yield from graph.initializer
+        yield from _dense(graph.sparse_initializer)
     for node in graph.node:
         for attribute in node.attribute:
             if attribute.HasField("t"):
                 yield attribute.t
+            if attribute.HasField("sparse_tensor"):
+                yield from _dense([attribute.sparse_tensor])
             yield from attribute.tensors
+            yield from _dense(attribute.sparse_tensors)
             if attribute.HasField("g"):
                 yield from tensors(attribute.g)
             for inner in attribute.graphs:
                 yield from tensors(inner)
+
+
+def _dense(sparse: Iterable[Any]) -> Iterator[Any]:
+    """The tensors that sparse ones are made of."""
+    for tensor in sparse:
+        yield from (tensor.values, tensor.indices)
 
 
 def load_external(graph: Any, folder: Path) -> list[Path]:

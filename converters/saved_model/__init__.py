@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,6 +40,12 @@ def _ports(path: Path) -> Ports:
     return ports(path)
 
 
+def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    from converters.saved_model.vetted import vetted
+
+    return vetted(path, wanted, folder)
+
+
 FORMATS = (
     Format(
         key="saved_model",
@@ -51,6 +57,7 @@ FORMATS = (
         main="saved_model",
         default=True,
         ports=_ports,
+        vetted=_vetted,
         runtimes=("tensorflow",),
         signatures=True,
     ),

@@ -35,14 +35,18 @@ class Saved:
     restore: str = ""
 
 
-def read_saved_model(data: bytes) -> Saved:
-    """The MetaGraph that is tagged for serving (else the first). Raises DamagedFileError, NotAPolicyError."""
+def read_saved_model(data: bytes, key: str | None = None) -> Saved:
+    """The MetaGraph that is tagged for serving (else the first), and its signature ``key``.
+
+    Without a key it is ``serving_default``, else the first. Raises DamagedFileError, NotAPolicyError.
+    """
     message = schema.parse(schema.SavedModel, data, "SavedModel")
     if not message.meta_graphs:
         raise NotAPolicyError("the SavedModel has no graph", fix="save the model again")
     meta = next((m for m in message.meta_graphs if "serve" in m.meta_info_def.tags), message.meta_graphs[0])
     keys = tuple(sorted(k for k, s in meta.signature_def.items() if s.outputs and not k.startswith(_INIT)))
-    key = SERVING if SERVING in keys else next(iter(keys), None)
+    if key not in keys:
+        key = SERVING if SERVING in keys else next(iter(keys), None)
     signature = ModelSignature()
     if key is not None:
         definition = meta.signature_def[key]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from converters.bundle.source import facts_of, recalled
 from converters.checkpoint.definition import with_values
@@ -10,7 +12,7 @@ from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
 from converters.fetch import Fetched
-from converters.graph.nodes import node_of
+from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
 from converters.saved_model.signature import ModelSignature, expose, fed_by_signature
@@ -27,19 +29,37 @@ def read(given: Fetched) -> list[SourceModel]:
     folder = path if path.is_dir() else path.parent
     file = folder / FILE if path.is_dir() else path
     saved = read_saved_model(given.bytes_of(file))
+    frozen = frozen_model(saved, folder)
+    graph, contract = recalled(frozen.graph)
+    facts = facts_of(graph, contract)
+    if contract is None:
+        graph, roles = expose(frozen.graph, frozen.signature)
+        facts = SourceFacts(roles=roles, notes=_notes(saved))
+    original = OriginalRun("tensorflow", folder, definition=frozen.definition)
+    return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
+
+
+@dataclass(frozen=True)
+class FrozenModel:
+    """A SavedModel without functions and variables: its graph, its definition, its signature on these.
+
+    ``files`` are those that the variables' values were read from.
+    """
+
+    graph: Graph
+    definition: Any
+    signature: ModelSignature
+    files: tuple[Path, ...]
+
+
+def frozen_model(saved: Saved, folder: Path) -> FrozenModel:
+    """What a signature computes, flat and frozen. Raises NotAPolicyError, DamagedFileError, GraphError."""
     prefix = folder / "variables" / "variables"
     checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
     training, signature = _inlined(saved) if saved.calls else (training_graph(saved.graph_def), saved.signature)
     frozen = freeze(training, checkpoint, signature.roots or None)
-    graph, contract = recalled(frozen.graph)
-    facts = facts_of(graph, contract)
-    if contract is None:
-        graph, roles = expose(frozen.graph, signature)
-        facts = SourceFacts(roles=roles, notes=_notes(saved))
-    files = (file, *(() if checkpoint is None else checkpoint.files))
     definition = fed_by_signature(with_values(training.definition, frozen.values), signature)
-    original = OriginalRun("tensorflow", folder, definition=definition)
-    return [SourceModel(graph, files, facts, None if contract is None else contract.name, original)]
+    return FrozenModel(frozen.graph, definition, signature, () if checkpoint is None else checkpoint.files)
 
 
 def _inlined(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:

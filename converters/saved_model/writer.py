@@ -22,7 +22,7 @@ from signatures.spec import TensorSpec
 
 PATH = "saved_model/saved_model.pb"
 SERVING, DETERMINISTIC = "serving_default", "deterministic"
-_METHOD = "tensorflow/serving/predict"
+METHOD = "tensorflow/serving/predict"
 
 
 def signatures_of(policy: Policy) -> dict[str, tuple[list[TensorSpec], list[TensorSpec]]]:
@@ -60,7 +60,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     meta.graph_def.CopyFrom(encode(with_contract(policy.graph, options.contract)))
     for key, (inputs, outputs) in signatures_of(policy).items():
         definition = meta.signature_def[key]
-        definition.method_name = _METHOD
+        definition.method_name = METHOD
         _fill(definition.inputs, inputs)
         _fill(definition.outputs, outputs)
     return {PATH: schema.serialise(message)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,12 @@ def _ports(path: Path) -> Ports:
     return ports(path)
 
 
+def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    from converters.tfjs.vetted import vetted
+
+    return vetted(path, wanted, folder)
+
+
 FORMATS = (
     Format(
         key="tfjs",
@@ -43,6 +49,7 @@ FORMATS = (
         main="tfjs",
         default=True,
         ports=_ports,
+        vetted=_vetted,
         runtimes=(
             *("tfjs-cpu", "tfjs-wasm", "tfjs-webgl"),
             *("tfjs-cpu@chromium", "tfjs-wasm@chromium"),

@@ -120,7 +120,7 @@ def _weights(
     found: dict[str, np.ndarray] = {}
     files: list[Path] = []
     for group in manifest:
-        paths = [_shard(folder, name) for name in group["paths"]]
+        paths = [shard(folder, name) for name in group["paths"]]
         files.extend(paths)
         data = b"".join(_bytes(given, p) for p in paths)
         at = 0
@@ -139,7 +139,7 @@ def _weights(
     return found, files
 
 
-def _shard(folder: Path, name: str) -> Path:
+def shard(folder: Path, name: str) -> Path:
     """A shard's path, which must stay inside the model's folder."""
     path = folder / name
     if not name or "://" in name or not path.resolve().is_relative_to(folder.resolve()):

@@ -1,8 +1,9 @@
 """``export-model compare``: artefacts that any tool made, held against a reference.
 
 The reference is read as a policy, so that it says what to draw for its inputs and which outputs are drawn. A candidate
-is not read, only fed: its names are taken from its file, matched with the reference's, and it is run as it lies there,
-in the runtimes of its format. What it lacks, has too much or calls otherwise is a failure that says what to map.
+is not read, only fed: its names are taken from its file, matched with the reference's, and it is run in the runtimes of
+its format, as far as a file that anyone may have made is given to one. What it lacks, has too much or calls otherwise
+is a failure that says what to map.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun, ReadOptions
 from exporter.export.bundle import POLICY, read_policy_json
-from exporter.export.sources import read_source
+from exporter.export.sources import naming, read_source
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, unload
@@ -117,6 +118,7 @@ def compare_artefacts(
     with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
         reference_file = Path(folder, "reference.bytes")
         reference_file.write_bytes(frozen(policy))
+        copies = [_vetted(m, Path(folder, str(number))) for number, m in enumerate(matched)]
         tested = PolicyUnderTest(
             policy.name,
             policy.signature,
@@ -129,8 +131,8 @@ def compare_artefacts(
         )
 
         def taking_part(numpy_model: LoadedModel, failure: Failure) -> Iterator[Participant]:
-            for candidate in matched:
-                yield from _participants(candidate, policy, numpy_model, used, pool, failure)
+            for candidate, copy in zip(matched, copies, strict=True):
+                yield from _participants(candidate, copy, policy, numpy_model, used, pool, failure)
 
         report = verify(tested, used, known, pool, options, progress, participants=taking_part)
     notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
@@ -339,8 +341,21 @@ def _constants(own: Ports, policy: Policy, taken: set[str]) -> tuple[dict[str, n
 # ---- running
 
 
+def _vetted(candidate: _Candidate, folder: Path) -> Path:
+    """A copy of the candidate as far as a runtime may be given it: anyone may have made it. Raises ExportModelError."""
+    found, ports = candidate.format, candidate.ports
+    folder.mkdir()
+    if found.vetted is None:
+        return ports.path
+    fed = [p.name for p in candidate.inputs.values()]
+    wanted = [str(ports.options["signature"])] if found.signatures else [*candidate.outputs.values(), *fed]
+    with naming(ports.path):
+        return found.vetted(ports.path, [*wanted, *candidate.constant], folder)
+
+
 def _participants(
     candidate: _Candidate,
+    path: Path,
     policy: Policy,
     numpy_model: LoadedModel,
     runtimes: Sequence[str],
@@ -350,7 +365,7 @@ def _participants(
     chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
         try:
-            model = pool.process(runtime).load(str(candidate.ports.path), **candidate.ports.options)
+            model = pool.process(runtime).load(str(path), **candidate.ports.options)
         except RunFailedError as error:
             failure(candidate.label, runtime, error, "*")
             for problem in candidate.problems:

@@ -261,10 +261,11 @@ def verify_folder(
     )
     used, known = chosen_runtimes(runtimes, [WRITTEN[key] for key in artefacts])
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    tested = PolicyUnderTest(
-        name, signature, policy.graph, artefacts, _sizes(content), graph_file, original, source_map, keys
-    )
-    with RuntimePool() as pool:
+    with tempfile.TemporaryDirectory(prefix="export-model-") as scratch, RuntimePool() as pool:
+        copies = _vetted(artefacts, names, list(keys), Path(scratch))
+        tested = PolicyUnderTest(
+            name, signature, policy.graph, copies, _sizes(content), graph_file, original, source_map, keys
+        )
         report = verify(tested, used or ("numpy",), known, pool, options, progress)
     if source is None:
         note = "the source was not given: the reference is the bundle's own .bytes"
@@ -277,6 +278,24 @@ def verify_folder(
             fix="pip install export-model[onnxruntime] (or [tensorflow]), or --allow-unverified",
         )
     return report
+
+
+def _vetted(
+    artefacts: Mapping[str, Path], names: Sequence[str], signatures: Sequence[str], scratch: Path
+) -> dict[str, Path]:
+    """Copies of a bundle's artefacts as far as a runtime may be given them: anyone may have made the bundle.
+
+    Raises UnsupportedOpError where one does more than compute, DamagedFileError, GraphError.
+    """
+    copies = {}
+    for key, path in artefacts.items():
+        found, folder = WRITTEN[key], scratch / key
+        folder.mkdir()
+        with naming(path):
+            copies[key] = (
+                path if found.vetted is None else found.vetted(path, signatures if found.signatures else names, folder)
+            )
+    return copies
 
 
 def _checked_graph(folder: Path, file: Path, content: Mapping[str, Any]) -> Graph:

@@ -42,9 +42,10 @@ def main() -> None:
 
         def __init__(self, path: str, draws: Sequence[str]) -> None:
             from converters.onnx import edit
+            from converters.onnx.vetted import contained
 
             self.cut = edit.cut
-            self.model = edit.lifted(edit.load(Path(path)), draws)
+            self.model = edit.lifted(contained(Path(path)), draws)
             self.sessions: dict[tuple[str, ...], Any] = {}
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:

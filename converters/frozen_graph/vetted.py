@@ -1,0 +1,25 @@
+"""A graph that anyone may have made, as far as a runtime may be given it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from converters import schema
+from converters.fetch import read_bytes
+from converters.frozen_graph.reader import from_graph_def
+from converters.frozen_graph.subgraph import subgraph
+from converters.graph.nodes import node_of
+
+
+def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    """A copy in ``folder`` of what the nodes ``wanted`` are computed from; those that are not there are left out.
+
+    Raises UnsupportedOpError where an op does more than compute, DamagedFileError, GraphError.
+    """
+    definition = schema.parse(schema.GraphDef, read_bytes(path), "TensorFlow graph")
+    from_graph_def(definition)  # its constants are bounded, its names are names
+    there = {n.name for n in definition.node}
+    copy = folder / path.name
+    copy.write_bytes(schema.serialise(subgraph(definition, [w for w in wanted if node_of(w) in there])))
+    return copy

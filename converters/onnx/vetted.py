@@ -1,0 +1,70 @@
+"""An ONNX model that anyone may have made, as far as a runtime may be given it.
+
+onnxruntime reads the files that a model names as its weights, in some releases from any folder, and loads what
+custom ops need. The copy is one file: weights that lie beside the model are brought into it, others are refused, and so
+is every op that is not of ONNX or of the runtime itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from converters.fetch import read_bytes
+from converters.onnx.proto import load_external
+from signatures.errors import DamagedFileError, UnsupportedOpError
+
+#: Domains whose operators compute, of ONNX and of onnxruntime.
+_DOMAINS = frozenset(("", "ai.onnx", "ai.onnx.ml", "com.microsoft", "com.ms.internal.nhwc"))
+#: Operators of these that load something else.
+_LOADING = frozenset(("EPContext", "PythonOp", "PythonOpGrad", "ExternalOp"))
+
+
+def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    """A copy in ``folder`` of the model in the file ``path``, with all its weights in it.
+
+    Raises UnsupportedOpError where an op is of another domain, DamagedFileError where weights lie elsewhere.
+    """
+    copy = folder / path.name
+    copy.write_bytes(contained(path).SerializeToString())
+    return copy
+
+
+def contained(path: Path) -> Any:
+    """The ModelProto with the data of all its files. Raises what ``vetted`` raises."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.ModelProto.FromString(read_bytes(path))
+    except DecodeError as error:
+        raise DamagedFileError(
+            "cannot be decoded as ONNX", where=str(path), why="the file is cut off or damaged", fix="export it again"
+        ) from error
+    model.ClearField("training_info")
+    own = {(f.domain, f.name) for f in model.functions}
+    for part in (model.graph, *model.functions):
+        load_external(part, path.parent)
+        for node in _nodes(part):
+            known = node.domain in _DOMAINS and node.op_type not in _LOADING
+            if not known and (node.domain, node.op_type) not in own:
+                raise UnsupportedOpError(
+                    f"the model has the custom operator {node.domain}::{node.op_type} (node {node.name!r})",
+                    issues=[(node.name, node.op_type)],
+                    why="a runtime would need a library for it; a model file is untrusted, and none is loaded for one",
+                    fix="export the model with operators of ONNX only",
+                )
+    return model
+
+
+def _nodes(part: Any) -> Iterator[Any]:
+    """The nodes of a graph or function, those of its subgraphs too."""
+    stack = [part]
+    while stack:
+        for node in stack.pop().node:
+            yield node
+            for attribute in node.attribute:
+                if attribute.HasField("g"):
+                    stack.append(attribute.g)
+                stack.extend(attribute.graphs)
