@@ -29,7 +29,7 @@ _READING = frozenset(("VarHandleOp", "ReadVariableOp", "ResourceGather", "Variab
 _ALLOWED = COMPUTING | _READING | ORDERING | CALLING
 _BOOL = 10  # DataType
 #: Copies of a graph's functions may hold this many nodes, and bytes: a small file could unfold to any size otherwise.
-MAX_NODES = 1 << 17
+MAX_NODES = 1 << 15
 _BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
 _MAX_DEPTH = 64
 
