@@ -23,6 +23,7 @@ from converters.policy import Policy
 from converters.understand.brains import Brain, find_brains
 from converters.understand.derived_outputs import derive_outputs, without_chance
 from converters.understand.facts import SourceFacts
+from converters.understand.further_outputs import leave_out_without_rows
 from converters.understand.inputs import classify_inputs
 from converters.understand.signature import sign, understand_actions
 from converters.understand.source_map import source_map
@@ -42,6 +43,7 @@ PASSES = (
     Pass("collapse views", on_tensors(collapse_views), (has.no_identities,), (has.no_identities, has.no_dead_nodes)),
     Pass("cancel transposes", on_tensors(cancel_transposes), (has.constants_folded,), (has.no_dead_nodes,)),
     Pass("understand actions", understand_actions, (has.no_identities,), (has.meanings,)),
+    Pass("leave out", leave_out_without_rows, (has.meanings,), (has.meanings,)),
     Pass("settle single draws", settle_single_draws, (has.meanings,), (has.one_spelling,)),
     Pass("settle noise", settle_noise, (has.no_control_flow,), (has.noise_as_asked,)),
     Pass("remove seeds", on_graph(unseeded), (), (has.no_seeds,)),

@@ -137,10 +137,10 @@ def _by_structure(
 
 
 def _has_rows(node: Node) -> bool:
-    """Whether a placeholder is [B, n] or [B, T, n]."""
+    """Whether a placeholder is [B, n] or [B, T, n]; a single number a row may be a flag that resets the memory."""
     shape: TensorShape | None = node.attrs.get("shape")
     dims = () if shape is None or shape.dims is None else shape.dims
-    return len(dims) in (2, 3) and dims[0] is None and dims[-1] is not None
+    return len(dims) in (2, 3) and dims[0] is None and dims[-1] is not None and (dims[-1] > 1 or len(dims) > 2)
 
 
 def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Callable[[Node], bool]) -> list[Node]:

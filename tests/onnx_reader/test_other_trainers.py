@@ -213,16 +213,15 @@ def test_an_inner_value_may_be_the_action(tmp_path: Path) -> None:
     assert policy.signature.outputs[0].source == "/net/mean"
 
 
-def test_inputs_that_say_nothing_are_asked_for(tmp_path: Path) -> None:
+def test_an_input_of_one_number_may_be_a_flag_and_roles_decide(tmp_path: Path) -> None:
     message = model(
         [node("Concat", ["p", "q"], "c", axis=1), node("MatMul", ["c", "w"], "action")],
-        {"p": (np.float32, ["batch", 2]), "q": (np.float32, ["batch", 4])},
+        {"p": (np.float32, ["batch", 2]), "q": (np.float32, ["batch", 1])},
         ["action"],
-        {"w": floats(6, 3)},
+        {"w": floats(3, 3)},
     )
-    with pytest.raises(SignatureError, match="--input NAME="):
-        compiled(message, tmp_path)
-    signature = compiled(message, tmp_path, inputs={"p": Role.VECTOR, "q": Role.VECTOR}).signature
+    assert compiled(message, tmp_path).signature.input("q").role is Role.PARAMETER
+    signature = compiled(message, tmp_path, inputs={"q": Role.VECTOR}).signature
     assert [(s.name, s.source) for s in signature.inputs] == [("state", "p"), ("state_1", "q")]
 
 

@@ -299,7 +299,10 @@ def test_a_state_may_be_forgotten_where_an_episode_begins(bench: Bench, tmp_path
 def test_a_state_that_is_not_given_back_is_no_memory(tmp_path: Path) -> None:
     message = recurrent()
     del message.graph.output[2]
-    signature = compiled(message, tmp_path, inputs={"h_in": Role.PARAMETER}).signature
+    given = {"inputs": {"h_in": Role.PARAMETER}}
+    with pytest.raises(SignatureError, match="'h_out' looks like a memory"):
+        compiled(message, tmp_path, **given)
+    signature = compiled(message, tmp_path, **given, outputs={"h_out": Role.OTHER}).signature
     assert signature.memory is None
     assert signature.input("c_in").role is Role.PARAMETER
 
