@@ -150,7 +150,7 @@ def _input(file: OnnxFile, name: str, dims: Dims) -> InputView:
 def _kept_nhwc(file: OnnxFile, name: str) -> bool:
     for node in file.readers(name):
         made = node.output[0] if node.output else ""
-        if any(reader.op_type == "Conv" and reader.input[0] == made for reader in file.readers(made)):
+        if any(reader.op_type == "Conv" and reader.input[:1] == [made] for reader in file.readers(made)):
             perm = attributes(node).get("perm")
             if node.op_type == "Transpose" and perm is not None and tuple(perm.ints) == _TO_NCHW:
                 return True
@@ -187,4 +187,4 @@ def _memories(file: OnnxFile) -> tuple[tuple[str, ...], set[str]]:
 
 def _cut_from(file: OnnxFile, name: str) -> str:
     producer: Any = file.producers.get(name)
-    return str(producer.input[0]) if producer is not None and producer.op_type == "Slice" else ""
+    return str(producer.input[0]) if producer is not None and producer.op_type == "Slice" and producer.input else ""

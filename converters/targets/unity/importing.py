@@ -196,7 +196,7 @@ def _attribute_type(attribute: Any) -> int:
 
 def _identity_of_reshaped_output(file: OnnxFile, name: str) -> bool:
     node = file.producers.get(name)
-    if node is None or node.op_type != "Identity" or node.input[0] not in file.outputs:
+    if node is None or node.op_type != "Identity" or not set(node.input) & set(file.outputs):
         return False
     source = file.producers.get(node.input[0])
     return source is not None and source.op_type == "Reshape"

@@ -19,9 +19,11 @@ _SAYS = {
 
 def misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
     """One finding per kind of construct, with its places; empty where the shapes of the file contradict each other."""
+    if file.has_negative_lengths:
+        return ()  # ONNX's shape inference would abort the process
     try:
         model = constructs(file.model)
-    except (ExportModelError, ValueError, TypeError):
+    except (ExportModelError, ValueError, TypeError, LookupError):
         return ()
     found: dict[tuple[Reading, str, str], list[str]] = {}
     for reading in misreadings(model, [consumer.runtime]):

@@ -13,12 +13,12 @@ import numpy as np
 from converters.fetch import read_bytes
 from converters.onnx.proto import load_external
 from converters.targets.unity.onnx_constants import RANDOM_OPS, value_of
+from converters.targets.unity.onnx_shapes import inferred_shapes
 from signatures.errors import DamagedFileError
 
 #: TensorProto.DataType that Sentis holds as floats; everything else is held as int.
 _FLOATS = frozenset({1, 10, 11, 16})
-#: Weights above this many elements are not given to shape inference: their shape is all it needs.
-_SMALL = 1024
+#: Inputs of more elements are not made for a trial run.
 _LARGEST_ZEROS = 1 << 16
 
 Dims = tuple[int | None, ...]
@@ -106,8 +106,15 @@ class OnnxFile:
 
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int | None, ...]]:
-        """Value → shape, of a run in which every free length of an input is 1 (as Sentis' trial run has it)."""
-        return _inferred(self)
+        """Value → shape, of a run in which every free length of an input is 1."""
+        return inferred_shapes(self)
+
+    @property
+    def has_negative_lengths(self) -> bool:
+        """Whether something is declared with a length below 0."""
+        graph = self.model.graph
+        declared = (*graph.input, *graph.output, *graph.value_info)
+        return any(d.dim_value < 0 for value in declared for d in value.type.tensor_type.shape.dim)
 
 
 def read_onnx_file(path: Path) -> OnnxFile:
@@ -125,6 +132,14 @@ def read_onnx_file(path: Path) -> OnnxFile:
             fix="export or download it again",
         ) from error
     load_external(model.graph, path.parent)
+    for tensor in model.graph.initializer:
+        if min(tensor.dims, default=0) < 0:
+            raise DamagedFileError(
+                f"the tensor {tensor.name!r} has the shape {list(tensor.dims)}",
+                where=str(path),
+                why="no length is negative",
+                fix="export or download it again",
+            )
     return OnnxFile(model)
 
 
@@ -138,41 +153,3 @@ def _dims(value: Any) -> Dims | None:
     if not kind.HasField("shape"):
         return None
     return tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.shape.dim)
-
-
-def _inferred(file: OnnxFile) -> Mapping[str, tuple[int | None, ...]]:
-    """By ONNX's own shape inference, over a copy without large weights; empty where it refuses the model."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
-    slim = onnx.ModelProto()
-    slim.ir_version = max(int(file.model.ir_version), 4)
-    slim.opset_import.extend(file.model.opset_import)
-    graph = slim.graph
-    graph.name = "shapes"
-    graph.node.extend(file.model.graph.node)
-    for value in file.model.graph.input:
-        if value.name in file.initializers:
-            continue
-        graph.input.append(value)
-        for dim in graph.input[-1].type.tensor_type.shape.dim:
-            if not dim.HasField("dim_value") or dim.dim_value < 0:
-                dim.dim_value = 1
-    for tensor in file.model.graph.initializer:
-        if int(np.prod(tensor.dims, dtype=np.float64)) <= _SMALL:
-            graph.initializer.append(tensor)
-        else:
-            graph.input.append(onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, list(tensor.dims)))
-    for value in file.model.graph.output:
-        graph.output.append(onnx.ValueInfoProto(name=value.name))
-        graph.output[-1].type.tensor_type.elem_type = value.type.tensor_type.elem_type
-    try:
-        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=True).graph
-    except (onnx.shape_inference.InferenceError, RuntimeError, ValueError, DecodeError):
-        return {}
-    found: dict[str, tuple[int | None, ...]] = {t.name: tuple(t.dims) for t in file.model.graph.initializer}
-    for value in (*inferred.input, *inferred.value_info, *inferred.output):
-        dims = _dims(value)
-        if dims is not None:
-            found[value.name] = dims
-    return found
