@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.barracuda.layer_builder import LayerBuilder, Shape, Value
+from converters.graph.nn import linear
 from converters.graph.nn.activations import scaled
 from converters.graph.types import FLOAT32, INT32, INT64
 
@@ -46,16 +47,9 @@ def matmul(b: LayerBuilder, args: Sequence[Value]) -> Value:
     ranks = tuple(b.layer.pool) or (2, 2)
     if len(ranks) != 2 or any(r not in (2, 3, 4) for r in ranks) or (ranks[1] != 2 and ranks[0] != ranks[1]):
         raise b.unsupported(f"the ranks {list(ranks)}", "products that broadcast over further axes are not translated")
-    if ranks[1] == 2:
-        if y.n is None:
-            raise b.unsupported("its second input has a row per agent", "the batch cannot be summed over")
-        return _times_matrix(b, x, ranks[0], b.as_matrix(y), y.n, y.size)
-    left, right = (_onnx_order(b, v, ranks[0]) for v in (x, y))
-    product = b.add("BatchMatMul", [left, right])
-    if ranks[0] == 3:
-        # ONNX [N, C, W]·[N, W, M] = [N, C, M], back to [N, 1, M, C]
-        return _from_onnx(b, product, (x.n, 1, y.w, x.c))
-    return _from_onnx(b, product, (x.n, x.h, y.w, x.c))
+    if ranks[1] == 2 and y.n is None:
+        raise b.unsupported("its second input has a row per agent", "the batch cannot be summed over")
+    return _times(b, x, y, ranks[0], ranks[1])
 
 
 def dense3(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -63,43 +57,36 @@ def dense3(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x, kernel, bias = args
     if kernel.n is None or bias.constant is None:
         raise b.unsupported("its kernel or bias is computed", "they are constants in every model known")
-    product = _times_matrix(b, x, 3, b.as_matrix(kernel), kernel.n, kernel.size)
-    column = b.floats(bias.constant.reshape(1, 1, -1, 1), "bias")
     if bias.size != kernel.size:
         raise b.damaged(f"a kernel of {kernel.size} columns, a bias of {bias.size}", "they must be equal")
-    total = b.add("Add", [b.as_image(product), column])
-    return b.shaped(total, product.shape)
+    product = _times(b, x, kernel, 3, 2)
+    column = b.floats(bias.constant.reshape(1, 1, -1, 1), "bias")
+    return b.shaped(b.add("Add", [b.as_image(product), column]), product.shape)
 
 
-def _times_matrix(b: LayerBuilder, x: Value, rank: int, matrix: str, rows: int, columns: int) -> Value:
-    inner = x.size if rank == 2 else x.w
+def _times(b: LayerBuilder, x: Value, y: Value, left: int, right: int) -> Value:
+    """The product of tensors that have these ranks in ONNX: [N, C], [N, C, W] or [N, C, H, W]."""
+    inner = x.size if left == 2 else x.w
+    rows, columns = {2: (y.n, y.size), 3: (y.c, y.w), 4: (y.h, y.w)}[right]
     if inner != rows:
-        raise b.damaged(f"{list(x.shape)} times a matrix of {rows} rows", f"{inner} numbers meet {rows}")
-    if rank == 2:
-        return b.rows(b.add("MatMul", [b.as_matrix(x), matrix]), x.n, columns)
-    n, h, w, c = x.shape
-    if rank == 3 and h != 1:
-        raise b.damaged(f"{list(x.shape)} as a tensor of rank 3", "its height is not 1")
-    flat = b.add("Reshape", [_onnx_order(b, x, 4), b.ints([-1, w], "rows")], name="rows")
-    product = b.add("MatMul", [flat, matrix])
-    lead = b.ints([-1 if n is None else n, c, h, columns], "lead")
-    return _from_onnx(b, b.add("Reshape", [product, lead], name="split"), (n, h, columns, c))
+        raise b.damaged(f"{list(x.shape)} times {list(y.shape)}", f"{inner} numbers meet {rows}")
+    product = linear.matmul(b, _onnx_order(b, x, left), _onnx_order(b, y, right))
+    if left == 2:
+        return b.rows(product, x.n, columns)
+    n = x.n if right == 2 or y.n == 1 else y.n
+    image = product if left == 4 else b.expand_dims(product, 2)
+    turned = b.transpose(image, (0, 2, 3, 1))
+    return b.shaped(turned, (n, x.h, columns, x.c))
 
 
 def _onnx_order(b: LayerBuilder, x: Value, rank: int) -> str:
-    """NHWC as [N, C, H, W], or [N, C, W] for rank 3."""
-    turned = b.add("Transpose", [b.as_image(x), b.ints([0, 3, 1, 2], "nchw")], name="nchw_order")
-    if rank == 4:
-        return turned
-    n, _, w, c = x.shape
-    return b.add("Reshape", [turned, b.ints([-1 if n is None else n, c, w], "ncw")], name="ncw_order")
-
-
-def _from_onnx(b: LayerBuilder, x: str, shape: Shape) -> Value:
-    """[N, C, H, W] (or [N, C, W]) back to NHWC."""
-    n, h, w, c = shape
-    image = b.add("Reshape", [x, b.ints([-1 if n is None else n, c, h, w], "nchw_shape")], name="nchw_form")
-    return b.shaped(b.add("Transpose", [image, b.ints([0, 2, 3, 1], "nhwc_perm")], name="nhwc_order"), shape)
+    """A tensor [N, H, W, C] as ONNX has it."""
+    if rank == 2:
+        return b.as_matrix(x)
+    if rank == 3 and x.h != 1:
+        raise b.damaged(f"{list(x.shape)} as a tensor of rank 3", "its height is not 1")
+    turned = b.transpose(b.as_image(x), (0, 3, 1, 2))
+    return turned if rank == 4 else b.squeeze(turned, [2])
 
 
 def scale_bias(b: LayerBuilder, args: Sequence[Value]) -> Value:

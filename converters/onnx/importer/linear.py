@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from converters.graph.nn import reduction
+from converters.graph.nn.linear import matmul
 from converters.graph.types import INT64, Dim, product
 from converters.onnx.importer.elementwise import is_bias
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
 
-#: Product with a matrix behind further axes is written on two axes: TF 1.x multiplies batches of equal shape only.
 _MATRIX = 2
 
 
@@ -42,32 +42,7 @@ def _gemm(op: Op, net: Importer) -> str:
 
 
 def _matmul(op: Op, net: Importer) -> str:
-    """Numpy's matmul: vectors are rows or columns, further axes broadcast."""
-    return matmul(op, net, op.need(0), op.need(1))
-
-
-def matmul(op: Op, net: Importer, a: str, b: str) -> str:
-    """See ``_matmul``."""
-    left, right = net.rank(a), net.rank(b)
-    if left == 1:
-        a = net.expand_dims(a, 0)
-    if right == 1:
-        b = net.expand_dims(b, 1)
-    value = _batched(op, net, a, b)
-    rank = net.rank(value)
-    return net.squeeze(value, [axis for axis, gone in ((rank - 2, left == 1), (rank - 1, right == 1)) if gone])
-
-
-def _batched(op: Op, net: Importer, a: str, b: str) -> str:
-    x, y = net.shape(a), net.shape(b)
-    if len(x) == _MATRIX and len(y) == _MATRIX:
-        return net.add("MatMul", [a, b])
-    if len(y) == _MATRIX:
-        rows = net.reshape(a, (-1, net.length(a, -1)))
-        return net.reshape(net.add("MatMul", [rows, b]), (*x[:-1], y[-1]))
-    batch = net.joined([x[:-2], y[:-2]])
-    wide = [net.broadcast(t, (*batch, *s[-2:])) for t, s in ((a, x), (b, y))]
-    return net.add("BatchMatMul", wide)
+    return matmul(net, op.need(0), op.need(1))
 
 
 def _einsum(op: Op, net: Importer) -> str:
