@@ -6,13 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from converters.bundle import BUNDLE
-from converters.bundle.source import artefacts, read_first
+from converters.bundle.bundle import Bundle
 from converters.fetch import Fetched
 from converters.format import Format, Member, Ports
 from converters.formats import FORMATS
 from converters.recognise import not_readable, recognised
 from converters.source import ReadOptions, SourceModel
-from signatures.errors import ExportModelError, SourceError, UsageError
+from signatures.contract import POLICY
+from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
 #: What only some sources have a use for: option, flag, and what to give to have one.
 _TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"))
@@ -43,9 +44,25 @@ def read_models(given: Fetched, found: Format, options: ReadOptions) -> list[Sou
     """The models of a source. Raises SourceError, GraphError and their kinds, UsageError."""
     if found.read is not None:
         return found.read(given, options)
-    members = [read_first(given.path, FORMATS)] if found.members is None else found.members(given.path, options)
+    members = [_artefact(given.path)] if found.members is None else found.members(given.path, options)
     inside = replace(options, step=None)
     return [model for member in members for model in _of_member(member, given, inside)]
+
+
+def _artefact(folder: Path) -> Member:
+    """The artefact that a bundle is read from, the first that can be. Raises BundleError where it was changed."""
+    bundle = Bundle.open(folder)
+    able = [f for f in FORMATS if f.main and f.read is not None]
+    found = next((f for f in able if bundle.has(f)), None)
+    if found is None:
+        raise BundleError(
+            "names no file that can be read",
+            where=str(folder / POLICY),
+            why=f"a bundle has one of {', '.join(f.main_of(bundle.name) for f in able)}",
+            fix="export the policy again",
+        )
+    bundle.verify_hashes(found)
+    return Member(bundle.path(found), bundle.name, files=(folder / POLICY,))
 
 
 def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -75,7 +92,11 @@ def ports_of(path: Path) -> list[tuple[Format, Ports]]:
     """
     found = recognised(Fetched(path))
     if found is BUNDLE:
-        return [(f, f.ports(place)) for f, place in artefacts(path, FORMATS) if f.ports is not None]
+        bundle = Bundle.open(path)
+        artefacts = [(f, f.ports(bundle.path(f))) for f in FORMATS if f.ports is not None and bundle.has(f)]
+        if not artefacts:
+            raise SourceError("the bundle holds no model", where=str(path), fix="export the policy again")
+        return artefacts
     if found.ports is None:
         able = ", ".join(f.key for f in FORMATS if f.ports is not None or f is BUNDLE)
         raise SourceError(

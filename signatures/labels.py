@@ -95,17 +95,12 @@ def remaining(labels: Mapping[str, Any], signature: PolicySignature) -> dict[str
 def sizes(signature: PolicySignature) -> dict[str, Any]:
     """How many texts each part has: per vector observation, of the continuous actions, per branch."""
     vectors = (s for s in signature.observations if s.role is not Role.VISUAL and s.shape)
-    heads = signature.outputs[: 2 if signature.action_space == "hybrid" else 1]
-    continuous = next((h for h in heads if h.dtype.startswith("float") and _is_continuous(h.role)), None)
+    continuous = next((h.spec for h in signature.heads if h.is_continuous), None)
     return {
         "observations": {s.name: s.shape[-1] for s in vectors if s.shape[-1] is not None},
         "actions": 0 if continuous is None else continuous.shape[-1] or 0,
         "branches": list(signature.branches),
     }
-
-
-def _is_continuous(role: Role) -> bool:
-    return role in (Role.CONTINUOUS, Role.DETERMINISTIC)
 
 
 def _lengths(labels: Mapping[str, Any]) -> list[int]:

@@ -34,14 +34,6 @@ class SourcePart:
         """As in policy.json."""
         return {"tensor": self.tensor, "shape": list(self.shape)}
 
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> SourcePart:
-        """The inverse of ``to_dict``; raises ValueError where the shape has not one batch axis."""
-        shape = tuple(entry["shape"])
-        if shape.count(None) != 1:
-            raise ValueError(f"the shape {list(shape)} of {entry['tensor']!r} has not one batch axis")
-        return cls(entry["tensor"], shape)
-
 
 def divided(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, np.ndarray]:
     """What the source is fed for a memory [B, n]: each part's columns in its shape."""

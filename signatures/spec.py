@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from signatures.labels import parsed
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Constant, Role
 
@@ -43,18 +41,10 @@ class TensorSpec:
             entry["distribution"] = dict(self.distribution)
         return entry
 
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> TensorSpec:
-        """The inverse of ``to_dict``."""
-        source = entry.get("source")
-        return cls(
-            name=entry["name"],
-            role=Role(entry["role"]),
-            dtype=entry["dtype"],
-            shape=tuple(entry["shape"]),
-            source=tuple(source) if isinstance(source, list) else source,
-            distribution=entry.get("distribution"),
-        )
+    @property
+    def is_continuous(self) -> bool:
+        """Whether an action is of numbers, not of choices."""
+        return self.role is Role.CONTINUOUS or (self.role is Role.DETERMINISTIC and self.dtype.startswith("float"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +61,30 @@ class Memory:
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json."""
         return {"size": self.size, "input": self.input, "output": self.output, "layout": list(self.layout)}
+
+
+@dataclass(frozen=True, slots=True)
+class ActionHead:
+    """An action: its output, the sizes of its branches (none: it is continuous), and the same without chance."""
+
+    spec: TensorSpec
+    branches: tuple[int, ...] = ()
+    plain: TensorSpec | None = None
+
+    @property
+    def name(self) -> str:
+        """The output's name."""
+        return self.spec.name
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether it is of numbers, not of choices."""
+        return self.spec.is_continuous
+
+
+def _companion(head: TensorSpec, plain: Sequence[TensorSpec], heads: int) -> TensorSpec | None:
+    """Of the actions without chance, the one of ``head``: by its kind, as one of two may be missing."""
+    return next((s for s in plain if heads == 1 or s.is_continuous == head.is_continuous), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +123,25 @@ class PolicySignature:
         return next((int(feeds[name].shape[0]) for name in free), 1)
 
     @property
+    def heads(self) -> tuple[ActionHead, ...]:
+        """The actions, the first outputs: one, or the continuous and the discrete one of a hybrid policy."""
+        count = 2 if self.action_space == "hybrid" else 1
+        plain = [s for s in self.outputs[count:] if s.role is Role.DETERMINISTIC]
+        return tuple(
+            ActionHead(s, () if s.is_continuous else self.branches, _companion(s, plain, count))
+            for s in self.outputs[:count]
+        )
+
+    def companion_of(self, output: str) -> TensorSpec | None:
+        """The action without chance that belongs to an action, None where there is none."""
+        return next((head.plain for head in self.heads if head.name == output), None)
+
+    @property
+    def log_probs(self) -> TensorSpec | None:
+        """The log-probabilities of the discrete actions, None where there are none."""
+        return next((s for s in self.outputs if s.role is Role.LOG_PROBS), None)
+
+    @property
     def observations(self) -> tuple[TensorSpec, ...]:
         """Inputs that are observations."""
         return tuple(s for s in self.inputs if s.role in OBSERVATIONS)
@@ -133,34 +166,6 @@ class PolicySignature:
             "notes": list(self.notes),
             **({"labels": dict(self.labels)} if self.labels else {}),
         }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> PolicySignature:
-        """The inverse of ``to_dict``; extra keys are ignored."""
-        memory = entry.get("memory")
-        return cls(
-            inputs=tuple(TensorSpec.from_dict(e) for e in entry["inputs"]),
-            outputs=tuple(TensorSpec.from_dict(e) for e in entry["outputs"]),
-            family=entry["family"],
-            action_space=entry["action_space"],
-            branches=tuple(entry.get("branches", ())),
-            algorithm=entry.get("algorithm"),
-            memory=Memory(memory["size"], memory["input"], memory["output"], tuple(memory["layout"]))
-            if memory
-            else None,
-            preprocess=entry.get("preprocess", {}),
-            constants={str(name): _constant(value) for name, value in entry.get("constants", {}).items()},
-            notes=tuple(entry.get("notes", ())),
-            labels=parsed(entry.get("labels")),
-        )
-
-
-def _constant(value: Any) -> Constant:
-    """A constant of policy.json; raises ValueError where it is none."""
-    items = value if isinstance(value, list) else [value]
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in items):
-        raise ValueError(f"the constant {value!r} is no number")
-    return [int(v) for v in items] if isinstance(value, list) else items[0]
 
 
 def _named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
@@ -215,22 +220,6 @@ class SourceMap:
             "rows": self.rows,
             **({"parts": {n: [p.to_dict() for p in parts] for n, parts in self.parts.items()}} if self.parts else {}),
         }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any], signature: PolicySignature) -> SourceMap:
-        """The inverse, with the feeds and fetches of ``signature``."""
-        parts = {n: tuple(SourcePart.from_dict(p) for p in given) for n, given in entry.get("parts", {}).items()}
-        return cls(
-            feeds=sources(signature.inputs, parts),
-            fetches=sources(signature.outputs, parts),
-            fixed={n: np.array(v["value"], v["dtype"]) for n, v in entry.get("fixed", {}).items()},
-            batch_sizes=dict(entry.get("batch_sizes", {})),
-            noise={n: tuple(shape) for n, shape in entry.get("noise", {}).items()},
-            noise_kept=bool(entry.get("noise_kept", False)),
-            branches=tuple(entry.get("branches", ())),
-            rows=entry.get("rows"),
-            parts=parts,
-        )
 
 
 def sources(specs: tuple[TensorSpec, ...], parts: Collection[str]) -> dict[str, str]:

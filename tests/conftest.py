@@ -58,7 +58,7 @@ def pool(processes: RuntimePool) -> RuntimePool:
 
 @pytest.fixture(scope="session", autouse=True)
 def _what_is_written_fits_its_schema() -> Iterator[None]:
-    from exporter.export import bundle
+    from converters.bundle import bundle
     from tests.reports.validation import check_parity, check_policy
 
     written = bundle.dumps

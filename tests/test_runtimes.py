@@ -16,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.cache import cache_folder, sweep
+from converters.bundle.exchange import sweep
+from converters.runtimes.cache import cache_folder
 from converters.runtimes.javascript import node as runtimes
 from converters.runtimes.javascript.node import install_packages, js_home, node_executable
 from converters.runtimes.registry import RuntimeInfo, available_runtimes
@@ -304,7 +305,7 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
 
     folder = user / "export-model"
     (rest,) = folder.iterdir()
-    assert rest.name.startswith(".js-")
+    assert rest.name.startswith(".export-model-")
     assert not js_home().exists()
 
     # The next run is not disturbed by what is left, and once it is old enough, removes it.
@@ -312,7 +313,7 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
     assert runtimes._has_packages(install_packages(quiet))
     assert sorted(folder.iterdir()) == sorted([rest, js_home()])
     os.utime(rest, (0, 0))
-    sweep(folder, runtimes._UNFINISHED)
+    sweep(folder)
     assert list(folder.iterdir()) == [js_home()]
 
 

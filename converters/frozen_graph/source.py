@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from converters import schema
-from converters.bundle.source import facts_of, recalled
+from converters.bundle.embed import facts_of, recalled
 from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
 from converters.source import OriginalRun, SourceModel

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 from converters import schema
+from converters.bundle.embed import with_contract
 from converters.format import WriteOptions
-from converters.frozen_graph.encode import encode, string_constant
-from converters.graph.compile import CONTRACT_NODE
-from converters.graph.nodes import Graph
+from converters.frozen_graph.encode import encode
 from converters.policy import Policy
-
-
-def with_contract(graph: Graph, contract: str) -> Graph:
-    """The graph with the contract as an unconnected string constant."""
-    return Graph((*graph.nodes, string_constant(CONTRACT_NODE, contract)))
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:

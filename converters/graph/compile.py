@@ -13,7 +13,7 @@ from converters.graph.passes import conditions as has
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import complete_shapes, set_values, settle_inputs
 from converters.graph.passes.memories import join_memories
-from converters.graph.passes.naming import CONTRACT_NODE, name_ports
+from converters.graph.passes.naming import name_ports
 from converters.graph.passes.noise import settle_noise, settle_single_draws, unseeded
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.simplify import collapse_views, drop_identities
@@ -122,4 +122,4 @@ def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain
     return chosen
 
 
-__all__ = ["CONTRACT_NODE", "PASSES", "compilations", "compile_graph"]
+__all__ = ["PASSES", "compilations", "compile_graph"]

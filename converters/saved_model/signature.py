@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from converters.format import Port
-from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.graph.ops.table import is_fed
 from converters.renaming import renamed
 from converters.schema import dtype_number
 from converters.understand.inputs import role_by_name
+from signatures.contract import EMBEDDED
 from signatures.errors import DamagedFileError
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
@@ -70,7 +70,7 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
                 f"the signature's {key!r} is the tensor {tensor.name!r}, which is not in the graph",
                 fix="save the model again",
             )
-    keep = [n.name for n in graph.nodes if n.name in (*CONSTANT_NAMES, CONTRACT_NODE)]
+    keep = [n.name for n in graph.nodes if n.name in (*CONSTANT_NAMES, EMBEDDED)]
     graph = _with_placeholders(graph, signature)
     graph = graph.pruned([*signature.roots, *keep])
     names = _names(signature)

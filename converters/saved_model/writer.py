@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.bundle.embed import with_contract
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
-from converters.frozen_graph.writer import with_contract
 from converters.graph.ops.samplers import SAMPLERS
 from converters.policy import Policy
 from signatures.roles import Role

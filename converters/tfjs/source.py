@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from converters.bundle.source import contract_of, facts_of, redrawn, retyped
+from dataclasses import replace
+
+import numpy as np
+
+from converters.bundle.embed import contract_of, facts_of, redrawn
 from converters.fetch import Fetched
+from converters.graph.nodes import Graph, NameScope, Node, topological
+from converters.renaming import renamed
 from converters.saved_model.signature import expose
 from converters.source import SourceModel
 from converters.tfjs.reader import read_model
 from converters.tfjs.unfuse import unfuse
 from converters.understand.facts import SourceFacts
+from signatures.contract import Contract
 
 
 def read(given: Fetched) -> list[SourceModel]:
@@ -19,5 +26,32 @@ def read(given: Fetched) -> list[SourceModel]:
         graph, roles = expose(graph, model.signature)
         return [SourceModel(graph, model.files, SourceFacts(roles=roles))]
     contract = contract_of(model.contract)
-    graph = retyped(redrawn(graph, contract), contract)
+    graph = _retyped(redrawn(graph, contract), contract)
     return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]
+
+
+#: The dtypes that TensorFlow.js has.
+_NARROW = ("float32", "int32", "bool")
+
+
+def _retyped(graph: Graph, contract: Contract) -> Graph:
+    """The graph with inputs and outputs in the dtypes of the contract, for a format that has not all of them.
+
+    TensorFlow.js has no int64: what was narrowed to int32 is cast, behind an input and before an output.
+    """
+    scope = NameScope(n.name for n in graph.nodes)
+    names = [s.name for s in (*contract.signature.inputs, *contract.signature.outputs) if s.dtype not in _NARROW]
+    inner = {name: scope.fresh(f"{name}/narrow") for name in names if name in graph}
+    nodes = {n.name: n for n in renamed(graph, inner).nodes}
+    for spec in contract.signature.inputs:
+        if spec.name in inner:
+            node = nodes[inner[spec.name]]
+            cast = Node(node.name, "Cast", (spec.name,), {"DstT": node.attrs["dtype"]})
+            wide = replace(node, name=spec.name, attrs={**node.attrs, "dtype": np.dtype(spec.dtype)})
+            nodes.update({node.name: cast, spec.name: wide})
+    for spec in contract.signature.outputs:
+        if spec.name in inner:
+            node = nodes[inner[spec.name]]
+            attrs = {"DstT": np.dtype(spec.dtype)}
+            nodes[spec.name] = Node(spec.name, "Cast", (node.name,), attrs, origin=node.origin)
+    return Graph(topological(list(nodes.values())))

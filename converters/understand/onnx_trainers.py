@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.bundle.source import contract_of, redrawn
-from converters.bundle.source import facts_of as facts_of_contract
+from converters.bundle.embed import contract_of, redrawn
+from converters.bundle.embed import facts_of as facts_of_contract
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
 from converters.onnx.reader import OnnxModel

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from exporter.acting.generator import Generator, likeliest
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.roles import OBSERVATIONS, Role
-from signatures.spec import PolicySignature, TensorSpec
+from signatures.spec import ActionHead, PolicySignature, TensorSpec
 
 Array = np.ndarray
 Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
@@ -53,11 +53,7 @@ class LoadedPolicy:
         self.name, self.signature, self.runtime = name, signature, runtime
         self._run = run
         self._generator = Generator(seed)
-        heads = 2 if signature.action_space == "hybrid" else 1
-        self._heads = signature.outputs[:heads]
-        plain = {s.dtype == "float32": s for s in signature.outputs[heads:] if s.role is Role.DETERMINISTIC}
-        self._plain = {h.name: plain[c] for h in self._heads if (c := _is_continuous(h)) in plain}
-        self._scores = next((s for s in signature.outputs if s.role is Role.LOG_PROBS), None)
+        self._scores = signature.log_probs
         # A mean beside its spread is drawn from here, unless the graph has drawn already.
         spread = next((s for s in signature.outputs if s.role in (Role.STD, Role.LOG_STD)), None)
         self._spread = None if signature.noise else spread
@@ -192,15 +188,14 @@ class LoadedPolicy:
     def _decision(self, outputs: dict[str, Array], deterministic: bool) -> Decision:
         continuous = discrete = None
         taken: dict[str, Array] = {}
-        for head in self._heads:
-            if _is_continuous(head):
-                plain = self._plain.get(head.name) if deterministic else None
-                taken[head.name] = continuous = outputs[(plain or head).name]
+        for head in self.signature.heads:
+            if head.is_continuous:
+                taken[head.name] = continuous = outputs[((deterministic and head.plain) or head.spec).name]
                 if self._spread is not None and not deterministic:
                     taken[head.name] = continuous = self._drawn(continuous, outputs[self._spread.name])
             else:
                 discrete = self._discrete(head, outputs, deterministic)
-                if head.role is Role.SAMPLED:
+                if head.spec.role is Role.SAMPLED:
                     taken[head.name] = discrete
         memory = self.signature.memory
         kept = None if memory is None or memory.output is None else outputs[memory.output]
@@ -212,19 +207,19 @@ class LoadedPolicy:
         std = np.exp(spread) if self._spread.role is Role.LOG_STD else spread
         return np.asarray(mean + std * self._generator.normals(mean.shape), np.float32)
 
-    def _discrete(self, head: TensorSpec, outputs: Mapping[str, Array], deterministic: bool) -> Array:
-        if head.role is Role.DETERMINISTIC:
+    def _discrete(self, head: ActionHead, outputs: Mapping[str, Array], deterministic: bool) -> Array:
+        if head.spec.role is Role.DETERMINISTIC:
             return outputs[head.name]
-        if deterministic and head.name in self._plain:
-            return outputs[self._plain[head.name].name]
-        if head.role is Role.PROBS:
+        if deterministic and head.plain is not None:
+            return outputs[head.plain.name]
+        if head.spec.role is Role.PROBS:
             with np.errstate(divide="ignore"):
                 scores = np.log(outputs[head.name].astype(np.float64))
         elif self._scores is None:  # its sampler is all there is
             return outputs[head.name]
         else:
             scores = outputs[self._scores.name]
-        branches = self.signature.branches or (scores.shape[1],)
+        branches = head.branches or (scores.shape[1],)
         return likeliest(scores, branches) if deterministic else self._generator.choices(scores, branches)
 
 
@@ -268,10 +263,6 @@ class Agent:
         return self._last
 
 
-def _is_continuous(head: TensorSpec) -> bool:
-    return head.role is Role.CONTINUOUS or (head.role is Role.DETERMINISTIC and head.dtype == "float32")
-
-
 def _cleared(array: Array | None, rows: Array) -> Array | None:
     """A copy with these rows zero, as an episode begins."""
     if array is None:
@@ -288,14 +279,14 @@ def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0
     ``numpy`` (needs its ``.bytes`` and nothing else; slower); without it, the first that is there. Raises BundleError,
     RuntimeUnavailableError, UsageError.
     """
-    from exporter.export.bundle import read_policy_json, signature_of
+    from converters.bundle.bundle import Bundle
+    from converters.formats import WRITTEN
 
-    folder = Path(bundle)
-    content = read_policy_json(folder)
-    name = content["name"]
+    found = Bundle.open(Path(bundle))
+    folder, name = found.folder, found.name
     if runtime not in (None, *RUNTIMES):
         raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
-    files = {"onnxruntime": folder / f"{name}.onnx", "numpy": folder / f"{name}.bytes"}
+    files = {"onnxruntime": found.path(WRITTEN["onnx"]), "numpy": found.path(WRITTEN["bytes"])}
     here = [r for r in RUNTIMES if files[r].is_file() and (r == "numpy" or importlib.util.find_spec(r) is not None)]
     if runtime is not None and runtime not in here:
         if not files[runtime].is_file():
@@ -309,8 +300,7 @@ def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0
             fix="export the policy with --to bytes,onnx",
         )
     chosen = runtime or here[0]
-    signature, _ = signature_of(content)
-    return LoadedPolicy(name, signature, _RUNS[chosen](files[chosen]), chosen, seed)
+    return LoadedPolicy(name, found.signature, _RUNS[chosen](files[chosen]), chosen, seed)
 
 
 def _in_onnxruntime(file: Path) -> Run:
@@ -328,14 +318,10 @@ def _in_onnxruntime(file: Path) -> Run:
 
 
 def _in_numpy(file: Path) -> Run:
-    from converters.frozen_graph.reader import read_graph
-    from converters.graph.compile import CONTRACT_NODE
-    from converters.graph.nodes import Graph
-    from converters.graph.passes.normalise import normalise
+    from converters.bundle.embed import read_runnable
     from converters.graph.run import run_graph
 
-    graph = read_graph(file.read_bytes())
-    graph = normalise(Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)))
+    graph = read_runnable(file.read_bytes())
     return lambda feeds, fetch: run_graph(graph, feeds, fetch)
 
 

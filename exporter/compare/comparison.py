@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from converters.bundle.bundle import Bundle
 from converters.format import Format, Port, Ports
 from converters.frozen_graph.writer import frozen
 from converters.graph.options import CompileOptions
@@ -25,7 +26,6 @@ from converters.read import ports_of
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun, ReadOptions
-from exporter.export.bundle import POLICY, read_policy_json
 from exporter.export.sources import naming, read_source
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
@@ -34,6 +34,7 @@ from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
 from exporter.verify.verification import verify
+from signatures.contract import POLICY
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
@@ -243,7 +244,7 @@ def _made_here(path: Path, policy: Policy) -> frozenset[str]:
     """Outputs of the reference that its source had not, as a bundle's policy.json says (or the graph that was read)."""
     made = {s.name for s in policy.signature.outputs if s.source is None}
     if (path / POLICY).is_file():
-        made |= {entry["name"] for entry in read_policy_json(path)["outputs"] if entry.get("source") is None}
+        made |= {s.name for s in Bundle.open(path).signature.outputs if s.source is None}
     return frozenset(made)
 
 

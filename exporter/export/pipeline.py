@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from converters.bundle import bundle
+from converters.bundle.bundle import Bundle
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
-from converters.frozen_graph.reader import read_graph
 from converters.frozen_graph.writer import frozen
-from converters.graph.compile import CONTRACT_NODE
 from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
@@ -23,7 +22,6 @@ from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.targets.profile import Profile
 from converters.targets.profiles import profile
-from exporter.export import bundle
 from exporter.export.labels import Labels, labelled, read_labels
 from exporter.export.sources import Source, naming, read_source
 from exporter.verify.inner_tensors import saved_graph
@@ -31,8 +29,10 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.report import ParityReport
 from exporter.verify.verification import verify
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
-from signatures.spec import SourceMap
+from exporter.version import __version__
+from signatures.contract import PARITY, POLICY, Contract, Origin, parse, safe_name
+from signatures.errors import BundleError, RuntimeUnavailableError, SignatureError, UsageError
+from signatures.fields import FieldError, printable
 
 Progress = Callable[[str], None]
 
@@ -60,9 +60,14 @@ class ExportResult:
 
     policy: Policy
     folder: Path
-    contract: Mapping[str, Any]
+    agreed: Contract
     sizes: Mapping[str, int]
     report: ParityReport | None
+
+    @property
+    def contract(self) -> Mapping[str, Any]:
+        """What every artefact embeds: policy.json without the hashes of the files."""
+        return self.agreed.to_dict()
 
     @property
     def passed(self) -> bool | None:
@@ -112,24 +117,26 @@ def export(
         origins.extend((p.name, f"{source.path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
     bundle.distinct_names(origins)
     jobs = [replace(j, policy=p) for j, p in zip(jobs, labelled([j.policy for j in jobs], labels), strict=True)]
-    for policy in (j.policy for j in jobs):
-        bundle.recover(options.out / policy.name)
-        bundle.check_replaceable(options.out / policy.name)
+    for job in jobs:
+        bundle.check_replaceable(options.out / job.policy.name)
     made = [(j, *_write(j, formats, options)) for j in jobs]
     with nullcontext(pool) if pool is not None else RuntimePool() as pool:
-        for job, content, artifacts in made:
+        for job, contract, artifacts in made:
             policy = job.policy
-            with _staged(options.out, content, artifacts) as stage, tempfile.TemporaryDirectory() as scratch:
+            with (
+                bundle.staged(options.out / policy.name, contract, artifacts) as stage,
+                tempfile.TemporaryDirectory() as scratch,
+            ):
                 report = None
                 if runtimes:
                     tested = _tested(job, stage, artifacts, Path(scratch))
                     report = verify(tested, runtimes, known, pool, options.parity, progress)
                     with bundle.writing(options.out):
-                        (stage / bundle.PARITY).write_bytes(bundle.dumps(report.to_dict()))
+                        (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
                 failed = report is not None and report.passed is False
                 place = options.out / (f"{policy.name}.failed" if failed else policy.name)
                 bundle.put_in_place(stage, place)
-            yield ExportResult(policy, place, content, {a.format.key: a.size for a in artifacts}, report)
+            yield ExportResult(policy, place, contract, {a.format.key: a.size for a in artifacts}, report)
 
 
 def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
@@ -160,39 +167,43 @@ def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list
         if len(policies) > 1 or sources > 1:
             raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
         policies = [replace(policies[0], name=options.name)]
-    return [replace(p, name=bundle.safe_name(p.name)) for p in policies]
+    return [replace(p, name=safe_name(p.name)) for p in policies]
 
 
-def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tuple[dict[str, Any], list[Artifact]]:
-    origin: dict[str, Any] = {"path": job.source.path.name, "sha256": job.source.sha256}
-    if job.model.name is not None:
-        origin["model"] = job.model.name
-    if options.read.step is not None:
-        origin["step"] = options.read.step
-    if options.read.sensors:
-        origin["sensors"] = [list(shape) for shape in options.read.sensors]
-    content = bundle.contract(job.policy, origin)
+def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tuple[Contract, list[Artifact]]:
     with naming(job.source.path):
+        contract = contract_of(job.policy, job.source, job.model, options.read)
         if job.profile is None:
-            how = WriteOptions(bundle.compact(content), options.opset)
-            return content, [f.artifact(job.policy, how) for f in formats]
-        how = WriteOptions(bundle.compact(content), job.profile.opset, job.profile.name)
+            how = WriteOptions(contract.compact(), options.opset)
+            return contract, [f.artifact(job.policy, how) for f in formats]
+        how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
         artifacts = [f.artifact(job.policy, how) for f in formats]
         for artifact in artifacts:
             if job.profile.check is not None:
                 job.profile.check(job.profile, artifact.files, job.policy.name)
-        return content, artifacts
+        return contract, artifacts
 
 
-@contextmanager
-def _staged(out: Path, content: Mapping[str, Any], artifacts: Sequence[Artifact]) -> Iterator[Path]:
-    """A staged bundle that is gone afterwards, unless it was put in its place."""
-    stage = bundle.write_staged(out, content, artifacts)
+def contract_of(policy: Policy, source: Source, model: SourceModel, read: ReadOptions) -> Contract:
+    """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
+    origin = Origin(
+        printable(source.path.name),
+        source.sha256,
+        None if model.name is None else printable(model.name),
+        read.step,
+        read.sensors,
+    )
+    tool = {"name": "export-model", "version": __version__}
+    contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
-        yield stage
-    finally:
-        if stage.exists():
-            shutil.rmtree(stage, ignore_errors=True)
+        parse(contract.to_dict())
+    except FieldError as error:
+        raise SignatureError(
+            "the policy cannot be described",
+            why=f"{error.field} {error.why}",
+            fix="give inputs and outputs other names where the model is made, or choose with --input and --output",
+        ) from error
+    return contract
 
 
 def _tested(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
@@ -235,36 +246,32 @@ def verify_folder(
     """
     if step is not None and source is None:
         raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
-    content = bundle.read_policy_json(folder)
-    bundle.check_hashes(folder, content)
-    name = content["name"]
-    artefacts = _artefacts(folder, content)
-    graph_file = artefacts.get("bytes")
-    if graph_file is None:
-        raise BundleError(
-            "has no .bytes, which is the reference without a source",
-            where=str(folder),
-            fix="export the policy again with bytes among --to",
-        )
-    signature, source_map = bundle.signature_of(content)
-    original = None if source is None else _original_of(source, content, step, source_map, trust_source)
-    embedding = _checked_graph(folder, graph_file, content)
+    found = Bundle.open(folder)
+    found.verify_hashes()
+    graph_file, contract = found.graph_file, found.contract
+    original = None if source is None else _original_of(source, contract, step, trust_source)
+    with naming(graph_file):
+        embedding = found.graph()
+    signature = contract.signature
+    formats = [f for f in WRITTEN.values() if found.has(f)]
+    artefacts = {f.key: found.path(f) for f in formats}
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
     graph = _whole_graph(embedding, names, artefacts)
     policy = Policy(
-        name,
+        found.name,
         graph,
         signature,
         {s.name: s.name for s in signature.inputs},
         {s.name: s.name for s in signature.outputs},
-        source_map,
+        contract.source,
     )
-    used, known = chosen_runtimes(runtimes, [WRITTEN[key] for key in artefacts])
+    used, known = chosen_runtimes(runtimes, formats)
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
+    sizes = {f.key: found.size(f) for f in formats}
     with tempfile.TemporaryDirectory(prefix="export-model-") as scratch, RuntimePool() as pool:
         copies = _vetted(artefacts, names, list(keys), Path(scratch))
         tested = PolicyUnderTest(
-            name, signature, policy.graph, copies, _sizes(content), graph_file, original, source_map, keys
+            found.name, signature, graph, copies, sizes, graph_file, original, contract.source, keys
         )
         report = verify(tested, used or ("numpy",), known, pool, options, progress)
     if source is None:
@@ -298,16 +305,6 @@ def _vetted(
     return copies
 
 
-def _checked_graph(folder: Path, file: Path, content: Mapping[str, Any]) -> Graph:
-    """The graph of a bundle's .bytes; raises BundleError where it embeds another contract than policy.json."""
-    with naming(file):
-        graph = read_graph(file.read_bytes())
-    node = graph.get(CONTRACT_NODE)
-    embedded = b"" if node is None or node.value is None or node.value.ndim else node.value.item()
-    bundle.check_contract(folder, content, embedded.decode("utf-8", "replace") if isinstance(embedded, bytes) else "")
-    return Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE))
-
-
 def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Path]) -> Graph:
     """A graph that has all inputs and outputs: the .bytes', else the SavedModel's.
 
@@ -322,43 +319,28 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
         raise BundleError(
             f"has no tensor {missing[0]!r}",
             where=str(artefacts["bytes"]),
-            why=f"{bundle.POLICY} names it",
+            why=f"{POLICY} names it",
             fix="export the policy again",
         )
     return graph
 
 
-def _artefacts(folder: Path, content: Mapping[str, Any]) -> dict[str, Path]:
-    """Format → what a loader is given, for the formats whose files policy.json names."""
-    name, files = content["name"], content["files"]
-    return {key: folder / f.main_of(name) for key, f in WRITTEN.items() if f.first_file_of(name) in files}
-
-
-def _sizes(content: Mapping[str, Any]) -> dict[str, int]:
-    name, files = content["name"], content["files"]
-    owned = {key: [e["bytes"] for path, e in files.items() if f.owns(path, name)] for key, f in WRITTEN.items()}
-    return {key: sum(found) for key, found in owned.items() if found}
-
-
-def _original_of(
-    source: Path, content: Mapping[str, Any], step: int | None, source_map: SourceMap, trust_source: bool
-) -> OriginalRun | None:
+def _original_of(source: Path, contract: Contract, step: int | None, trust_source: bool) -> OriginalRun | None:
     """How to run the source of a bundle; raises BundleError where ``source`` is another file.
 
     A run's folder is read at ``step``, by default at the one that the export asked for.
     """
-    asked = content["source"].get("step")
-    sensors = tuple(tuple(shape) for shape in content["source"].get("sensors", ()))
-    read = ReadOptions(step if step is not None or not isinstance(asked, int) else asked, sensors, trust_source)
+    origin = contract.origin
+    read = ReadOptions(origin.step if step is None else step, origin.sensors, trust_source)
     found = read_source(source, read)
-    if found.sha256 != content["source"]["sha256"]:
+    if found.sha256 != origin.sha256:
         raise BundleError(
             "is not the source of this bundle",
             where=str(source),
-            why=f"its sha256 differs from that of {content['source']['path']} in {bundle.POLICY}",
+            why=f"its sha256 differs from that of {origin.path} in {POLICY}",
             fix="give the file it was exported from (a checkpoint of a run's folder: its --step), or export it again",
         )
-    named = [m for m in found.models if m.name == content["source"].get("model")]
+    named = [m for m in found.models if m.name is not None and printable(m.name) == origin.model]
     original = (named or list(found.models))[0].original
     with naming(source):
-        return None if original is None else original.narrowed(source_map)
+        return None if original is None else original.narrowed(contract.source)

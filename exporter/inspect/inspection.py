@@ -15,8 +15,8 @@ from converters.graph.options import CompileOptions
 from converters.policy import Policy
 from converters.source import ReadOptions
 from exporter.cli.tables import size_text, table
-from exporter.export.bundle import safe_name
 from exporter.export.sources import naming, read_source
+from signatures.contract import safe_name
 from signatures.errors import ExportModelError
 from signatures.roles import Role
 from signatures.spec import TensorSpec

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exporter.export.bundle import distinct_names, safe_name, writing
+from converters.bundle.bundle import distinct_names, writing
+from signatures.contract import safe_name
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:

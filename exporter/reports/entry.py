@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from converters.frozen_graph.reader import read_graph
-from converters.graph.compile import CONTRACT_NODE
+from converters.bundle.bundle import Bundle
 from converters.graph.nodes import Graph
-from exporter.export import bundle
 from exporter.export.pipeline import ExportResult
 from exporter.verify.report import ParityReport
+from signatures.contract import Contract
 from signatures.errors import ExportModelError
 from signatures.sampling import draw_cases, draw_rollout
 from signatures.spec import PolicySignature
@@ -27,8 +25,7 @@ class Entry:
     report: ParityReport
     signature: PolicySignature | None = None
     graph: Graph | None = None
-    #: policy.json, or what is known of it
-    contract: Mapping[str, Any] = field(default_factory=dict)
+    contract: Contract | None = None
     #: Steps of a rollout, to draw its inputs again.
     steps: int = 4
 
@@ -56,20 +53,14 @@ def of_result(result: ExportResult, steps: int) -> Entry | None:
     if result.report is None:
         return None
     policy = result.policy
-    return Entry(result.report, policy.signature, policy.graph, result.contract, steps)
+    return Entry(result.report, policy.signature, policy.graph, result.agreed, steps)
 
 
 def of_bundle(report: ParityReport, folder: Path, steps: int) -> Entry:
     """The entry of a bundle that was verified again (so its files are what policy.json says)."""
-    content = bundle.read_policy_json(folder)
-    signature, _ = bundle.signature_of(content)
-    return Entry(report, signature, _graph_of(folder / f"{content['name']}.bytes"), content, steps)
-
-
-def _graph_of(file: Path) -> Graph | None:
-    """The graph of a bundle's .bytes; a report without a picture is better than none where it has gone since."""
+    found = Bundle.open(folder)
     try:
-        graph = read_graph(file.read_bytes())
-    except (OSError, ExportModelError):
-        return None
-    return Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE))
+        graph = found.graph()
+    except (OSError, ExportModelError):  # a report without a picture is better than none where it has gone since
+        graph = None
+    return Entry(report, found.signature, graph, found.contract, steps)

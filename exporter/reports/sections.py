@@ -62,9 +62,8 @@ def facts(entry: Entry) -> Markup:
         found.append(("Trained with", signature.family))
         branches = f", {' + '.join(map(str, signature.branches))}" if signature.branches else ""
         found.append(("Actions", signature.action_space + branches))
-    source = entry.contract.get("source")
-    if isinstance(source, dict) and source.get("path"):
-        found.append(("Source", el("code", str(source["path"]))))
+    if entry.contract is not None:
+        found.append(("Source", el("code", entry.contract.origin.path)))
     found += [
         ("Reference", el("code", report.reference)),
         ("Comparisons", f"{len(report.comparisons)} ({len(report.failures)} disagree)"),

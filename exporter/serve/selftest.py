@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph
 from exporter.verify.difference import floored, ties
 from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
@@ -36,13 +35,10 @@ _STORED = {"int64": "int32", "bool": "uint8"}
 
 def golden(signature: PolicySignature, file: Path) -> tuple[dict[str, Any], bytes]:
     """golden.json and golden.bin for the policy whose ``.bytes`` is ``file``."""
-    from converters.frozen_graph.reader import read_graph
-    from converters.graph.compile import CONTRACT_NODE
-    from converters.graph.passes.normalise import normalise
+    from converters.bundle.embed import read_runnable
     from converters.graph.run import run_graph
 
-    graph = read_graph(file.read_bytes())
-    graph = normalise(Graph(tuple(n for n in graph.nodes if n.name != CONTRACT_NODE)))
+    graph = read_runnable(file.read_bytes())
     drawn = random_outputs(graph, [s.name for s in signature.outputs])
     names = [s.name for s in signature.outputs if s.name not in drawn]
     book = _Book(signature)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import converters.tfjs
+from converters.bundle.bundle import Bundle, dumps, writing
+from converters.bundle.exchange import exchange, stage
+from converters.formats import WRITTEN
 from converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
-from exporter.export import bundle
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import TYPES
 from exporter.version import __version__
+from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError
-from signatures.spec import PolicySignature
 
 PAGE = Path(__file__).resolve().parent / "page"
 POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
@@ -62,27 +62,27 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     Raises BundleError (its files are not those of policy.json, it holds no TensorFlow.js or no .bytes), UsageError (the
     scene does not fit), RuntimeUnavailableError (the npm packages are not installed).
     """
-    content, signature = _checked(folder)
-    found = scene_of(content["name"], signature, scene)
-    opponent = None if found is None or found.side is None else _opponent(folder, content["name"], found)
+    policy = _checked(folder)
+    found = scene_of(policy.name, policy.signature, scene)
+    opponent = None if found is None or found.side is None else _opponent(policy, found)
     site = {path.relative_to(PAGE).as_posix(): path.read_bytes() for path in sorted(PAGE.rglob("*")) if _ours(path)}
     site["policy.mjs"] = POLICY_MODULE.read_bytes()
     vendor, backends, absent = _vendor()
     site.update(vendor)
-    site.update(_model(folder, content, "model"))
+    site.update(_model(policy, "model"))
     if opponent is not None:
-        site.update(_model(*opponent, "opponent"))
-    said, data = golden(signature, folder / f"{content['name']}.bytes")
-    site["golden.json"], site["golden.bin"] = f"{bundle.compact(said)}\n".encode(), data
-    site["policy.json"] = bundle.dumps(content)
-    site[SITE] = bundle.dumps(
+        site.update(_model(opponent, "opponent"))
+    said, data = golden(policy.signature, policy.graph_file)
+    site["golden.json"], site["golden.bin"] = f"{json.dumps(said, separators=(',', ':'))}\n".encode(), data
+    site["policy.json"] = dumps(policy.content)
+    site[SITE] = dumps(
         {
             "made_by": MADE_BY,
             "version": __version__,
-            "name": content["name"],
+            "name": policy.name,
             "scene": None if found is None else found.id,
             "side": None if found is None else found.side,
-            "opponent": None if opponent is None else opponent[1]["name"],
+            "opponent": None if opponent is None else opponent.name,
             "tfjs": package_version(js_home(), _TFJS),
             "backends": backends,
             "absent": absent,
@@ -94,7 +94,7 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
 
 def write_site(site: Mapping[str, bytes], place: Path) -> None:
     """Write a site, in place of an older one of ours. Raises BundleError where something else is in the way."""
-    with bundle.writing(place, "cannot be written"):
+    with writing(place):
         if place.is_symlink() or (place.exists() and not _replaceable(place)):
             raise BundleError(
                 "is in the way and is not a page of ours",
@@ -102,17 +102,12 @@ def write_site(site: Mapping[str, bytes], place: Path) -> None:
                 why=f"it has no {SITE} that says so",
                 fix="move it, or choose another folder with --out",
             )
-        place.parent.mkdir(parents=True, exist_ok=True)
-        stage = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
-        try:
+        with stage(place) as new:
             for name, data in site.items():
-                target = stage / name
+                target = new / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(data)
-            stage.chmod(0o755)
-            bundle.put_in_place(stage, place)
-        finally:
-            shutil.rmtree(stage, ignore_errors=True)
+            exchange(new, place)
 
 
 def _replaceable(place: Path) -> bool:
@@ -131,33 +126,33 @@ def _ours(path: Path) -> bool:
     return path.is_file() and path.suffix in TYPES
 
 
-def _checked(folder: Path) -> tuple[dict[str, Any], PolicySignature]:
-    content = bundle.read_policy_json(folder)
-    bundle.check_hashes(folder, content)
-    for file, why in (
-        ("tfjs/model.json", "the page runs TensorFlow.js"),
-        (f"{content['name']}.bytes", "what the page's answers are held against is computed from it"),
+def _checked(folder: Path) -> Bundle:
+    found = Bundle.open(folder)
+    found.verify_hashes()
+    for key, why in (
+        ("tfjs", "the page runs TensorFlow.js"),
+        ("bytes", "what the page's answers are held against is computed from it"),
     ):
-        if file not in content["files"]:
+        if not found.has(WRITTEN[key]):
+            file = WRITTEN[key].first_file_of(found.name)
             raise BundleError(f"has no {file}", where=str(folder), why=why, fix="export it again with --to bytes,tfjs")
-    signature, _ = bundle.signature_of(content)
-    return content, signature
+    return found
 
 
-def _model(folder: Path, content: Mapping[str, Any], place: str) -> dict[str, bytes]:
-    names = sorted(name for name in content["files"] if name.startswith("tfjs/"))
-    return {f"{place}/{name.removeprefix('tfjs/')}": (folder / name).read_bytes() for name in names}
+def _model(found: Bundle, place: str) -> dict[str, bytes]:
+    names = sorted(name for name in found.contract.files if WRITTEN["tfjs"].owns(name, found.name))
+    return {f"{place}/{name.removeprefix('tfjs/')}": (found.folder / name).read_bytes() for name in names}
 
 
-def _opponent(folder: Path, name: str, scene: Scene) -> tuple[Path, dict[str, Any]] | None:
+def _opponent(first: Bundle, scene: Scene) -> Bundle | None:
     """The other player's bundle, where it lies beside this one; the page says so where it does not."""
-    for other in other_side(name):
-        beside = folder.resolve().parent / other
-        if (beside / bundle.POLICY).is_file():
-            content, signature = _checked(beside)
-            found = scene_of(other, signature)
+    for other in other_side(first.name):
+        beside = first.folder.resolve().parent / other
+        if (beside / POLICY).is_file():
+            second = _checked(beside)
+            found = scene_of(other, second.signature)
             if found is not None and found.id == scene.id and found.side != scene.side:
-                return beside, content
+                return second
     return None
 
 

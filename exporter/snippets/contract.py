@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from converters.bundle import bundle
+from converters.formats import WRITTEN
 from converters.frozen_graph.reader import read_graph
-from exporter.export.bundle import check_hashes, read_policy_json, signature_of
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -73,34 +72,26 @@ class Bundle:
     @property
     def heads(self) -> tuple[TensorSpec, ...]:
         """The outputs that are the actions: one, or two of a hybrid."""
-        return self.signature.outputs[: 2 if self.signature.action_space == "hybrid" else 1]
+        return tuple(head.spec for head in self.signature.heads)
 
     def plain(self, head: TensorSpec) -> TensorSpec:
         """The output with ``head``'s action without chance; the head itself where there is none."""
-        others = self.signature.outputs[len(self.heads) :]
-        found = [s for s in others if s.role is Role.DETERMINISTIC]
-        pairs = dict(zip((h.name for h in self.heads), found, strict=False))
-        return pairs.get(head.name, head)
+        return self.signature.companion_of(head.name) or head
 
 
 def read_bundle(folder: Path) -> Bundle:
     """A bundle by its policy.json. Raises BundleError, also where its .bytes is not the one that was written."""
-    content = read_policy_json(folder)
-    signature, _ = signature_of(content)
-    name, files = content["name"], frozenset(content["files"])
-    graph = f"{name}.bytes"
-    nodes = _nodes(folder, graph, content["files"][graph]) if graph in files else frozenset()
-    return Bundle(folder, name, signature, files, nodes)
-
-
-def _nodes(folder: Path, file: str, entry: Mapping[str, Any]) -> frozenset[str]:
-    check_hashes(folder, {"files": {file: entry}})
-    return frozenset(node.name for node in read_graph((folder / file).read_bytes()).nodes)
+    found, frozen = bundle.Bundle.open(folder), WRITTEN["bytes"]
+    nodes: frozenset[str] = frozenset()
+    if found.has(frozen):
+        found.verify_hashes(frozen)
+        nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
+    return Bundle(folder, found.name, found.signature, frozenset(found.contract.files), nodes)
 
 
 def is_continuous(head: TensorSpec) -> bool:
     """Whether an action is of numbers, not of choices."""
-    return head.role is Role.CONTINUOUS or (head.role is Role.DETERMINISTIC and head.dtype == "float32")
+    return head.is_continuous
 
 
 def example_shape(spec: TensorSpec) -> tuple[int, ...]:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from converters.bundle.embed import runnable
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node, split_ref
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.ops.table import traits
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
@@ -77,13 +77,13 @@ class Bisector:
         return self._graph
 
     def _graphs(self) -> Iterator[Graph]:
-        yield plain(self.tested.graph)
+        yield runnable(self.tested.graph)
         with contextlib.suppress(ExportModelError, OSError):
-            yield plain(read_graph(self.tested.reference.read_bytes()))
+            yield runnable(read_graph(self.tested.reference.read_bytes()))
         saved = self.tested.artefacts.get("saved_model")
         if saved is not None:
             with contextlib.suppress(ExportModelError, OSError):
-                yield plain(saved_graph(saved))
+                yield runnable(saved_graph(saved))
 
     def _within(self, participant: Participant) -> InnerTensors:
         key = (participant.name, participant.runtime)
@@ -207,11 +207,6 @@ class _Search:
             hidden,
             reason=difference.reason,
         )
-
-
-def plain(graph: Graph) -> Graph:
-    """The graph as the numpy kernels run it: without the contract's string, in one spelling."""
-    return normalise(Graph(tuple(n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S")))
 
 
 def _chunks(tensors: Sequence[str], values: dict[str, np.ndarray]) -> Iterator[list[str]]:

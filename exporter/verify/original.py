@@ -28,18 +28,14 @@ class Original:
         self.source = source
         #: draws that the policy makes itself, and the source is given
         self.draws = np.random.default_rng(0)
-        heads = 2 if signature.action_space == "hybrid" else 1
-        #: the actions: continuous before discrete in a hybrid
-        self.heads: Sequence[TensorSpec] = signature.outputs[:heads]
-        plain = [s for s in signature.outputs[heads:] if s.role is Role.DETERMINISTIC]
         #: an action without chance → the action it belongs to
-        self.plain = {s.name: head for s, head in zip(plain, self.heads, strict=False)}
+        self.plain = {head.plain.name: head.spec for head in signature.heads if head.plain is not None}
 
     def _drawn(self, name: str) -> bool:
         return self.signature.output(name).role is Role.SAMPLED
 
     def _derivable(self, spec: TensorSpec) -> bool:
-        if spec.name in {h.name for h in self.heads}:
+        if spec.name in {h.name for h in self.signature.heads}:
             return False
         if spec.role is Role.LOG_PROBS:
             return self._has_logits()

@@ -14,10 +14,10 @@ from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from exporter.export.bundle import safe_name
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.difference import compare, floored
 from exporter.verify.tolerances import Tolerance, tolerance_for
+from signatures.contract import safe_name
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 from signatures.spec import PolicySignature

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from converters.bundle.embed import runnable
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node
 from converters.graph.options import CompileOptions
@@ -20,7 +21,7 @@ from converters.policy import Policy
 from converters.runtimes.process import RunFailedError
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify import bisection as bisect
-from exporter.verify.bisection import _Search, plain
+from exporter.verify.bisection import _Search
 from exporter.verify.difference import compare
 from exporter.verify.findings import Bisection, Numbers
 from exporter.verify.inner_tensors import InnerTensors
@@ -37,7 +38,7 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Policy]:
         place = tmp_path_factory.mktemp(name)
         options = ExportOptions(place, ("bytes",), verify="none", compile=CompileOptions())
         (result,) = export([fixture(name)], options)
-        made[name] = replace(result.policy, graph=plain(result.policy.graph))
+        made[name] = replace(result.policy, graph=runnable(result.policy.graph))
     return made
 
 
@@ -185,7 +186,7 @@ def test_no_more_than_a_runtime_should_hold_is_asked_at_a_time(
 def test_a_graph_is_run_without_the_contract(policies: dict[str, Policy]) -> None:
     read = read_graph(fixture("continuous").read_bytes())
     text = Node("text", "Const", value=np.array(b"x", object).astype("S1"))
-    assert "text" not in plain(Graph((*read.nodes, text)))
+    assert "text" not in runnable(Graph((*read.nodes, text)))
 
 
 # ------------------------------------------------------------------ the smallest tolerance

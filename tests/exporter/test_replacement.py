@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import sys
@@ -10,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export import bundle
+from converters.bundle import bundle, exchange
+from converters.bundle.bundle import Bundle
 from fixtures import path as fixture
+from signatures.contract import safe_name
 from signatures.errors import BundleError, UsageError
 from tests.commands import Ran, export_model, files_in, python
 
@@ -21,23 +24,23 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSI
 SUICIDE = """
 import os, shutil, signal, sys
 from pathlib import Path
-from exporter.export import bundle
+from converters.bundle import exchange as swap
 from exporter.cli.main import main
 
 point, *arguments = sys.argv[1:]
 kind, _, number = point.partition(":")
 left = int(number or 0)
-write, rename, exchange, remove = Path.write_bytes, Path.rename, bundle._exchange, shutil.rmtree
+write, rename, exchange, remove = Path.write_bytes, Path.rename, swap._exchanged, shutil.rmtree
 
 def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 def dying_write(path, data):
     global left
-    if left == 0:
+    if left == 0 and path.name != "stage.txt":
         write(path, data[: len(data) // 2])
         die()
-    left -= 1
+    left -= path.name != "stage.txt"
     return write(path, data)
 
 def dying_rename(path, target):
@@ -57,9 +60,9 @@ def dying_exchange(a, b):
 if kind == "write":
     Path.write_bytes = dying_write
 elif kind.endswith("exchange"):
-    bundle._exchange = dying_exchange
+    swap._exchanged = dying_exchange
 else:  # a system without an exchange
-    bundle._exchange = lambda a, b: False
+    swap._exchanged = lambda a, b: False
     if kind == "rename":
         Path.rename = dying_rename
     else:
@@ -82,7 +85,7 @@ def killed(point: str, out: Path) -> None:
 
 def is_whole(folder: Path) -> bool:
     """Whether every file of a bundle is the one that its policy.json names."""
-    bundle.check_hashes(folder, bundle.read_policy_json(folder))
+    Bundle.open(folder).verify_hashes()
     return True
 
 
@@ -138,8 +141,7 @@ def test_without_an_exchange_a_bundle_is_whole_at_the_other_points(point: str, o
 
 
 def test_without_an_exchange_the_old_bundle_goes_away_in_the_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bundle, "_exchange", lambda a, b: False)
-    (out / ".continuous.old").mkdir()
+    monkeypatch.setattr(exchange, "_exchanged", lambda a, b: False)
     assert exported(out, "--deterministic").status == 0
     assert is_deterministic(out / "continuous")
     assert {p.name for p in out.iterdir()} == {"continuous"}
@@ -148,11 +150,11 @@ def test_without_an_exchange_the_old_bundle_goes_away_in_the_end(out: Path, monk
 def test_without_an_exchange_a_rename_that_fails_puts_the_old_bundle_back(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bundle, "_exchange", lambda a, b: False)
+    monkeypatch.setattr(exchange, "_exchanged", lambda a, b: False)
     rename = Path.rename
 
     def failing(path: Path, target: Path) -> Path:
-        if ".old" not in path.name and ".old" not in target.name:
+        if path.name == "new":
             raise OSError(5, "Input/output error")
         return rename(path, target)
 
@@ -170,19 +172,19 @@ def test_linux_exchanges_two_folders_in_one_step(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / name).touch()
-    assert bundle._exchange(tmp_path / "a", tmp_path / "b")
+    assert exchange._exchanged(tmp_path / "a", tmp_path / "b")
     assert files_in(tmp_path) == {"a", "a/b", "b", "b/a"}
-    assert not bundle._exchange(tmp_path / "a", tmp_path / "nothing")
+    assert not exchange._exchanged(tmp_path / "a", tmp_path / "nothing")
 
 
 def test_other_systems_do_not_try_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
-    assert not bundle._exchange(tmp_path, tmp_path)
+    assert not exchange._exchanged(tmp_path, tmp_path)
 
 
 def test_a_libc_without_the_call_is_no_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("exporter.export.bundle.ctypes.CDLL", lambda *a, **k: object())
-    assert not bundle._exchange(tmp_path, tmp_path)
+    monkeypatch.setattr("converters.bundle.exchange.ctypes.CDLL", lambda *a, **k: object())
+    assert not exchange._exchanged(tmp_path, tmp_path)
 
 
 def test_a_replaced_bundle_leaves_nothing_of_the_old_one(out: Path) -> None:
@@ -201,6 +203,46 @@ def test_only_a_bundle_or_an_empty_folder_is_replaced(tmp_path: Path) -> None:
     assert files_in(tmp_path) == {"place"}
 
 
+def test_what_is_called_like_a_stage_but_is_not_ours_stays(out: Path) -> None:
+    """Folders of the user's own, old and named like ours or like a bundle: neither removed nor taken for a bundle."""
+    mine = [out / ".continuous.old", out / ".continuous.backup", out / ".export-model-continuous-mine"]
+    for folder in mine:
+        (folder / "old" / "continuous").mkdir(parents=True)
+        (folder / "notes.txt").write_text("mine")
+        os.utime(folder, (0, 0))
+    shutil.rmtree(out / "continuous")
+    assert exported(out, "--opset", "99").status == 2
+    assert not (out / "continuous").exists()
+    assert exported(out).status == 0
+    for folder in mine:
+        assert (folder / "notes.txt").read_text() == "mine"
+        assert (folder / "old" / "continuous").is_dir()
+
+
+def test_what_a_killed_run_left_is_removed_a_day_later(out: Path) -> None:
+    killed("write:1", out)
+    (left,) = [p for p in out.iterdir() if p.name.startswith(".")]
+    assert exported(out).status == 0
+    assert left.is_dir()
+    os.utime(left, (0, 0))
+    assert exported(out).status == 0
+    assert not left.exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks /proc which file it is")
+def test_all_is_on_the_disk_before_the_exchange(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+    sync, exchanged = os.fsync, exchange._exchanged
+    monkeypatch.setattr(
+        os, "fsync", lambda number: (seen.append(str(Path(f"/proc/self/fd/{number}").readlink())), sync(number))[1]
+    )
+    monkeypatch.setattr(exchange, "_exchanged", lambda a, b: (seen.append("exchange"), exchanged(a, b))[1])
+    assert exported(out).status == 0
+    before = {Path(p).name for p in seen[: seen.index("exchange")]}
+    assert before >= {"policy.json", "continuous.bytes", "continuous.onnx", "saved_model.pb", "tfjs", "new"}
+    assert Path(seen[-1]) == out
+
+
 def test_names_that_fall_together_are_found() -> None:
     bundle.distinct_names([("a", "x"), ("b", "y"), ("a", "x")])
     with pytest.raises(UsageError, match="x and y"):
@@ -212,5 +254,5 @@ def test_names_that_fall_together_are_found() -> None:
     [("3DBall", "3DBall"), ("a b/c\\d:e", "a-b-c-d-e"), ("", "policy"), ("...", "policy"), ("ä", "-")],
 )
 def test_names_are_made_safe(given: str, safe: str) -> None:
-    assert bundle.safe_name(given) == safe
-    assert bundle.safe_name(safe) == safe
+    assert safe_name(given) == safe
+    assert safe_name(safe) == safe

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from converters.bundle.embed import runnable
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import verify_folder
-from exporter.verify.bisection import plain
 from exporter.verify.difference import compare
 from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
 from exporter.verify.participants import PolicyUnderTest, participants_of
@@ -45,7 +45,7 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
     name: str, bundle: Bundle, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tested = policy_under_test(bundle(name).folder, monkeypatch)
-    graph = plain(tested.graph)
+    graph = runnable(tested.graph)
     case = draw_cases(tested.signature, seed=3, samples=1)[1]
     read = outputs_read([n.name for n in graph.nodes], [r for n in graph.nodes for r in n.inputs])
     tensors = [t for n in graph.nodes for t in read[n.name]]
@@ -75,7 +75,7 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
 
 def test_a_saved_model_has_the_same_graph_as_the_bytes(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     tested = policy_under_test(bundle("recurrent").folder, monkeypatch)
-    ours, other = plain(tested.graph), plain(saved_graph(tested.artefacts["saved_model"]))
+    ours, other = runnable(tested.graph), runnable(saved_graph(tested.artefacts["saved_model"]))
     assert [(n.name, n.op, n.inputs) for n in ours.nodes] == [(n.name, n.op, n.inputs) for n in other.nodes]
     assert all(
         np.array_equal(a.value, b.value) for a, b in zip(ours.nodes, other.nodes, strict=True) if a.op == "Const"

@@ -15,10 +15,10 @@ from converters.graph.run import run_graph
 from converters.onnx.writer import CONTRACT_KEY, write
 from converters.policy import Policy
 from exporter.cli.summary import failure_lines
-from exporter.export.bundle import compact, contract
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import FIXTURES, path
+from signatures.contract import Contract, Origin
 from signatures.errors import DamagedFileError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
@@ -27,11 +27,14 @@ from tests.onnx_reader.models import Bench, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")
 
-ORIGIN = {"path": "source", "sha256": "0" * 64}
+ORIGIN = Origin("source", "0" * 64)
+TOOL = {"name": "export-model", "version": "0"}
 
 
 def written(policy: Policy, folder: Path, opset: int = 15) -> Path:
-    (data,) = write(policy, WriteOptions(compact(contract(policy, ORIGIN)), opset)).values()
+    (data,) = write(
+        policy, WriteOptions(Contract(policy.name, policy.signature, ORIGIN, policy.source, TOOL).compact(), opset)
+    ).values()
     place = folder / f"{policy.name}-{opset}.onnx"
     place.write_bytes(data)
     return place

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from jsonschema import Draft202012Validator
 
-from exporter.export.bundle import dumps
+from converters.bundle.bundle import dumps
 from exporter.reports.schemas import schema
 from fixtures import FIXTURES
 from fixtures import path as fixture

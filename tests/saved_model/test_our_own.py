@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 
 from converters import schema
-from converters.graph.compile import CONTRACT_NODE
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.cli.summary import failure_lines
-from exporter.export.bundle import compact, contract
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import read_source
 from fixtures import FIXTURES
 from fixtures import path as fixture
+from signatures.contract import EMBEDDED, Contract, Origin
 from signatures.errors import BundleError, DamagedFileError, ExportModelError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
@@ -77,7 +76,13 @@ def test_the_contract_of_every_public_and_genuine_graph_is_kept(target: str, tmp
     for number, source in enumerate(sources):
         for policy in read_source(source).policies():
             folder = tmp_path / f"{number}-{policy.name}"
-            text = compact(contract(policy, {"path": source.name, "sha256": "0"}))
+            text = Contract(
+                policy.name,
+                policy.signature,
+                Origin(source.name, "0" * 64),
+                policy.source,
+                {"name": "n", "version": "0"},
+            ).compact()
             artifact = WRITTEN[target].artifact(policy, WriteOptions(text))
             for relative, data in artifact.files.items():
                 (folder / relative).parent.mkdir(parents=True, exist_ok=True)
@@ -175,7 +180,7 @@ def test_a_contract_that_cannot_be_read(bundle: Path) -> None:
     graph = schema.parse(schema.GraphDef, (bundle / "continuous.bytes").read_bytes(), "graph")
     for text in ("{", "{}", "3", '{"name": 3, "inputs": [], "outputs": []}'):
         for node in graph.node:
-            if node.name == CONTRACT_NODE:
+            if node.name == EMBEDDED:
                 node.attr["value"].tensor.string_val[:] = [text.encode()]
         file = bundle / "other.bytes"
         file.write_bytes(schema.serialise(graph))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,43 +11,55 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from signatures.roles import Role
+from signatures.contract import parse_signature, parse_source_map
+from signatures.fields import Field
+from signatures.roles import INPUT_ROLES, Role
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec
 
-NAMES = st.text(min_size=1, max_size=12)
+NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
 NUMBERS = st.integers(-(2**40), 2**40) | st.floats(allow_nan=False, allow_infinity=False)
 SHAPES = st.lists(st.none() | st.integers(0, 512), max_size=4).map(tuple)
 SOURCES = st.none() | NAMES | st.lists(NAMES, min_size=1, max_size=3).map(tuple)
-DISTRIBUTIONS = st.none() | st.fixed_dictionaries({"kind": st.just("normal"), "mean": st.lists(NUMBERS, max_size=3)})
-TENSORS = st.builds(
-    TensorSpec,
-    name=NAMES,
-    role=st.sampled_from(list(Role)),
-    dtype=st.sampled_from(["float32", "int32", "int64", "bool"]),
-    shape=SHAPES,
-    source=SOURCES,
-    distribution=DISTRIBUTIONS,
-)
-MEMORIES = st.none() | st.builds(
-    Memory,
-    size=st.integers(0, 512),
-    input=st.none() | NAMES,
-    output=st.none() | NAMES,
-    layout=st.lists(st.sampled_from("ch"), max_size=4).map(tuple),
-)
-SIGNATURES = st.builds(
-    PolicySignature,
-    inputs=st.lists(TENSORS, max_size=3).map(tuple),
-    outputs=st.lists(TENSORS, max_size=3).map(tuple),
-    family=NAMES,
-    action_space=st.sampled_from(["continuous", "discrete", "hybrid"]),
-    branches=st.lists(st.integers(1, 9), max_size=3).map(tuple),
-    algorithm=st.none() | st.sampled_from(["PPO", "SAC"]),
-    memory=MEMORIES,
-    preprocess=st.dictionaries(NAMES, st.just({"layout": "NHWC"}), max_size=2),
-    constants=st.dictionaries(NAMES, NUMBERS, max_size=3),
-    notes=st.lists(NAMES, max_size=2).map(tuple),
-)
+DISTRIBUTIONS = st.none() | st.fixed_dictionaries({"kind": st.just("normal"), "mean": NUMBERS, "std": NUMBERS})
+
+
+def tensors(roles: Sequence[Role], least: int = 0) -> st.SearchStrategy[tuple[TensorSpec, ...]]:
+    one = st.builds(
+        TensorSpec,
+        name=NAMES,
+        role=st.sampled_from(roles),
+        dtype=st.sampled_from(["float32", "int32", "int64", "bool"]),
+        shape=SHAPES,
+        source=SOURCES,
+        distribution=DISTRIBUTIONS,
+    )
+    return st.lists(one, min_size=least, max_size=3, unique_by=lambda s: s.name).map(tuple)
+
+
+@st.composite
+def signatures(draw: st.DrawFn) -> PolicySignature:
+    inputs = draw(tensors(INPUT_ROLES))
+    outputs = draw(tensors([r for r in Role if r not in INPUT_ROLES], 2))
+    name = st.none() | st.sampled_from([s.name for s in inputs]) if inputs else st.none()
+    memory = st.builds(
+        Memory,
+        size=st.integers(0, 512),
+        input=name,
+        output=st.none() | st.sampled_from([s.name for s in outputs]),
+        layout=st.lists(st.sampled_from("ch"), max_size=4).map(tuple),
+    )
+    return PolicySignature(
+        inputs=inputs,
+        outputs=outputs,
+        family=draw(NAMES),
+        action_space=draw(st.sampled_from(["continuous", "discrete", "hybrid"])),
+        branches=draw(st.lists(st.integers(1, 9), max_size=3).map(tuple)),
+        algorithm=draw(st.none() | st.sampled_from(["PPO", "SAC"])),
+        memory=draw(st.none() | memory),
+        preprocess={s.name: {"layout": "NHWC", "range": [0, 1], "from_bytes": "as they are"} for s in inputs[:1]},
+        constants=draw(st.dictionaries(NAMES, NUMBERS, max_size=3)),
+        notes=draw(st.lists(NAMES, max_size=2).map(tuple)),
+    )
 
 
 def through_json(content: dict[str, Any]) -> dict[str, Any]:
@@ -54,18 +67,13 @@ def through_json(content: dict[str, Any]) -> dict[str, Any]:
     return read
 
 
-@given(TENSORS)
-def test_a_tensor_is_read_back(spec: TensorSpec) -> None:
-    assert TensorSpec.from_dict(through_json(spec.to_dict())) == spec
-
-
-@given(SIGNATURES)
+@given(signatures())
 @settings(max_examples=60, deadline=None)
 def test_a_signature_is_read_back(signature: PolicySignature) -> None:
     entry = through_json(signature.to_dict())
-    assert PolicySignature.from_dict(entry) == signature
-    assert PolicySignature.from_dict({**entry, "files": {}, "schema": 1}) == signature
-    assert through_json(PolicySignature.from_dict(entry).to_dict()) == entry
+    assert parse_signature(Field(entry)) == signature
+    assert parse_signature(Field({**entry, "files": {}, "schema": 1})) == signature
+    assert through_json(parse_signature(Field(entry)).to_dict()) == entry
 
 
 ARRAYS = st.one_of(
@@ -100,7 +108,7 @@ def test_how_to_run_the_source_is_read_back(
     )
     signature = PolicySignature(inputs, outputs, "own model", "continuous")
     source = SourceMap({}, {}, fixed, batch_sizes, noise, kept, branches)
-    read = SourceMap.from_dict(through_json(source.to_dict()), signature)
+    read = parse_source_map(Field(through_json(source.to_dict())), signature)
     assert read.feeds == {"state": "vector_observation:0"}
     assert read.fetches["action"] == "action:0"
     assert "deterministic_action" not in read.fetches
@@ -112,7 +120,7 @@ def test_how_to_run_the_source_is_read_back(
 
 def test_an_empty_map_is_read_from_nothing() -> None:
     signature = PolicySignature((), (), "own model", "continuous")
-    assert SourceMap.from_dict({}, signature) == SourceMap()
+    assert parse_source_map(Field({}), signature) == SourceMap()
 
 
 def test_tensors_are_found_by_name() -> None:
@@ -138,3 +146,37 @@ def test_the_parts_of_policy_json_are_in_their_order() -> None:
         *("preprocess", "constants", "notes"),
     ]
     assert signature.to_dict()["memory"] == {"size": 4, "input": "a", "output": "b", "layout": ["c", "h"]}
+
+
+def hybrid(*companions: TensorSpec) -> PolicySignature:
+    heads = (
+        TensorSpec("continuous_actions", Role.CONTINUOUS, "float32", (None, 2)),
+        TensorSpec("discrete_actions", Role.LOG_PROBS, "float32", (None, 5)),
+    )
+    return PolicySignature((), (*heads, *companions), "own model", "hybrid", (2, 3))
+
+
+def test_each_action_of_a_hybrid_has_its_own_companion_even_where_one_is_missing() -> None:
+    steady = TensorSpec("deterministic_continuous_actions", Role.DETERMINISTIC, "float32", (None, 2))
+    likeliest = TensorSpec("deterministic_discrete_actions", Role.DETERMINISTIC, "int64", (None, 2))
+    assert [h.plain for h in hybrid(steady, likeliest).heads] == [steady, likeliest]
+    assert [h.plain for h in hybrid(likeliest, steady).heads] == [steady, likeliest]
+    assert [h.plain for h in hybrid(likeliest).heads] == [None, likeliest]
+    assert [h.plain for h in hybrid(steady).heads] == [steady, None]
+    assert hybrid(likeliest).companion_of("continuous_actions") is None
+    assert hybrid(likeliest).companion_of("discrete_actions") is likeliest
+    assert hybrid(likeliest).companion_of("deterministic_discrete_actions") is None
+    assert [(h.name, h.is_continuous, h.branches) for h in hybrid().heads] == [
+        ("continuous_actions", True, ()),
+        ("discrete_actions", False, (2, 3)),
+    ]
+
+
+def test_the_only_action_has_the_companion_that_there_is() -> None:
+    action = TensorSpec("action", Role.SAMPLED, "int64", (None, 1))
+    likeliest = TensorSpec("own/deterministic", Role.DETERMINISTIC, "int64", (None, 1))
+    scores = TensorSpec("action_log_probs", Role.LOG_PROBS, "float32", (None, 4))
+    signature = PolicySignature((), (action, likeliest, scores), "own model", "discrete", (4,))
+    assert signature.companion_of("action") is likeliest
+    assert signature.log_probs is scores
+    assert PolicySignature((), (likeliest,), "own model", "discrete", (4,)).heads[0].plain is None

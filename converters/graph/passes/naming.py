@@ -10,10 +10,8 @@ import numpy as np
 from converters.graph.compilation import Compilation
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, split_ref, topological
 from converters.graph.ops.table import traits
+from signatures.contract import EMBEDDED
 from signatures.roles import Constant, Role
-
-#: The name of the string constant in which our GraphDefs carry their contract.
-CONTRACT_NODE = "export_model_contract"
 
 
 def name_ports(c: Compilation) -> Compilation:
@@ -25,7 +23,7 @@ def name_ports(c: Compilation) -> Compilation:
     scope, source = c.brain.scope, c.options.names == "source"
     kept = {**c.facts.constants, **c.brain.constants} if source else {}
     unread = [n for n, r in c.roles.items() if r is Role.SEQUENCE_LENGTH and source]
-    reserved = (CONTRACT_NODE, *(scope + k for k in kept), *unread)
+    reserved = (EMBEDDED, *(scope + k for k in kept), *unread)
     graph = name_tensors(c.graph, c.feeds, c.fetches, reserved)
     torch = c.facts.family is not None and "PyTorch" in c.facts.family
     constants = [

@@ -39,7 +39,6 @@ _ONNXRUNTIME_WEB = "onnxruntime-web"
 _PACKAGES = (_CORE, _CONVERTER, _CPU, _WASM, "@tensorflow/tfjs", _ONNXRUNTIME_WEB, "playwright-core")
 
 _STDERR_LINES = 8
-_UNFINISHED = ".js-"
 
 
 def js_home() -> Path:
@@ -86,7 +85,7 @@ def install_packages(progress: Progress) -> Path:
             fix=f"install Node.js 18 or later, or: {INSTALL_NODE}; then: {INSTALL_TFJS}",
         )
     try:
-        with built_beside(target, _UNFINISHED, _has_packages) as building:
+        with built_beside(target, _has_packages) as building:
             for name in ("package.json", "package-lock.json"):
                 shutil.copyfile(JS_SOURCE / name, building / name)
             progress("installing TensorFlow.js, onnxruntime-web and playwright-core with npm (110 MB, 480 MB on disk)")

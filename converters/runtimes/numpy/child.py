@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.frozen_graph.reader import read_graph
+from converters.bundle.embed import read_runnable
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import reseed
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.runtimes.child import claim_stdout, serve
 from converters.runtimes.wire import Tensors
@@ -32,8 +31,7 @@ class _Model:
 
 def _load(header: Mapping[str, Any]) -> _Model:
     reseed(int(header.get("seed", 0)))
-    graph = read_graph(Path(header["path"]).read_bytes())
-    return _Model(normalise(Graph(tuple(n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S"))))
+    return _Model(read_runnable(Path(header["path"]).read_bytes()))
 
 
 def main() -> None:

@@ -42,7 +42,7 @@ def install(release: Release, progress: Progress) -> Path:
         raise RuntimeUnavailableError(f"TensorFlow {release.version} does not run here", why=reason)
     progress(f"fetching TensorFlow {release.version} with pip ({release.megabytes} MB)")
     try:
-        with built_beside(target, f".tf-{release.version}-", is_whole) as folder:
+        with built_beside(target, is_whole) as folder:
             _fill(folder, release)
     except OSError as error:
         raise RuntimeUnavailableError(

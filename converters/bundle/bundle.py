@@ -1,0 +1,222 @@
+"""A bundle: the folder of one policy, by its contract. It is opened, checked and written here, and nowhere else."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from converters.bundle.embed import embedded, without_contract
+from converters.bundle.exchange import exchange, recover, stage
+from converters.format import Artifact, Format
+from converters.frozen_graph.reader import read_graph
+from converters.graph.nodes import Graph
+from signatures.contract import POLICY, Contract, FileEntry, json_of, parse
+from signatures.digest import sha256_hex
+from signatures.errors import BundleError, UsageError
+from signatures.fields import FieldError
+from signatures.spec import PolicySignature
+
+_AGAIN = "export the policy again"
+#: A contract is some kilobytes; one with labels and statistics of large observations some hundred.
+_MOST_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A folder that this tool wrote, with what its policy.json says."""
+
+    folder: Path
+    contract: Contract
+    #: policy.json as it is, fields that are not known included
+    content: Mapping[str, Any] = field(repr=False)
+
+    @classmethod
+    def open(cls, folder: Path) -> Bundle:
+        """The bundle in ``folder``. Raises BundleError that names what is wrong with its policy.json."""
+        path = folder / POLICY
+        try:
+            if path.stat().st_size > _MOST_BYTES:
+                raise BundleError("is too large", where=str(path), why="no contract is", fix=_AGAIN)
+            content = json_of(path.read_bytes())
+            contract = parse(content)
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise BundleError(
+                "is no bundle",
+                where=str(folder),
+                why=f"it has no {POLICY}",
+                fix="give the folder that export-model wrote",
+            ) from error
+        except OSError as error:
+            raise BundleError("cannot be read", where=str(path), why=error.strerror, fix=_AGAIN) from error
+        except FieldError as error:
+            raise BundleError(
+                f"{error.field} {error.why}",
+                where=str(path),
+                why="this is no contract that this version of export-model reads",
+                fix=f"{_AGAIN}, or use the version of export-model that wrote it",
+            ) from error
+        if not contract.files:
+            raise BundleError("files is empty", where=str(path), why="a bundle holds a model", fix=_AGAIN)
+        return cls(folder, contract, content)
+
+    @property
+    def name(self) -> str:
+        """The policy's name."""
+        return self.contract.name
+
+    @property
+    def signature(self) -> PolicySignature:
+        """What the policy takes and gives."""
+        return self.contract.signature
+
+    def has(self, wanted: Format) -> bool:
+        """Whether it holds the policy in a format."""
+        return wanted.first_file_of(self.name) in self.contract.files
+
+    def path(self, wanted: Format) -> Path:
+        """What a loader is given of a format."""
+        return self.folder / wanted.main_of(self.name)
+
+    def size(self, wanted: Format) -> int:
+        """Bytes of all files of a format, as policy.json says."""
+        return sum(entry.size for path, entry in self.contract.files.items() if wanted.owns(path, self.name))
+
+    def verify_hashes(self, wanted: Format | None = None) -> None:
+        """Raise BundleError that names the first file (of a format) which is missing or not what was written."""
+        for relative, entry in self.contract.files.items():
+            if wanted is None or wanted.owns(relative, self.name):
+                self._verify(relative, entry)
+
+    def _verify(self, relative: str, entry: FileEntry) -> None:
+        path = self.folder / relative
+        if not _is_inside(path, self.folder):
+            raise BundleError(
+                f"names a file outside of the bundle: {relative}",
+                where=str(self.folder / POLICY),
+                why="a bundle's files lie in its folder",
+                fix=f"do not use this bundle; {_AGAIN}",
+            )
+        try:
+            found = sha256_hex(path.read_bytes())
+        except FileNotFoundError as error:
+            raise BundleError("is missing", where=str(path), why=f"{POLICY} names it", fix=_AGAIN) from error
+        except OSError as error:
+            raise BundleError("cannot be read", where=str(path), why=error.strerror, fix=_AGAIN) from error
+        if found != entry.sha256:
+            raise BundleError(
+                "has been changed since it was exported",
+                where=str(path),
+                why=f"its sha256 is not the one in {POLICY}",
+                fix=f"{_AGAIN}; compare foreign artefacts with export-model compare",
+            )
+
+    @property
+    def graph_file(self) -> Path:
+        """Its ``.bytes``. Raises BundleError where it has none."""
+        relative = f"{self.name}.bytes"
+        if relative not in self.contract.files:
+            raise BundleError(
+                "has no .bytes",
+                where=str(self.folder),
+                why="it is the graph that this tool reads and runs by itself",
+                fix=f"{_AGAIN} with bytes among --to",
+            )
+        return self.folder / relative
+
+    def graph(self) -> Graph:
+        """The graph of its ``.bytes``, without the contract.
+
+        Raises BundleError where it has none, or one that embeds another contract than policy.json; SourceError and its
+        like where it is damaged.
+        """
+        whole = read_graph(self.graph_file.read_bytes())
+        try:
+            same = json_of(embedded(whole) or "") == {k: v for k, v in self.content.items() if k != "files"}
+        except FieldError:
+            same = False
+        if not same:
+            raise BundleError(
+                "has been changed since it was exported",
+                where=str(self.folder / POLICY),
+                why="it is not the contract that the bundle's own graph embeds",
+                fix=_AGAIN,
+            )
+        return without_contract(whole)
+
+
+def dumps(content: Mapping[str, Any]) -> bytes:
+    """JSON as the bundle's files have it: keys in their given order, floats at full precision, a final newline."""
+    return (json.dumps(content, indent=1, ensure_ascii=True, allow_nan=False) + "\n").encode()
+
+
+@contextlib.contextmanager
+def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
+    """What the system refuses inside is a BundleError about ``place``."""
+    try:
+        yield
+    except OSError as error:
+        raise BundleError(
+            what, where=str(place), why=error.strerror, fix="make room or rights there, or choose another place"
+        ) from error
+
+
+@contextlib.contextmanager
+def staged(place: Path, contract: Contract, artifacts: Sequence[Artifact]) -> Iterator[Path]:
+    """A bundle in a new folder beside ``place``, gone afterwards unless it was put in its place. Raises BundleError."""
+    files = {path: data for artifact in artifacts for path, data in artifact.files.items()}
+    entries = {path: FileEntry(sha256_hex(data), len(data)) for path, data in sorted(files.items())}
+    whole = replace(contract, files=entries)
+    with contextlib.ExitStack() as stack:
+        with writing(place.parent, "the output folder cannot be written"):
+            new = stack.enter_context(stage(place))
+            for relative, data in (*files.items(), (POLICY, dumps(whole.to_dict()))):
+                (new / relative).parent.mkdir(parents=True, exist_ok=True)
+                (new / relative).write_bytes(data)
+        yield new
+
+
+def put_in_place(new: Path, place: Path) -> None:
+    """Exchange a staged bundle with what is at ``place``. Raises BundleError."""
+    check_replaceable(place)
+    with writing(place):
+        exchange(new, place)
+
+
+def check_replaceable(place: Path) -> None:
+    """Put back what a killed run had moved out of ``place``. Raises BundleError where it is not ours."""
+    with writing(place, "cannot be looked at"):
+        recover(place)
+        if not place.exists() and not place.is_symlink():
+            return
+        if place.is_dir() and not place.is_symlink() and (not any(place.iterdir()) or (place / POLICY).is_file()):
+            return
+    raise BundleError(
+        "is in the way and is not a bundle",
+        where=str(place),
+        why=f"it has no {POLICY}, so it is not this tool's to replace",
+        fix="move it, or choose another folder with -o or another --name",
+    )
+
+
+def distinct_names(policies: Sequence[tuple[str, str]]) -> None:
+    """Raise UsageError when two (name, where it comes from) fall together on a file system that folds case."""
+    seen: dict[str, str] = {}
+    for name, where in policies:
+        other = seen.setdefault(name.casefold(), where)
+        if other != where:
+            raise UsageError(
+                f"two policies would be written to {name!r}: {other} and {where}",
+                why="their names are the same once case and special characters are folded",
+                fix="export them one by one, each with --name",
+            )
+
+
+def _is_inside(path: Path, folder: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character
+        return False

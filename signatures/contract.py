@@ -1,0 +1,307 @@
+"""The contract: what policy.json says, and the copy that every artefact embeds. Only here is it parsed and validated.
+
+A contract comes from a file, so it is not trusted: types, ranges, names that can be printed, keys of files that stay
+inside the bundle. What is wrong is said with the field that it stands in (``outputs[1].shape``). Keys that are not
+known are left alone.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from signatures.fields import Field, FieldError
+from signatures.labels import parsed
+from signatures.memories import SourcePart
+from signatures.roles import INPUT_ROLES, Constant, Role
+from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
+
+POLICY, PARITY = "policy.json", "parity.json"
+SCHEMA = 1
+#: What an artefact calls the copy that it embeds: a node of a graph, a property of a model.
+EMBEDDED = "export_model_contract"
+#: Characters that may stand in a policy's name.
+_NAME = re.compile(r"[A-Za-z0-9._-]{1,255}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_DTYPES = (
+    *("bool", "float16", "float32", "float64", "int8", "int16", "int32", "int64"),
+    *("uint8", "uint16", "uint32", "uint64"),
+)
+_SPACES = ("continuous", "discrete", "hybrid")
+_OUTPUT_ROLES = tuple(r.value for r in Role if r not in INPUT_ROLES)
+#: What a placeholder that is fixed may hold.
+_MOST_FIXED = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class FileEntry:
+    """One file of a bundle: the sha256 of its bytes (hexadecimal) and how many they are."""
+
+    sha256: str
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a policy comes from: the source's base name and sha256, which model of it, how it was read."""
+
+    path: str
+    sha256: str
+    model: str | None = None
+    step: int | None = None
+    sensors: tuple[tuple[int, ...], ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in policy.json."""
+        content: dict[str, Any] = {"path": self.path, "sha256": self.sha256}
+        if self.model is not None:
+            content["model"] = self.model
+        if self.step is not None:
+            content["step"] = self.step
+        if self.sensors:
+            content["sensors"] = [list(shape) for shape in self.sensors]
+        return content
+
+
+@dataclass(frozen=True, slots=True)
+class Contract:
+    """What is agreed on a policy, the same in every format; ``files`` is empty in the copy that an artefact embeds."""
+
+    name: str
+    signature: PolicySignature
+    origin: Origin
+    source: SourceMap
+    tool: Mapping[str, str]
+    files: Mapping[str, FileEntry] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in policy.json, or as embedded where there are no files."""
+        files = {path: {"sha256": entry.sha256, "bytes": entry.size} for path, entry in self.files.items()}
+        return {
+            "schema": SCHEMA,
+            "name": self.name,
+            **self.signature.to_dict(),
+            "source": {**self.origin.to_dict(), **self.source.to_dict()},
+            **({"files": files} if files else {}),
+            "tool": dict(self.tool),
+        }
+
+    def compact(self) -> str:
+        """JSON on one line, for embedding."""
+        return json.dumps(self.to_dict(), separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+
+
+def safe_name(name: str) -> str:
+    """A name for files and folders: characters outside [A-Za-z0-9._-] become ``-``."""
+    cleaned = re.sub(r"[^A-Za-z0-9._-]", "-", name)
+    return cleaned if cleaned.strip(".") else "policy"
+
+
+def json_of(text: str | bytes) -> Any:
+    """What JSON text says. Raises FieldError."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FieldError("the whole", f"is not JSON ({error})"[:200]) from error
+
+
+def parse(content: Any) -> Contract:
+    """The contract in what JSON said. Raises FieldError that names the field."""
+    whole = Field(content)
+    if whole["schema"].value != SCHEMA:
+        raise whole["schema"].error(f"is {str(whole['schema'].value)[:20]!r}, and this version reads {SCHEMA}")
+    name = whole["name"]
+    if not isinstance(name.value, str) or not _NAME.fullmatch(name.value) or not name.value.strip("."):
+        raise name.error("is not the name of a policy")
+    signature = parse_signature(whole)
+    source, tool = whole["source"], whole["tool"]
+    origin = Origin(
+        source["path"].text(),
+        _sha256(source["sha256"]),
+        None if source["model"].missing else source["model"].text(blank=True),
+        None if source["step"].missing else source["step"].integer(-(2**63)),
+        tuple(tuple(n.integer(1) for n in shape.items(8)) for shape in source["sensors"].items(1000)),
+    )
+    files = {_key(path, entry): _file(entry) for path, entry in whole["files"].members().items()}
+    made = {key: tool[key].text() for key in ("name", "version")}
+    return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
+
+
+def parse_signature(whole: Field) -> PolicySignature:
+    """The part of a contract that describes the policy. Raises FieldError."""
+    inputs = _tensors(whole["inputs"], [r.value for r in INPUT_ROLES])
+    outputs = _tensors(whole["outputs"], _OUTPUT_ROLES)
+    space = whole["action_space"].one_of(_SPACES)
+    if len(outputs) < (2 if space == "hybrid" else 1):
+        raise whole["outputs"].error("lacks an action")
+    named = {s.name: s for s in inputs}
+    preprocess = {name: _preprocess(entry) for name, entry in whole["preprocess"].members().items()}
+    if not preprocess.keys() <= named.keys():
+        raise whole["preprocess"].error(f"names {min(preprocess.keys() - named.keys())!r}, which is no input")
+    try:
+        labels = parsed(whole["labels"].value)
+    except ValueError as error:
+        raise whole["labels"].error(str(error)) from error
+    return PolicySignature(
+        inputs=inputs,
+        outputs=outputs,
+        family=whole["family"].text(),
+        action_space=space,
+        branches=tuple(n.integer(1, 2**31 - 1) for n in whole["branches"].items()),
+        algorithm=None if whole["algorithm"].missing else whole["algorithm"].text(),
+        memory=None if whole["memory"].missing else _memory(whole["memory"], inputs, outputs),
+        preprocess=preprocess,
+        constants={name: _constant(value) for name, value in whole["constants"].members().items()},
+        notes=tuple(note.text() for note in whole["notes"].items()),
+        labels=labels,
+    )
+
+
+def parse_source_map(source: Field, signature: PolicySignature) -> SourceMap:
+    """How the source is run, with the feeds and fetches of ``signature``. Raises FieldError."""
+    parts = {name: tuple(_part(p) for p in given.items()) for name, given in source["parts"].members().items()}
+    known = {s.name for s in (*signature.inputs, *signature.outputs)}
+    if not parts.keys() <= known:
+        raise source["parts"].error(f"names {min(parts.keys() - known)!r}, which is no input or output")
+    return SourceMap(
+        feeds=sources(signature.inputs, parts),
+        fetches=sources(signature.outputs, parts),
+        fixed={name: _array(entry) for name, entry in source["fixed"].members().items()},
+        batch_sizes={name: rank.integer(0, 1) for name, rank in source["batch_sizes"].members().items()},
+        noise={name: shape.shape() for name, shape in source["noise"].members().items()},
+        noise_kept=source["noise_kept"].truth(),
+        branches=tuple(None if b.missing else b.text() for b in source["branches"].items()),
+        rows=None if source["rows"].missing else source["rows"].integer(1),
+        parts=parts,
+    )
+
+
+# ------------------------------------------------------------------ tensors
+
+
+def _tensors(entries: Field, roles: Any) -> tuple[TensorSpec, ...]:
+    found = tuple(_tensor(entry, roles) for entry in entries.items())
+    names = [s.name for s in found]
+    if len({*names}) < len(names):
+        raise entries.error("has two tensors of one name")
+    return found
+
+
+def _tensor(entry: Field, roles: Any) -> TensorSpec:
+    shape, source = entry["shape"].shape(), entry["source"]
+    return TensorSpec(
+        entry["name"].text(),
+        Role(entry["role"].one_of(roles)),
+        entry["dtype"].one_of(_DTYPES),
+        shape,
+        tuple(s.text() for s in source.items())
+        if isinstance(source.value, list)
+        else None
+        if source.missing
+        else source.text(),
+        None if entry["distribution"].missing else _distribution(entry["distribution"], shape),
+    )
+
+
+def _distribution(entry: Field, shape: tuple[int | None, ...]) -> dict[str, Any]:
+    kind = entry["kind"].one_of(("normal", "uniform", "integer", "mask"))
+    if kind == "integer":
+        low = entry["low"].integer(0)
+        entry["high"].integer(low)
+    elif kind == "uniform":
+        entry["low"].number()
+        entry["high"].number()
+    elif kind == "normal":
+        for key in ("mean", "std"):
+            _statistics(entry[key], shape)
+    return dict(entry.value)
+
+
+def _statistics(entry: Field, shape: tuple[int | None, ...]) -> None:
+    """A number, or one for each number of the input."""
+    if not isinstance(entry.value, list):
+        entry.number()
+        return
+    for number in entry.items(10_000_000):
+        number.number()
+    if shape and shape[-1] not in (None, len(entry.value)) and len(entry.value) != 1:
+        raise entry.error(f"has {len(entry.value)} numbers, and the input {shape[-1]}")
+
+
+def _preprocess(entry: Field) -> dict[str, Any]:
+    entry["layout"].one_of(("NHWC", "NCHW"))
+    low, high = (n.number() for n in _pair(entry["range"]))
+    if low >= high:
+        raise entry["range"].error("does not go up")
+    entry["from_bytes"].text()
+    return dict(entry.value)
+
+
+def _pair(entry: Field) -> list[Field]:
+    found = entry.items()
+    if len(found) != 2:
+        raise entry.error("is no pair")
+    return found
+
+
+def _memory(entry: Field, inputs: tuple[TensorSpec, ...], outputs: tuple[TensorSpec, ...]) -> Memory:
+    taken = None if entry["input"].missing else entry["input"].one_of([s.name for s in inputs])
+    given = None if entry["output"].missing else entry["output"].one_of([s.name for s in outputs])
+    layout = tuple(part.text() for part in entry["layout"].items())
+    return Memory(entry["size"].integer(0, 2**31 - 1), taken, given, layout)
+
+
+def _constant(value: Field) -> Constant:
+    return [n.integer(-(2**63)) for n in value.items()] if isinstance(value.value, list) else value.number()
+
+
+# ------------------------------------------------------------------ the source
+
+
+def _part(entry: Field) -> SourcePart:
+    shape = entry["shape"].shape()
+    if shape.count(None) != 1:
+        raise entry["shape"].error("has not one batch axis")
+    return SourcePart(entry["tensor"].text(), shape)
+
+
+def _array(entry: Field) -> np.ndarray:
+    dtype = np.dtype(entry["dtype"].one_of(_DTYPES))
+    try:
+        value = np.array(entry["value"].value)
+        if value.size > _MOST_FIXED or value.dtype.kind not in "biuf":
+            raise entry["value"].error("is no array of numbers")
+        return value.astype(dtype)
+    except (ValueError, TypeError, OverflowError) as error:
+        if isinstance(error, FieldError):
+            raise
+        raise entry["value"].error("is no array of numbers") from error
+
+
+# ------------------------------------------------------------------ files
+
+
+def _sha256(entry: Field) -> str:
+    if not isinstance(entry.value, str) or not _SHA256.fullmatch(entry.value):
+        raise entry.error("is no sha256 in hexadecimal")
+    return entry.value
+
+
+def _file(entry: Field) -> FileEntry:
+    return FileEntry(_sha256(entry["sha256"]), entry["bytes"].integer(0))
+
+
+def _key(path: str, entry: Field) -> str:
+    """A path inside the bundle in its normal form, on every system."""
+    parts = PurePosixPath(path).parts
+    if path != "/".join(parts) or not parts or {"..", "/"} & {*parts} or any(c in path for c in '\\:<>"|?*'):
+        raise entry.error("names a file outside of the bundle, or one that not every system can have")
+    if path in (POLICY, PARITY):
+        raise entry.error("is not a file of an artefact")
+    return path
