@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, normal_ref, ref, split_ref
+from converters.graph.nodes import Graph, Node, normal_ref, ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
@@ -54,6 +54,19 @@ def _added_up(
     return tuple(moved)
 
 
+def _needed(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:
+    """Names of the nodes that must be computed: those upstream of ``fetch``, not behind tensors that are fed."""
+    needed: set[str] = set()
+    stack = [normal_ref(name) for name in fetch]
+    while stack:
+        reference = stack.pop()
+        node = graph.producer(reference)
+        if reference not in fed and node.name not in needed:
+            needed.add(node.name)
+            stack.extend(node.inputs)
+    return needed
+
+
 def run_graph(
     graph: Graph,
     feeds: Mapping[str, np.ndarray],
@@ -62,17 +75,18 @@ def run_graph(
 ) -> dict[str, np.ndarray]:
     """Values of the tensors in ``fetch``, by the names they were asked under.
 
-    ``feeds`` may name any tensor, not only placeholders: a recorded draw can stand for a sampler's output. Raises
-    GraphError when a placeholder is not fed or a kernel fails.
+    ``feeds`` may name any tensor, not only placeholders: a recorded draw can stand for a sampler's output, and one of
+    an op's outputs for itself while the others are computed. Raises GraphError when a placeholder is not fed or a
+    kernel fails.
 
     With ``jitter`` every float that an op computes, and every term of a sum of products, is moved by one unit in its
     last place, up or down at random (Monte Carlo arithmetic), a sum by what rounding its partial sums makes, the result
     of a function that runtimes approximate by four units. How far the outputs then move is what rounding explains.
     """
     values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
-    needed = graph.ancestors(fetch, stop=frozenset(split_ref(name)[0] for name in values))
+    needed = _needed(graph, fetch, values)
     for node in graph.nodes:
-        if node.name not in needed or (node.name in values and node.op != "Split"):
+        if node.name not in needed:
             continue
         if node.op == "Placeholder":
             raise GraphError(

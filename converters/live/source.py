@@ -21,8 +21,6 @@ _KINDS = {
     "tf_function": (Format(key="tf_function", label="a live tf.function"), read_function),
     "keras_model": (Format(key="keras_model", label="a live Keras model"), read_keras),
 }
-#: What a caller may give: the parameters' names.
-LIVE = tuple(_KINDS)
 
 
 @dataclass(frozen=True)
@@ -36,12 +34,12 @@ class Live:
 
 
 def label(kind: str) -> str:
-    """What stands where other sources have a path, for a kind in ``LIVE``."""
+    """What stands where other sources have a path, for a live object of a kind."""
     return _KINDS[kind][0].label.removeprefix("a ")
 
 
 def read_live(kind: str, given: object, folder: Path) -> Live:
-    """Read ``given``, which is of a kind in ``LIVE``; neither it nor its graph is changed.
+    """Read ``given``, which is of a kind in ``_KINDS``; neither it nor its graph is changed.
 
     ``folder`` is empty and stays until the export is verified: what TensorFlow needs to run the original is written
     there. Raises UsageError for an object of another kind, SourceError and what a frozen graph raises.

@@ -46,7 +46,6 @@ _NARROW = {
     np.dtype(np.int16): INT32,
     np.dtype(np.uint16): INT32,
 }
-_DTYPE_NAMES = {"DT_INT64": "DT_INT32", "DT_DOUBLE": "DT_FLOAT", "DT_UINT8": "DT_INT32"}
 
 
 def _narrowed(node: Node) -> np.ndarray:
@@ -97,8 +96,12 @@ def _attribute(proto: Any) -> dict[str, Any]:
 
 
 def _dtype(number: int) -> str:
-    name = schema.dtype_name(schema.dtype_of(number))
-    return _DTYPE_NAMES.get(name, name)
+    return _dtype_name(schema.dtype_of(number))
+
+
+def _dtype_name(dtype: np.dtype) -> str:
+    """What TensorFlow.js calls the dtype that it has in place of one."""
+    return schema.dtype_name(_NARROW.get(dtype, dtype))
 
 
 def _shape(proto: Any) -> dict[str, Any]:
@@ -131,10 +134,9 @@ def _topology(graph: Graph) -> dict[str, Any]:
 
 
 def _tensor_info(spec: TensorSpec) -> dict[str, Any]:
-    name = schema.dtype_name(np.dtype(spec.dtype))
     return {
         "name": f"{spec.name}:0",
-        "dtype": _DTYPE_NAMES.get(name, name),
+        "dtype": _dtype_name(np.dtype(spec.dtype)),
         "tensorShape": {"dim": [{"size": str(-1 if n is None else n)} for n in spec.shape]},
     }
 

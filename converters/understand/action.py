@@ -70,12 +70,14 @@ def _without_gumbel(graph: Graph, scores: str) -> str | None:
 
 def _is_gumbel(graph: Graph, reference: str) -> bool:
     """Whether a tensor is log(−log(u)), u drawn from 0 to 1."""
-    for op in ("Log", "Neg", "Log"):
-        node = graph.producer(reference)
-        if node.op != op:
-            return False
-        reference = node.inputs[0]
-    return traits(graph.producer(reference)).sampler == "uniform"
+    drawn = _inside(graph, _inside(graph, _inside(graph, reference, "Log"), "Neg"), "Log")
+    return drawn is not None and traits(graph.producer(drawn)).sampler == "uniform"
+
+
+def _inside(graph: Graph, reference: str | None, op: str) -> str | None:
+    """The operand of ``op``, where that makes a tensor."""
+    node = None if reference is None else graph.producer(reference)
+    return node.inputs[0] if node is not None and node.op == op else None
 
 
 def _leaves(graph: Graph, reference: str) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from converters.frozen_graph.reader import read_graph
 from converters.graph.compilation import Compilation, Condition
 from converters.graph.compile import PASSES, compilations, compile_graph
 from converters.graph.nodes import Graph, Node
@@ -17,8 +18,12 @@ from exporter.export.sources import read_source
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.roles import Role
+from tests.graph.harness import Runtimes, difference
 from tests.graph.making import const, graph, node, placeholder
+from tests.graph.running import values
+from tests.graph.samples import floats
 
+pytestmark = pytest.mark.xdist_group("graph-passes")
 OPTIONS = {
     "as it is": CompileOptions(),
     "noise kept": CompileOptions(noise="keep"),
@@ -87,3 +92,20 @@ def test_brains_are_compiled_one_by_one() -> None:
     ]
     assert [p.name for p in compile_graph(graph(*nodes), "p")] == ["p-A", "p-B"]
     assert [p.name for p in compile_graph(graph(*nodes), "p", CompileOptions(brain="B"))] == ["p-B"]
+
+
+def test_all_passes_together_keep_what_tensorflow_computes(runtimes: Runtimes) -> None:
+    """The visual fixture flattens by shape arithmetic, draws noise and has two heads."""
+    source = read_graph(fixture("visual").read_bytes())
+    (policy,) = compile_graph(source, "visual")
+    feeds = {
+        "observation_0": floats(3, 20, 20, 3, low=0, high=1),
+        "state": floats(3, 4),
+        "epsilon": floats(3, 2, seed=2),
+    }
+    mine = values(policy.graph, feeds, "action", "value_estimate")
+    for expected, actual in zip(
+        runtimes.tensorflow(policy.graph, feeds, ["action", "value_estimate"]), mine, strict=True
+    ):
+        assert difference(expected, actual) is None
+    assert not {n.op for n in policy.graph.nodes} & {"Shape", "Prod", "Slice", "Pack", "StopGradient"}

@@ -233,6 +233,9 @@ def _tfjs_strided_slice(builder: GraphBuilder, node: Node, types: Mapping[str, T
 
 
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
+    """An index that is outside of its axis is an error, as in TensorFlow on a CPU; numpy counts some from the end."""
+    if indices.size and indices.dtype.kind in "iu" and indices.min() < 0:
+        raise IndexError(f"index {indices.min()} is out of bounds: TensorFlow does not count from the end")
     return np.take(x, indices, axis=0 if axis is None else int(axis))
 
 

@@ -30,7 +30,6 @@ DTYPES: Mapping[int, np.dtype] = {
     9: BOOL,
     11: FLOAT32,
 }
-DOUBLE = 11
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +85,6 @@ class Op:
         if number not in DTYPES:
             raise self.refused(f"{name} {number} is a data type that is not converted", "policies compute in float32")
         return DTYPES[number]
-
-    def uses(self, position: int) -> bool:
-        """Whether somebody reads the output at ``position``."""
-        return position < len(self.outputs) and bool(self.outputs[position])
 
     def refused(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:
         """The error that this node cannot be converted."""

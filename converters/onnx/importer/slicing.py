@@ -124,6 +124,8 @@ def _gather(op: Op, net: Importer) -> str:
     axis = net.axis(x, op.integer("axis", 0))
     length = net.shape(x)[axis]
     value = net.constant(indices)
+    if value is not None and isinstance(length, int) and ((value < -length) | (value >= length)).any():
+        raise op.refused(f"it takes an element that an axis of {length} does not have")
     if value is not None and value.ndim == 0 and (isinstance(length, int) or int(value) >= 0):
         index = int(value) % length if isinstance(length, int) else int(value)
         return _taken(net, x, axis, index)

@@ -1,0 +1,74 @@
+"""The numpy runner: what is computed, what may be fed, and what is an error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from converters.graph.run import run_graph
+from signatures.errors import ExportModelError, GraphError
+from tests.graph.harness import Runtimes, policy_of
+from tests.graph.making import const, graph, node, placeholder
+
+pytestmark = pytest.mark.xdist_group("graph-ops")
+
+X = np.arange(12, dtype=np.float32).reshape(2, 6)
+CUT = {
+    "Split": [const("axis", 1), node("cut", "Split", "axis", "x", num_split=3)],
+    "SplitV": [const("axis", 1), const("sizes", [2, 2, 2]), node("cut", "SplitV", "x", "sizes", "axis", num_split=3)],
+    "Unpack": [node("cut", "Unpack", "x", num=6, axis=1)],
+}
+
+
+def test_an_input_that_is_not_fed_is_named() -> None:
+    with pytest.raises(GraphError, match="'x' is not fed"):
+        run_graph(graph(placeholder("x", (None, 2)), node("y", "Neg", "x")), {}, ["y"])
+
+
+@pytest.mark.parametrize("fed", ["cut", "cut:0", "cut:1"])
+@pytest.mark.parametrize("op", CUT)
+def test_the_other_outputs_of_a_node_are_computed_where_one_is_fed(op: str, fed: str) -> None:
+    made = graph(placeholder("x", (None, 6)), *CUT[op])
+    plain = run_graph(made, {"x": X}, ["cut", "cut:1", "cut:2"])
+    given = np.full_like(plain["cut"], 7)
+    found = run_graph(made, {"x": X, fed: given}, ["cut", "cut:1", "cut:2"])
+    for name, value in plain.items():
+        np.testing.assert_array_equal(found[name], given if name == fed.removesuffix(":0") else value)
+
+
+@pytest.mark.parametrize("op", CUT)
+def test_nothing_behind_a_fed_output_is_needed(op: str) -> None:
+    made = graph(placeholder("x", (None, 6)), *CUT[op], node("y", "Neg", "cut:1"))
+    given = np.ones((2, 2), np.float32)
+    np.testing.assert_array_equal(run_graph(made, {"cut:1": given}, ["y"])["y"], -given)
+    with pytest.raises(GraphError, match="'x' is not fed"):
+        run_graph(made, {"cut:1": given}, ["y", "cut:2"])
+
+
+@pytest.mark.parametrize("index", [-1, 6])
+@pytest.mark.parametrize("op", ["Gather", "GatherV2"])
+def test_an_index_outside_of_its_axis_is_an_error_as_in_tensorflow(op: str, index: int, runtimes: Runtimes) -> None:
+    operands = [const("axis", 0)] if op == "GatherV2" else []
+    made = graph(
+        placeholder("x", (6,)), placeholder("i", (None,), np.int32), *operands,
+        node("y", op, "x", "i", *(o.name for o in operands)),
+    )  # fmt: skip
+    feeds = {"x": X[0], "i": np.array([0, index], np.int32)}
+    with pytest.raises(GraphError, match="'y'"):
+        run_graph(made, feeds, ["y"])
+    with pytest.raises(ExportModelError, match="is not in \\[0, 6\\)"):
+        runtimes.tensorflow(made, feeds, ["y"])
+
+
+@pytest.mark.parametrize("backend", ["tfjs-cpu", "tfjs-wasm"])
+def test_float16_inside_is_float32_in_tensorflow_js(backend: str, runtimes: Runtimes) -> None:
+    made = graph(
+        placeholder("x", (None, 3)),
+        node("half", "Cast", "x", DstT=np.dtype(np.float16)),
+        const("two", np.full(3, 2, np.float16)),
+        node("doubled", "Mul", "half", "two"),
+        node("y", "Cast", "doubled", DstT=np.dtype(np.float32)),
+    )
+    x = np.array([[0.5, -1.25, 3]], np.float32)
+    (y,) = runtimes.tfjs(backend, policy_of(made, ["y"]), {"x": x})
+    np.testing.assert_array_equal(y, x * 2, strict=True)
