@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, normal_ref, ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
@@ -60,10 +60,10 @@ def _needed(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str
     stack = [normal_ref(name) for name in fetch]
     while stack:
         reference = stack.pop()
-        node = graph.producer(reference)
-        if reference not in fed and node.name not in needed:
-            needed.add(node.name)
-            stack.extend(node.inputs)
+        if reference in fed or node_of(reference) in needed:
+            continue
+        needed.add(node_of(reference))
+        stack.extend(graph.producer(reference).inputs)
     return needed
 
 

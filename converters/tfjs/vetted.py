@@ -22,7 +22,7 @@ from signatures.errors import DamagedFileError
 #: What the official converter makes of other ops, and what TensorFlow 2 writes loops with: in memory, all of them.
 _OWN = frozenset(
     (
-        *("_FusedMatMul", "_FusedConv2D", "FusedDepthwiseConv2dNative", "Prelu"),
+        *("FusedDepthwiseConv2dNative", "Prelu"),
         *("TensorListReserve", "TensorListFromTensor", "TensorListGetItem", "TensorListSetItem", "TensorListStack"),
         *("TensorListConcat", "TensorListConcatV2", "TensorListLength", "TensorListResize", "EmptyTensorList"),
         *("TensorListPushBack", "TensorListPopBack", "TensorListGather", "TensorListScatter", "TensorListScatterV2"),

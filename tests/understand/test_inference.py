@@ -237,8 +237,8 @@ def test_outputs_that_the_format_declares_go_before_names() -> None:
         op("right", "Abs", "net/action"),
     )
     (brain,) = find_brains(g, declared={"left": Role.ACTION, "right": None})
-    assert brain.outputs == (("left", Role.ACTION, "left"),)
-    assert brain.left_out == ("right",)
+    assert brain.outputs == (("left", Role.ACTION, "left"), ("right", Role.OTHER, "right"))
+    assert brain.left_out == ()
     (only,) = find_brains(g, declared={"left": None})
     assert only.outputs == (("left", Role.ACTION, "left"),)
     with pytest.raises(SignatureError, match=r"left \(Neg\), right \(Abs\)"):
