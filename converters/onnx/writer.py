@@ -8,7 +8,7 @@ can point at a tensor inside.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,28 @@ from signatures.spec import TensorSpec
 IR_VERSIONS = {11: 6, 12: 7, 13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
 #: What people may ask for; profiles of old importers ask for less.
 ASKED_FOR = range(13, 22)
+#: Profiles whose importer swaps the operands of a Sub or Div of which the first is constant.
+SWAPS_OPERANDS = ("barracuda-1.0",)
+#: What works element by element, so that a Transpose may as well come behind it.
+_ELEMENTWISE = frozenset(
+    (
+        "Abs",
+        "Add",
+        "Div",
+        "Elu",
+        "Exp",
+        "LeakyRelu",
+        "Max",
+        "Min",
+        "Mul",
+        "Neg",
+        "Relu",
+        "Selu",
+        "Sigmoid",
+        "Sub",
+        "Tanh",
+    )
+)
 PRODUCER = "export-model"
 CONTRACT_KEY = "export_model_contract"
 
@@ -35,11 +57,15 @@ CONTRACT_KEY = "export_model_contract"
 class _Builder:
     """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
 
-    def __init__(self, graph: Graph, opset: int, outputs: Collection[str]) -> None:
+    def __init__(self, graph: Graph, opset: int, outputs: Collection[str], profile: str | None = None) -> None:
         import onnx
 
         self.onnx = onnx
         self.opset = opset
+        self.constant_first = profile not in SWAPS_OPERANDS
+        self._sinks = profile is not None
+        self._transposed: dict[str, tuple[str, tuple[int, ...]]] = {}
+        self._scalars: set[str] = set()
         self.types: Types = infer_types(graph)
         self._graph = graph
         self.outputs = frozenset(outputs)
@@ -77,6 +103,9 @@ class _Builder:
         return name
 
     def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
+        sunk = self._sunk(op, inputs, attributes) if self._sinks and outputs == 1 else ""
+        if sunk:
+            return sunk
         names = [self.fresh(f"{self._prefix}/{op}" if self._prefix else op) for _ in range(outputs)]
         for key, value in attributes.items():
             if isinstance(value, np.dtype):
@@ -84,13 +113,33 @@ class _Builder:
             elif isinstance(value, np.ndarray):
                 attributes[key] = self.onnx.numpy_helper.from_array(value)
         self.nodes.append(self.onnx.helper.make_node(op, list(inputs), names, name=names[0], **attributes))
+        if op == "Transpose":
+            self._transposed[names[0]] = (inputs[0], tuple(attributes["perm"]))
         return names[0] if outputs == 1 else tuple(names)
+
+    def _sunk(self, op: str, inputs: Sequence[str], attributes: Mapping[str, Any]) -> str:
+        """A node behind transposes put in front of them, empty where that is not to be done: two that undo each other
+        are none. Between the convolutions of a policy none is left; old importers lose their way in them.
+        """
+        turned = [self._transposed[i] for i in inputs if i in self._transposed]
+        if op == "Transpose" and turned:
+            source, first = turned[0]
+            order = [first[axis] for axis in attributes["perm"]]
+            return source if order == sorted(order) else ""
+        if op not in _ELEMENTWISE or not turned or len({order for _, order in turned}) > 1:
+            return ""
+        if any(i not in self._transposed and i not in self._scalars for i in inputs):
+            return ""
+        moved = self.emit(op, [self._transposed[i][0] if i in self._transposed else i for i in inputs], **attributes)
+        return str(self.emit("Transpose", [moved], perm=list(turned[0][1])))
 
     def const(self, array: np.ndarray, hint: str = "const") -> str:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             name = self.fresh("/".join(part for part in (self._prefix, hint) if part))
             self._constants[key] = name
+            if array.size == 1 and array.ndim < 2:
+                self._scalars.add(name)
             self.initializers.append(self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
         return self._constants[key]
 
@@ -149,6 +198,11 @@ class _Builder:
                         names[i] = new
             if node.name == old:
                 node.name = new
+        if old in self._transposed:
+            self._transposed[new] = self._transposed.pop(old)
+        for value, (source, order) in self._transposed.items():
+            if source == old:
+                self._transposed[value] = (new, order)
         self._taken.discard(old)
         self._taken.add(new)
 
@@ -203,7 +257,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
     graph = fuse(policy.graph, policy.fetches.values(), activations=False)
-    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs])
+    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], options.profile)
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)
     for node in graph.nodes:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,13 +67,13 @@ class Pair:
 
     def brain(self) -> Brain:
         """Behavior Parameters of an agent that the dressed policy is for."""
-        inputs = sorted(self.dressed.signature.observations, key=lambda s: int(s.name.removeprefix("obs_")))
-        constants = self.dressed.signature.constants
+        signature = self.dressed.signature
+        inputs = sorted(signature.observations, key=lambda s: int("0" + re.sub(r"\D", "", s.name)))
         shapes = [tuple(int(d or 1) for d in s.shape[1:]) for s in inputs]
-        branches = constants.get("discrete_action_output_shape", [])
-        width = constants.get("continuous_action_output_shape", 0)
-        assert isinstance(branches, list) and isinstance(width, int | float)
-        return Brain(int(width), tuple(branches), sensors=sensors_of(shapes))
+        drawn = [s for s in signature.outputs if s.role in (Role.CONTINUOUS, Role.DETERMINISTIC)]
+        width = next((int(s.shape[-1] or 0) for s in drawn if s.dtype == "float32"), 0)
+        vector = next((int(s.shape[-1] or 0) for s in inputs if s.name == "vector_observation"), 0)
+        return Brain(width, signature.branches, vector, sensors=sensors_of(shapes))
 
     def verdicts(self, folder: Path) -> dict[str, UnityVerdict]:
         """What our checker says for each release of the profile."""
@@ -106,8 +107,8 @@ class Pair:
 
     def _masks(self, rows: int, rng: np.random.Generator) -> np.ndarray | None:
         """Masks that leave one action of each branch allowed, and forbid others now and then."""
-        sizes = self.dressed.signature.constants.get("discrete_action_output_shape")
-        if not isinstance(sizes, list):
+        sizes = self.dressed.signature.branches
+        if not sizes:
             return None
         parts = []
         for size in sizes:
@@ -121,6 +122,9 @@ class Pair:
         if spec.role is Role.MASKS:
             assert masks is not None
             return masks
+        if isinstance(spec.source, tuple) and spec.role is Role.VECTOR:
+            parts = [s for s in self.policy.signature.inputs if s.role is Role.VECTOR]
+            return np.concatenate([own[s.name].astype(np.float32) for s in parts], 1)
         source = [s for s in self.policy.signature.inputs if s.role is spec.role and s.source == spec.source]
         assert len(source) == 1, spec
         value = own[source[0].name]
@@ -134,7 +138,12 @@ class Pair:
         self, expected: Feeds, actual: Feeds, scores: list[str], masks: np.ndarray | None, *, drawn: bool
     ) -> str | None:
         for spec in self.dressed.signature.outputs:
-            if spec.role is Role.SAMPLED or (drawn and spec.name == "continuous_actions"):
+            if spec.role is Role.SAMPLED or (drawn and spec.role is Role.CONTINUOUS):
+                continue
+            if spec.role is Role.LOG_PROBS:
+                found = self._branches_compared(expected, [actual[spec.name][:, a:b] for a, b in self._bounds()])
+                if found is not None:
+                    return found
                 continue
             name = self._own_name(spec)
             want, got = expected[name], actual[spec.name]
@@ -155,20 +164,33 @@ class Pair:
 
     def _scores_compared(self, expected: Feeds, actual: Feeds, scores: list[str]) -> str | None:
         """What is drawn from has the distribution of the policy's own log-probabilities."""
-        name = next((n for n in ("action_log_probs", "discrete_actions", "action") if n in expected), None)
-        roles = {s.name: s.role for s in self.policy.signature.outputs}
-        if not scores or name is None or roles[name] not in (Role.LOG_PROBS, Role.PROBS):
+        if not scores:
             return None
-        sizes = self.dressed.signature.constants["discrete_action_output_shape"]
-        assert isinstance(sizes, list)
-        own = expected[name] if roles[name] is Role.LOG_PROBS else np.log(expected[name])
-        parts = iter(scores)
-        for begin, size in zip(np.cumsum([0, *sizes]), sizes, strict=False):
-            if size == 1:
+        drawn = iter(scores)
+        parts = [None if b - a == 1 else actual[next(drawn)] for a, b in self._bounds()]
+        return self._branches_compared(expected, parts)
+
+    def _bounds(self) -> list[tuple[int, int]]:
+        sizes = self.dressed.signature.branches
+        ends = np.cumsum(sizes).tolist()
+        return [(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+
+    def _branches_compared(self, expected: Feeds, parts: Sequence[np.ndarray | None]) -> str | None:
+        roles = {s.name: s.role for s in self.policy.signature.outputs}
+        name = next(n for n in ("action_log_probs", "discrete_actions", "action") if n in expected)
+        best = next((n for n in ("deterministic_discrete_actions", "deterministic_action") if n in expected), None)
+        for number, ((begin, end), got) in enumerate(zip(self._bounds(), parts, strict=True)):
+            if got is None:
                 continue
-            want, got = _softmax(own[:, begin : begin + size]), _softmax(actual[next(parts)])
-            if not np.allclose(want, got, 1e-4, 1e-5, equal_nan=True):
-                return f"the branch at {begin} is drawn from {got[0]} instead of {want[0]}"
+            if roles[name] is Role.DETERMINISTIC:
+                assert best is not None
+                if got.argmax(1).tolist() != expected[best].reshape(len(got), -1)[:, number].tolist():
+                    return f"the best of branch {number} is another"
+                continue
+            own = expected[name] if roles[name] is Role.LOG_PROBS else np.log(expected[name])
+            want, have = _softmax(own[:, begin:end]), _softmax(got)
+            if not np.allclose(want, have, 1e-4, 1e-5, equal_nan=True):
+                return f"branch {number} is drawn from {have[0]} instead of {want[0]}"
         return None
 
 

@@ -13,6 +13,7 @@ from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES, profile
 from exporter import export_model
 from signatures.errors import ExportModelError, ProfileError, UsageError
+from signatures.roles import Role
 from tests import commands
 from tests.handmade import graph_bytes, sampled_policy
 from tests.targets.dressed import Pair, compiled, run
@@ -26,15 +27,45 @@ FIXTURES = [
 ]
 BATCHES = (1, 3, 16)
 
-#: Policies that a profile cannot hold: (file, what the refusal names).
-CANNOT = {
-    "lstmcell__legacy.onnx": "h_in, c_in",
-    "grucell__dynamo.onnx": "h_in",
-    "lidar_conv1d__dynamo.onnx": "lidar",
-    "entity_attention__legacy.onnx": "entities",
+#: Policies that a profile cannot hold: (file, profile) → what the refusal names.
+CANNOT_IN = {
+    ("sb3_ppo_gelu__dynamo_dyn.onnx", "barracuda-1.4"): "Erf",
+    ("sb3_ppo_gelu__dynamo_dyn.onnx", "barracuda-1.0"): "Erf",
+    ("norms__legacy.onnx", "barracuda-1.0"): "ReduceMean",
+    ("entity_attention__legacy.onnx", "barracuda-3"): "Reshape",
+    ("entity_attention__legacy.onnx", "barracuda-1.4"): "Reshape",
+    ("autoregressive__legacy.onnx", "barracuda-1.0"): "ArgMax",
+    ("autoregressive__dynamo.onnx", "barracuda-1.0"): "ArgMax",
+    ("sb3_ppo_mlp_bin__legacy_dyn.onnx", "barracuda-1.0"): "Round",
+    # an action [B, n, 1], whose elements Barracuda 1.1 gives in another order
+    ("Balint-H+marathon-envs__ControllerMarathonMan-v1-no-collisions.onnx", "barracuda-1.0"): "Reshape",
+    ("Balint-H+marathon-envs__Hopper-v0.onnx", "barracuda-1.0"): "Reshape",
+    # a flattened image joined with a vector
+    ("visual.bytes", "barracuda-1.0"): "Concat",
+    # Barracuda 1.1 has no Shape, which a sum of exponentials that may be infinite, and rows of constants, are made with
+    **dict.fromkeys(
+        (
+            (f"{name}.onnx", "barracuda-1.0")
+            for name in (
+                "clean_ppo_cont_sampled__legacy",
+                "sb3_maskable_bool__dynamo_dyn",
+                "sb3_maskable_bool__legacy_fixed",
+                "sb3_maskable_dist__legacy_fixed",
+                "sb3_maskable_where__dynamo_dyn",
+                "sb3_ppo_discobs__dynamo_dyn",
+                "sb3_ppo_discobs__legacy_fixed",
+                "sb3_ppo_mlp_disc__dynamo_fixed",
+                "sb3_ppo_mlp_multi__legacy_fixed",
+                "sb3_ppo_stoch_box__legacy_fixed",
+                "sb3_ppo_stoch_disc__legacy_fixed",
+                "sb3_trpo_mlp_disc__dynamo_dyn",
+                "sb3_discrete",
+                "sb3_stochastic",
+            )
+        ),
+        "Shape",
+    ),
 }
-#: Policies that one profile cannot hold.
-CANNOT_IN = {("sb3_ppo_gelu__dynamo_dyn.onnx", "barracuda-1.4"): "Erf"}
 
 
 def held(path: Path, wanted: Profile, folder: Path) -> int:
@@ -45,9 +76,14 @@ def held(path: Path, wanted: Profile, folder: Path) -> int:
         return 0  # other tests say which files are no policies
     count = 0
     for policy in policies:
-        named = CANNOT.get(path.name) or CANNOT_IN.get((path.name, wanted.name))
-        if policy.signature.memory is not None and policy.signature.memory.output is None:
+        named = CANNOT_IN.get((path.name, wanted.name))
+        memory = policy.signature.memory
+        if memory is not None and wanted.name == "barracuda-1.0":
+            named = "it has a memory"
+        elif memory is not None and memory.output is None:
             named = "not given back"
+        elif wanted.name == "barracuda-1.0" and any(s.role is Role.ENTITIES for s in policy.signature.inputs):
+            named = "list of entities"
         if named:
             with pytest.raises(ProfileError, match=named):
                 Pair.of(policy, wanted)
@@ -56,7 +92,9 @@ def held(path: Path, wanted: Profile, folder: Path) -> int:
         for seed, rows in enumerate(BATCHES):
             assert pair.difference(rows, seed) is None, (policy.name, rows)
         for name, verdict in pair.verdicts(folder).items():
-            assert all(verdict.accepted.values()), (policy.name, name, verdict.to_dict())
+            # releases 1 to 16 know no deterministic inference
+            modes = ["stochastic"] if wanted.name == "barracuda-1.0" else list(verdict.accepted)
+            assert all(verdict.accepted[mode] for mode in modes), (policy.name, name, verdict.to_dict())
         count += 1
     return count
 
@@ -64,8 +102,11 @@ def held(path: Path, wanted: Profile, folder: Path) -> int:
 @pytest.mark.parametrize("wanted", PROFILES, ids=lambda p: p.name)
 @pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
 def test_a_fixture_acts_the_same_and_is_accepted(path: Path, wanted: Profile, tmp_path: Path) -> None:
-    lost = path.name == "ppo_0_22_lstm.onnx"  # ML-Agents 0.20 to 0.24 exported no recurrent_out
-    assert (held(path, wanted, tmp_path) == 0) == lost
+    count = held(path, wanted, tmp_path)
+    # ML-Agents 0.20 to 0.24 exported no recurrent_out; version 2 holds no memory
+    lost = path.name == "ppo_0_22_lstm.onnx" or (path.name, wanted.name) in CANNOT_IN
+    lost = lost or (wanted.name == "barracuda-1.0" and ("lstm" in path.name or path.name == "recurrent.bytes"))
+    assert (count == 0) == lost
 
 
 def _sources() -> list[Path]:
@@ -114,8 +155,7 @@ def test_masks_that_a_policy_lacks_are_supplied_and_applied(draws: bool, tmp_pat
     assert not policy.signature.has_input("action_masks")
     pair = Pair.of(policy, profile("unity6"))
     assert any("action_masks was added" in note for note in pair.dressed.signature.notes)
-    ((width, *_),) = pair.made_constant("discrete_action_output_shape").tolist()
-    width = int(width)
+    (width,) = pair.dressed.signature.branches
     rng = np.random.default_rng(0)
     feeds = {
         s.name: rng.standard_normal([width * 50, *(d or 1 for d in s.shape[1:])]).astype(np.float32)

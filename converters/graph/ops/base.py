@@ -31,6 +31,8 @@ class OnnxBuilder(Protocol):
     """What a lowering may use. Values are ONNX names; ``value`` gives the one that stands for a tensor of the graph."""
 
     opset: int
+    #: False: the importer that is written for swaps the operands of Sub and Div where the first is a constant
+    constant_first: bool
 
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""

@@ -77,12 +77,13 @@ def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, 
     return OpDef(name, broadcast_of(count=2), _plain(function), lowering, (T,), elementwise=True, **traits)
 
 
-def _pair(onnx_op: str) -> Lower:
+def _pair(name: str) -> Lower:
     """An ONNX op of two operands. A constant is written without leading axes of length 1 where the other operand has
     as many: Barracuda 1.1 gives the result of [B, n] and [1, n] another shape (Add_02).
     """
 
     def lower(node: Node, builder: OnnxBuilder) -> str:
+        onnx_op = name
         kinds = [builder.type_of(r) for r in node.inputs]
         values = []
         for kind, other, reference in zip(kinds, reversed(kinds), node.inputs, strict=True):
@@ -91,6 +92,10 @@ def _pair(onnx_op: str) -> Lower:
                 leading = next((i for i, n in enumerate(constant.shape) if n != 1), constant.ndim - 1)
                 value = builder.const(constant.reshape(constant.shape[leading:]), "row")
             values.append(value)
+        inverse = {"Sub": ("Neg", "Add"), "Div": ("Reciprocal", "Mul")}.get(onnx_op)
+        if inverse is not None and not builder.constant_first and kinds[0].constant is not None:
+            values[1], onnx_op = builder.emit(inverse[0], values[1:]), inverse[1]
+            values.reverse()
         result: str = builder.emit(onnx_op, values)
         return result
 

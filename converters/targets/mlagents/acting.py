@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from converters.graph.types import INT32, INT64
+from converters.graph.types import FLOAT32, INT32, INT64
 from converters.targets.mlagents.dressing import Dressing, row
 from converters.targets.mlagents.feeding import supply_masks
 from converters.understand.action import action_meaning
@@ -77,6 +77,7 @@ def branches(dressing: Dressing, spec: TensorSpec, masks: str | None) -> Branche
     """The branches of the discrete action ``spec``; masks are supplied and applied where ``masks`` is None."""
     builder, signature = dressing.builder, dressing.policy.signature
     scores, sizes = _scores(dressing, spec)
+    dressing.branches = sizes
     samples = best = None
     if masks is None:
         masks = supply_masks(dressing, sum(sizes))
@@ -108,6 +109,27 @@ def samples(dressing: Dressing, found: Branches) -> tuple[str, str]:
         ]
         drawn = builder.concat(parts, 1)
     return drawn, best or builder.concat([_best(dressing, s) for s in found.scores], 1)
+
+
+def log_probabilities(dressing: Dressing, spec: TensorSpec, found: Branches) -> str:
+    """What a consumer draws from, float32 [B, sum of branches]: log-probabilities per branch, one after the other.
+
+    A policy that does not draw gets the best action of each branch far above all others.
+    """
+    builder = dressing.builder
+    if spec.role is Role.DETERMINISTIC:
+        return builder.concat([_settled(dressing, s) for s in found.scores], 1)
+    if spec.role is Role.SAMPLED:
+        return builder.concat([builder.add("LogSoftmax", [s], "log_probabilities") for s in found.scores], 1)
+    return builder.concat(list(found.scores), 1)
+
+
+def _settled(dressing: Dressing, score: str) -> str:
+    """0 for the best, far below it for the others."""
+    builder = dressing.builder
+    best = builder.add("Equal", [score, builder.reduce("Max", score, [1], keep=True)], "is_best")
+    other = builder.add("Sub", [builder.cast(best, FLOAT32), builder.floats(1.0, "one")])
+    return builder.add("Mul", [other, builder.floats(_FORBIDDEN)], "settled")
 
 
 def _best(dressing: Dressing, score: str) -> str:

@@ -42,6 +42,7 @@ class Dressing:
     fetches: dict[str, str] = field(default_factory=dict)
     constants: dict[str, np.ndarray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    branches: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         self.builder = Builder(NameScope(n.name for n in self.policy.graph.nodes))
@@ -129,6 +130,7 @@ class Dressing:
             inputs=tuple(s for s in self.inputs if s.name in feeds),
             outputs=tuple(self.outputs),
             memory=memory,
+            branches=self.branches,
             preprocess=preprocess,
             constants={k: _plain(v) for k, v in self.constants.items()},
             notes=(*self.policy.signature.notes, *self.notes),

@@ -1,0 +1,101 @@
+"""API version 2: what ML-Agents' C# side looks up from 0.7 to release 16.
+
+``vector_observation`` (all vectors joined), ``visual_observation_i``, ``action_masks``, ``prev_action``; ``action``:
+continuous actions, or log-probabilities of all branches, which the C# side draws from (GeneratorImpl.cs, ApplierImpl.cs
+1.0 to 1.9). A policy with both kinds has ``continuous_actions`` and ``discrete_actions``, from release 11 on. Constants
+are float32 outputs, as the torch exporter wrote them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from converters.policy import Policy
+from converters.targets.mlagents import feeding
+from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities
+from converters.targets.mlagents.dressing import Dressing
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+_VERSION = 2
+VECTOR = "vector_observation"
+
+
+def dress(policy: Policy, profile: str) -> Policy:
+    """The policy under the names of API version 2. Raises ProfileError where it cannot be held."""
+    dressing = Dressing(policy, profile)
+    feeding.refuse_parameters(dressing)
+    if policy.signature.memory is not None:
+        dressing.refuse(
+            "it has a memory",
+            why="the ONNX of API version 2 gave no memory back, or one that was right for a single agent alone",
+            fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
+        )
+    images = _take_observations(dressing)
+    masks = feeding.take_masks(dressing)
+    feeding.take_previous_action(dressing)
+    dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
+    dressing.constants["version_number"] = np.array([_VERSION], np.float32)
+    dressing.constants["memory_size"] = np.array([0], np.float32)
+    _give_actions(dressing, heads(dressing), masks)
+    return dressing.finished(None, images)
+
+
+def _take_observations(dressing: Dressing) -> dict[str, object]:
+    signature = dressing.policy.signature
+    entities = [s.name for s in signature.observations if s.role is Role.ENTITIES]
+    if entities:
+        dressing.refuse(
+            f"its observation {entities[0]} is a list of entities",
+            why="ML-Agents 1.x has no sensor of variable length",
+            fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
+        )
+    images: dict[str, object] = {}
+    for number, spec in enumerate(s for s in signature.observations if s.role is Role.VISUAL):
+        name = f"visual_observation_{number}"
+        feeding.take_observation(dressing, name, spec)
+        images[name] = {"layout": "NCHW", "range": [0, 1], "from_bytes": "divide by 255"}
+    vectors = [s for s in signature.observations if s.role is Role.VECTOR]
+    if len(vectors) == 1:
+        feeding.take_observation(dressing, VECTOR, vectors[0])
+    elif vectors:
+        _take_joined(dressing, vectors)
+    return images
+
+
+def _take_joined(dressing: Dressing, vectors: list[TensorSpec]) -> None:
+    """Several vectors, which the C# side joins in the order of its sensors."""
+    widths = [s.shape[-1] for s in vectors]
+    if any(w is None or len(s.shape) != 2 for w, s in zip(widths, vectors, strict=True)):
+        dressing.refuse(
+            f"the shape of its observation {vectors[0].name} is {list(vectors[0].shape)}",
+            why="vectors are fed as one row of a known width",
+            fix="export the model again with all lengths but the batch fixed",
+        )
+    known = [int(w or 0) for w in widths]
+    joined = TensorSpec(VECTOR, Role.VECTOR, "float32", (None, sum(known)), tuple(str(s.source) for s in vectors))
+    taken = dressing.take(VECTOR, joined, (None, sum(known)))
+    for number, (spec, width) in enumerate(zip(vectors, known, strict=True)):
+        begin = sum(known[:number])
+        dressing.give_in(spec, dressing.builder.slice(taken, 1, begin, begin + width))
+    names = ", ".join(f"{s.name} ({w})" for s, w in zip(vectors, known, strict=True))
+    dressing.notes.append(f"{VECTOR} is {names}, one behind the other")
+
+
+def _give_actions(dressing: Dressing, found: Heads, masks: str | None) -> None:
+    both = found.continuous is not None and found.discrete is not None
+    constants = dressing.constants
+    if found.continuous is not None:
+        drawn, _, width = continuous_rows(dressing, found.continuous)
+        constants["continuous_action_output_shape" if both else "action_output_shape"] = np.array([width], np.float32)
+        dressing.give("continuous_actions" if both else "action", drawn, Role.CONTINUOUS, found.continuous.source)
+    if found.discrete is not None:
+        scores = branches(dressing, found.discrete, masks)
+        total = np.array([sum(scores.sizes)], np.float32)
+        constants["discrete_action_output_shape" if both else "action_output_shape"] = total
+        given = log_probabilities(dressing, found.discrete, scores)
+        dressing.give("discrete_actions" if both else "action", given, Role.LOG_PROBS, found.discrete.source)
+    if both:
+        dressing.notes.append("continuous_actions and discrete_actions are read by release 11 and later")
+    else:
+        constants["is_continuous_control"] = np.array([found.continuous is not None], np.float32)
