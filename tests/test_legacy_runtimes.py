@@ -11,17 +11,18 @@ from pathlib import Path
 import pytest
 
 from converters.runtimes.registry import Runtime, RuntimeInfo
-from converters.runtimes.tensorflow1 import found as legacy
+from converters.runtimes.tensorflow1 import found
 from converters.runtimes.tensorflow1 import install as legacy_install
-from converters.runtimes.tensorflow1.found import (
+from converters.runtimes.tensorflow1 import release as legacy
+from converters.runtimes.tensorflow1.found import RUNTIMES
+from converters.runtimes.tensorflow1.install import install, weaken_python_symbols
+from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     LIBRARIES,
     RELEASES,
-    RUNTIMES,
     is_whole,
     library_folder,
 )
-from converters.runtimes.tensorflow1.install import install, weaken_python_symbols
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 
@@ -37,7 +38,8 @@ def quiet(_: str) -> None:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache of a user whose machine can run them."""
     monkeypatch.setattr(legacy, "cache_folder", lambda: tmp_path / "cache")
-    monkeypatch.setattr(legacy, "unsupported_reason", lambda: None)
+    for module in (legacy, found, legacy_install):
+        monkeypatch.setattr(module, "unsupported_reason", lambda: None)
     monkeypatch.setattr(legacy_install, "unsupported_reason", lambda: None)
     return tmp_path / "cache"
 

@@ -83,6 +83,31 @@ def test_only_the_children_and_what_acts_import_a_runtime(module: Path) -> None:
         assert not set(imported(ast.parse(module.read_text(encoding="utf-8")))) & RUNTIMES
 
 
+def own_imports(path: Path, names: set[str]) -> set[str]:
+    """The modules of this project that a module imports, lazily too; those for type checking alone do not count."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for found in ast.walk(tree):
+        if isinstance(found, ast.If) and ast.unparse(found.test) == "TYPE_CHECKING":
+            found.body = []
+    wanted: list[str] = []
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Import):
+            wanted += [alias.name for alias in found.names]
+        elif isinstance(found, ast.ImportFrom):
+            module = found.module or ""
+            wanted += [n if (n := f"{module}.{alias.name}") in names else module for alias in found.names]
+    return names & set(wanted)
+
+
+def test_no_module_imports_itself_round_a_corner() -> None:
+    """Lazy imports count: a cycle that is only broken by waiting is a cycle."""
+    paths = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", "."): p for p in MODULES}
+    left = {name: own_imports(path, set(paths)) - {name} for name, path in paths.items()}
+    while free := {name for name, others in left.items() if not others}:
+        left = {name: others - free for name, others in left.items() if name not in free}
+    assert not left, f"these modules import each other: {left}"
+
+
 def loaded_by(*arguments: object) -> set[str]:
     """Top-level modules that a command imports."""
     ran = python("-X", "importtime", *arguments)

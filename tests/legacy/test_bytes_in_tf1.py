@@ -16,7 +16,7 @@ from converters.frozen_graph.reader import read_graph
 from converters.graph.options import CompileOptions
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
-from converters.runtimes.tensorflow1.found import RELEASES
+from converters.runtimes.tensorflow1.release import RELEASES
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.findings import Finding
 from exporter.verify.participants import PolicyUnderTest

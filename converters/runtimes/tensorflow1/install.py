@@ -1,4 +1,4 @@
-"""Fetching the C libraries of TensorFlow 1.4 and 1.7 from their wheels (found.py says what for)."""
+"""Fetching the C libraries of TensorFlow 1.4 and 1.7 from their wheels (release.py says what for)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from converters.runtimes.base import Progress
 from converters.runtimes.cache import built_beside
-from converters.runtimes.tensorflow1.found import (
+from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     LIBRARIES,
     Release,
