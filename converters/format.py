@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from converters.fetch import Fetched
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
+    from signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
 #: How a child process is told to load an artefact that has no signatures.
@@ -110,7 +111,8 @@ class Format:
       compute, no file from elsewhere.
     - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
-      once; ``dtypes`` are the only ones that it has (empty: all).
+      once; ``dtypes`` are the only ones that it has (empty: all); ``answers`` are the outputs of a policy that an
+      artefact answers (None: all).
     """
 
     key: str
@@ -131,6 +133,7 @@ class Format:
     signatures: bool = False
     predicts: bool = False
     dtypes: frozenset[str] = frozenset()
+    answers: Callable[[PolicySignature], list[str]] | None = None
 
     @property
     def readable(self) -> bool:

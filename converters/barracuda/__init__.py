@@ -1,16 +1,19 @@
-"""Barracuda's ``.nn`` models."""
+"""Barracuda's ``.nn`` models: read, and written (version 16) for Unity's ML-Agents of 0.7 to release 20."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from converters.format import Format
+from converters.format import Format, WriteOptions
 
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
+    from signatures.spec import PolicySignature
 
 #: Versions of the format, an int64 at its beginning.
 _VERSIONS = range(15, 21)
@@ -26,4 +29,27 @@ def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return read(given)
 
 
-FORMATS = (Format(key="nn", label="a Barracuda .nn model", sniff=_sniff, read=_read),)
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+    from converters.barracuda.writer import write
+
+    return write(policy, options)
+
+
+def _answers(signature: PolicySignature) -> list[str]:
+    from converters.barracuda.answers import answered
+
+    return answered(signature)
+
+
+FORMATS = (
+    Format(
+        key="nn",
+        label="a Barracuda .nn model",
+        sniff=_sniff,
+        read=_read,
+        write=_write,
+        main="{name}.nn",
+        runtimes=("numpy",),
+        answers=_answers,
+    ),
+)

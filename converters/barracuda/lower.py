@@ -13,8 +13,8 @@ constants               ``version_number`` 2, ``memory_size``, ``is_continuous_c
 =====================  ============================================================================================
 
 Source: ``BarracudaModelParamLoader`` and ``TensorGenerator`` of ML-Agents 0.7 to release 20. What such a policy gives
-besides (``value_estimate``, ``action_probs``) is written too. The action without chance is not: the largest score of
-each branch, or the action at ``epsilon`` 0.
+besides (``value_estimate``, ``action_probs``, a deterministic action of its own) is written too. The action without
+chance is not where it is made here: it is the largest score of each branch, or the action at ``epsilon`` 0.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ API_VERSION = 2
 
 _IMAGE: Axes = (0, 1, 2, 3)
 _IMAGE_NCHW: Axes = (0, 3, 1, 2)
-_NAMES = {Role.MASKS: "action_masks", Role.PREV_ACTION: "prev_action", Role.NOISE: "epsilon"}
+#: What ML-Agents calls the inputs that there is one of.
+INPUT_NAMES = {Role.MASKS: "action_masks", Role.PREV_ACTION: "prev_action", Role.NOISE: "epsilon"}
 _EXTRA = {Role.VALUE: "value_estimate", Role.ACTION_PROBS: "action_probs"}
 #: What an action is called: alone, or by its kind.
 HEADS = ("action", "continuous_actions", "discrete_actions")
@@ -80,9 +81,10 @@ class _Lowering:
         self.inputs: list[NnInput] = []
         self.parts = self._memory_parts()
         self.heads = [s for s in self.signature.outputs if base_name(s) in HEADS]
-        taken = [*HEADS, *_NAMES.values(), *_EXTRA.values(), *_CONSTANTS, "vector_observation", "recurrent_in"]
+        taken = [*HEADS, *INPUT_NAMES.values(), *_EXTRA.values(), *_CONSTANTS, "vector_observation", "recurrent_in"]
         taken += [f"visual_observation_{i}" for i in range(len(self.signature.inputs))]
         taken += [name for part in self.parts for name in (part.taken, part.given)]
+        taken += [base_name(spec) for spec in self.signature.outputs]
         self.b = NnBuilder(infer_types(self.graph), taken)
         self.outputs: list[str] = []
 
@@ -99,8 +101,8 @@ class _Lowering:
             reference = results[spec.name]
             if spec in self.heads:
                 self._action(spec, [values[r] for r in scores] if reference is None else [values[reference]])
-            elif reference is not None and spec.role in _EXTRA:
-                self._output(_EXTRA[spec.role], self._row(values[reference]))
+            elif reference is not None:
+                self._output(_EXTRA.get(spec.role, base_name(spec)), self._row(values[reference]))
         if memory is not None and memory.output is not None:
             self._memories_out(self._row(values[self.policy.fetches[memory.output]]))
         return self._assembled()
@@ -114,7 +116,7 @@ class _Lowering:
         cameras = [s for s in self.signature.inputs if s.role is Role.VISUAL]
         for number, spec in enumerate(cameras):
             self._camera(given, number, spec)
-        for role, name in _NAMES.items():
+        for role, name in INPUT_NAMES.items():
             for number, spec in enumerate(s for s in self.signature.inputs if s.role is role):
                 if number == 0:
                     given[self._feed(spec)] = self._input(name, self._lengths(spec))
@@ -236,9 +238,13 @@ class _Lowering:
             return next(self.policy.fetches[s.name] for s in self.signature.outputs if s.role is Role.LOG_PROBS)
         if spec in self.heads and spec.role is Role.DETERMINISTIC and self._discrete(spec):
             return None
-        if spec in self.heads or spec.role in _EXTRA:
+        if spec in self.heads or spec.role in _EXTRA or self._own_quiet(spec):
             return self.policy.fetches[spec.name]
         return None
+
+    def _own_quiet(self, spec: TensorSpec) -> bool:
+        """An action without chance that the source has itself: of some trainers, not the one at no noise."""
+        return spec.role is Role.DETERMINISTIC and spec.source is not None and spec.dtype == "float32"
 
     def _discrete(self, spec: TensorSpec) -> bool:
         name = base_name(spec)

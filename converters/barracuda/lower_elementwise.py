@@ -20,6 +20,7 @@ from converters.graph.types import Dim
 
 #: Times this, every difference that float32 tells apart from 0 near 1 is beyond ±1.
 _STEEP = 1e30
+_LARGEST = float(np.finfo(np.float32).max)
 
 _ACTIVATIONS = MappingProxyType(
     {
@@ -337,17 +338,30 @@ def compare(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 
 def select(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """A where the condition holds, else b: condition·(a − b) + b. Barracuda has no choice before 1.4."""
+    """A where the condition holds, else b: condition·a + (1 − condition)·b. Barracuda has no choice before 1.4.
+
+    What is computed is bounded first: infinity times 0 would be no number.
+    """
     condition, *choices = args
     shape = b.shape_of(b.node.name)
     if any(v.array is not None and not np.isfinite(v.array).all() for v in choices):
         raise b.refused("it chooses an infinite number", "Barracuda before 1.4 has no choice, only products and sums")
     if b.node.op == "Select" and len(condition.shape) == 1 < len(shape):
         condition = _as_rows(b, condition, len(shape))
-    values = [_float(v) for v in choices]
-    difference = _combined(b, LayerType.SUB, values[0], values[1], shape)
-    chosen = _combined(b, LayerType.MUL, difference, condition, shape)
-    return _combined(b, LayerType.ADD, chosen, values[1], shape)
+    first, second = (_bounded(b, v) for v in choices)
+    if condition.array is not None:
+        holds = condition.array.astype(np.float32)
+        condition, other = replace(condition, array=holds), replace(condition, array=1 - holds)
+    else:
+        other = _mapped(b, condition, lambda x: b.shifted(b.scaled(x, -1, "negative"), 1, "other"))
+    chosen = [_combined(b, LayerType.MUL, v, c, shape) for v, c in ((first, condition), (second, other))]
+    return _combined(b, LayerType.ADD, chosen[0], chosen[1], shape)
+
+
+def _bounded(b: NnBuilder, value: Value) -> Value:
+    if value.array is not None:
+        return replace(value, array=value.array.astype(np.float32))
+    return _mapped(b, value, lambda x: b.at_least(b.at_most(x, _LARGEST), -_LARGEST))
 
 
 def _as_rows(b: NnBuilder, condition: Value, rank: int) -> Value:
@@ -358,23 +372,13 @@ def _as_rows(b: NnBuilder, condition: Value, rank: int) -> Value:
     return replace(condition, shape=shape, axes=(*condition.axes, *[None] * (rank - 1)))
 
 
-def _float(value: Value) -> Value:
-    return value if value.array is None else replace(value, array=value.array.astype(np.float32))
-
-
 def _combined(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape: tuple[Dim, ...]) -> Value:
     """Two values combined inside of an op: constants at once, others by layers."""
     if first.array is not None and second.array is not None:
-        functions = {LayerType.SUB: np.subtract, LayerType.MUL: np.multiply, LayerType.ADD: np.add}
+        functions = {LayerType.MUL: np.multiply, LayerType.ADD: np.add}
         array = functions[kind](first.array, second.array)
         return Value(_constant_shape(array, shape), array=array)
     shape = _broadcast(first, second, shape)
-    if kind is LayerType.SUB:
-        if second.array is not None:
-            second = replace(second, array=np.multiply(second.array, np.float32(-1)))
-        else:
-            second = _mapped(b, second, lambda x: b.scaled(x, -1, "negative"))
-        kind = LayerType.ADD
     pair = _Pair(b, [first, second], shape)
     names = pair.names if pair.full(0) and pair.arrays[0] is None else pair.names[::-1]
     return pair.made(_two(b, pair, kind, names[0], names[1], "chosen"))

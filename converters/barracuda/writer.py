@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from converters.barracuda.encode import encode
-from converters.barracuda.format import Trailer
+from converters.barracuda.format import Trailer, parse
 from converters.barracuda.lower import policy_model
 from converters.format import WriteOptions
 from converters.policy import Policy
@@ -25,3 +25,8 @@ def write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
     """The ``.nn``. Raises UnsupportedOpError or SignatureError that names what the format cannot hold."""
     trailer = Trailer(_NO_SOURCE, _NO_VERSION, PRODUCER, metadata=((CONTRACT_KEY, options.contract),))
     return {f"{policy.name}.nn": encode(replace(policy_model(policy), trailer=trailer))}
+
+
+def contract_text(data: bytes) -> str:
+    """The contract that a ``.nn`` carries, empty where it has none. Raises DamagedFileError."""
+    return parse(data).metadata(CONTRACT_KEY) or ""

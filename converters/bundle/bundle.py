@@ -134,8 +134,13 @@ class Bundle:
         like where it is damaged.
         """
         whole = read_graph(self.graph_file.read_bytes())
+        self.verify_contract(embedded(whole) or "")
+        return without_contract(whole)
+
+    def verify_contract(self, text: str | bytes) -> None:
+        """Raise BundleError where an artefact embeds another contract than policy.json."""
         try:
-            same = json_of(embedded(whole) or "") == {k: v for k, v in self.content.items() if k != "files"}
+            same = json_of(text) == {k: v for k, v in self.content.items() if k != "files"}
         except FieldError:
             same = False
         if not same:
@@ -145,7 +150,6 @@ class Bundle:
                 why="it is not the contract that the bundle's own graph embeds",
                 fix=_AGAIN,
             )
-        return without_contract(whole)
 
 
 def dumps(content: Mapping[str, Any]) -> bytes:

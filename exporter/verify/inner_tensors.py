@@ -75,6 +75,8 @@ def _of_format(participant: Participant, path: Path, pool: RuntimePool) -> Abstr
         return _saved_model(path, key or "serving_default", pool)
     if kind == "onnx":
         return _onnx(participant.runtime, path, pool)
+    if kind == "nn":  # layers are called otherwise, and several ops are one
+        return contextlib.nullcontext(InnerTensors(lambda tensor: None, participant.model.run))
     if kind == "tfjs":
         return contextlib.nullcontext(InnerTensors(_own_name(_tfjs_nodes(path)), participant.model.run))
     return contextlib.nullcontext(InnerTensors(_own_name(_graph_nodes(path)), _not_what_is_fed(participant.model.run)))

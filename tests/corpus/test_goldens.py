@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from converters.format import WriteOptions
-from converters.formats import WRITTEN
+from converters.formats import DEFAULTS, WRITTEN
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
@@ -80,7 +80,7 @@ def answers(policy: Policy, folder: Path, pool: RuntimePool, source: Path) -> di
     """Runtime → (how to run it, whether draws can be fed to it)."""
     outputs = [s.name for s in policy.signature.outputs]
     result: dict[str, tuple[Answer, bool]] = {}
-    for target in WRITTEN:
+    for target in DEFAULTS:
         artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
         for name, data in artifact.files.items():
             path = folder / name

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import exporter
-from converters.formats import WRITTEN
+from converters.formats import DEFAULTS, WRITTEN
 from converters.runtimes.base import Progress
 from converters.runtimes.javascript.node import install_packages
 from converters.runtimes.registry import RUNTIMES, Runtime
@@ -109,7 +109,7 @@ def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) 
     assert lines[0].endswith(f" -> {tmp_path / 'continuous'}")
     assert lines[-1].startswith(f"next: export-model verify {tmp_path / 'continuous'}")
     assert "NOT VERIFIED: --verify none" in lines
-    assert [line.split()[0] for line in lines[3:7]] == list(WRITTEN)
+    assert [line.split()[0] for line in lines[3:7]] == list(DEFAULTS)
 
 
 def test_an_export_of_bytes_says_that_unity_wants_the_trainers_names(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from converters.format import WriteOptions
-from converters.formats import WRITTEN
+from converters.formats import DEFAULTS, WRITTEN
 from converters.graph.nodes import Graph
 from converters.policy import Policy
 from fixtures import FIXTURES
@@ -102,7 +102,7 @@ def plant(monkeypatch: pytest.MonkeyPatch, target: str, output: str = "action") 
 
 
 @pytest.mark.parametrize("name", ["continuous", "discrete", "sampled", "recurrent"])
-@pytest.mark.parametrize("target", list(WRITTEN))
+@pytest.mark.parametrize("target", DEFAULTS)
 def test_a_wrong_weight_in_one_format_is_found_and_named(
     target: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,7 @@
 """The numpy reference in its own process: a frozen graph of ours, run by the kernels of the op table.
 
+A ``.nn`` of ours runs here as well, through this project's reader, since no runtime outside Unity has it.
+
 ``python -m converters.runtimes.numpy.child``
 """
 
@@ -29,9 +31,21 @@ class _Model:
         return run_graph(self.graph, feeds, fetch, None if jitter is None else np.random.default_rng(jitter))
 
 
-def _load(header: Mapping[str, Any]) -> _Model:
+class _NnModel:
+    def __init__(self, data: bytes) -> None:
+        from converters.barracuda.answers import NnPolicy
+
+        self.policy = NnPolicy(data)
+
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        jitter = request.get("jitter")
+        return self.policy.run(feeds, fetch, None if jitter is None else np.random.default_rng(jitter))
+
+
+def _load(header: Mapping[str, Any]) -> _Model | _NnModel:
     reseed(int(header.get("seed", 0)))
-    return _Model(read_runnable(Path(header["path"]).read_bytes()))
+    data = Path(header["path"]).read_bytes()
+    return _NnModel(data) if header["path"].endswith(".nn") else _Model(read_runnable(data))
 
 
 def main() -> None:

@@ -1,0 +1,119 @@
+"""A ``.nn`` under the names of its contract, in a bundle, and verified there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.barracuda.answers import NnPolicy, answered, contract_of
+from converters.barracuda.encode import encode
+from converters.barracuda.format import parse
+from converters.barracuda.writer import CONTRACT_KEY
+from converters.format import WriteOptions
+from converters.formats import DEFAULTS, WRITTEN
+from converters.graph.options import CompileOptions
+from converters.graph.run import run_graph
+from converters.runtimes.pool import RuntimePool
+from exporter.cli.summary import failure_lines
+from exporter.export.pipeline import ExportOptions, export, verify_folder
+from exporter.verify.tolerances import Tolerance, tolerance_for
+from signatures.errors import BundleError, DamagedFileError
+from signatures.roles import Role
+from tests.barracuda.conftest import SHARED, params
+from tests.barracuda.nn_running import some
+from tests.barracuda.test_writer import FIXTURES, policies
+
+
+def test_it_is_written_on_request_only() -> None:
+    assert "nn" in WRITTEN
+    assert "nn" not in DEFAULTS
+
+
+@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("options", [{}, {"names": "source"}, {"deterministic": True}, {"noise": "zero"}], ids=str)
+def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str, Any]) -> None:
+    for policy in policies(path, **options):
+        signature = policy.signature
+        contract = WriteOptions(json.dumps(signature.to_dict()))
+        (data,) = WRITTEN["nn"].artifact(policy, contract).files.values()
+        nn = NnPolicy(data)
+        assert nn.signature.to_dict() == signature.to_dict()
+        names = answered(signature)
+        assert names == [s.name for s in signature.outputs if s.role is not Role.SAMPLED]
+        for rows in (1, 3):
+            feeds = some(policy, rows)
+            expected = run_graph(policy.graph, feeds, names)
+            for name, value in nn.run(feeds, names).items():
+                assert value.dtype == expected[name].dtype, name
+                bound = tolerance_for(signature, name, Tolerance())
+                np.testing.assert_allclose(value, expected[name], atol=max(bound.atol, 1e-3), rtol=1e-3, err_msg=name)
+
+
+def test_a_file_without_a_contract_says_so() -> None:
+    policy = policies(FIXTURES[0])[0]
+    (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
+    model = parse(data)
+    for other in (model, replace(model, trailer=None)):
+        with pytest.raises(DamagedFileError, match="no contract"):
+            contract_of(other)
+
+
+@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
+def test_a_bundle_of_a_nn_alone_is_written_and_verified(path: Path, tmp_path: Path, pool: RuntimePool) -> None:
+    for result in export([path], ExportOptions(tmp_path, ["nn"], verify="numpy"), pool=pool):
+        assert result.report is not None
+        assert result.report.passed is None, "no runtime computes it by itself"
+        report = verify_folder(result.folder, runtimes="numpy")
+        assert report.passed is None
+        assert not [c for c in report.comparisons if not c.passed], failure_lines(report)
+        assert {(c.format, c.runtime) for c in report.comparisons} == {("reference", "numpy"), ("nn", "numpy")}
+        assert any("only Unity runs a .nn" in note for note in report.notes)
+
+
+def test_a_nn_whose_numbers_or_contract_were_changed_is_found(tmp_path: Path, pool: RuntimePool) -> None:
+    (path,) = (p for p in FIXTURES if p.stem == "continuous")
+    (result,) = export([path], ExportOptions(tmp_path, ["bytes", "nn"], verify="numpy"), pool=pool)
+    file = result.folder / "continuous.nn"
+    model = parse(file.read_bytes())
+    weights = model.weights.copy()
+    weights[np.abs(weights).argmax()] += 1
+    content = json.loads((result.folder / "policy.json").read_text())
+
+    def put(data: bytes) -> None:
+        from signatures.digest import sha256_hex
+
+        file.write_bytes(data)
+        content["files"]["continuous.nn"] = {"sha256": sha256_hex(data), "bytes": len(data)}
+        (result.folder / "policy.json").write_text(json.dumps(content))
+
+    put(encode(replace(model, weights=weights)))
+    report = verify_folder(result.folder, runtimes="numpy", allow_unverified=True)
+    assert report.passed is False
+    assert {c.format for c in report.comparisons if not c.passed} == {"nn"}
+    assert model.trailer is not None
+    changed = model.trailer.metadata[0][1].replace("continuous", "discrete")
+    put(encode(replace(model, trailer=replace(model.trailer, metadata=((CONTRACT_KEY, changed),)))))
+    with pytest.raises(BundleError, match="has been changed"):
+        verify_folder(result.folder, runtimes="numpy")
+
+
+GENUINE = sorted(SHARED.glob("genuine/*/Brain*.nn")) + sorted(SHARED.glob("corpus/onnx/*.onnx"))
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("path", params(GENUINE, lambda p: f"{p.parent.name}-{p.stem}"[-80:]))
+@pytest.mark.parametrize("noise", ["lift", "keep"])
+def test_a_nn_agrees_in_verification(path: Path, noise: Any, tmp_path: Path, pool: RuntimePool, shared: Path) -> None:
+    if any(word in str(path) for word in ("tf115-ppo", "CustomResidual", "Dodge-18499955")):
+        pytest.skip("it is damaged, or has observations of variable length")
+    options = ExportOptions(tmp_path, ["nn"], verify="numpy", compile=CompileOptions(noise=noise))
+    (result,) = export([path], options, pool=pool)
+    assert result.report is not None
+    failed = [c for c in result.report.comparisons if not c.passed and c.format != "reference"]
+    assert not failed, "\n".join(failure_lines(result.report))
