@@ -55,6 +55,10 @@ def contained(path: Path) -> Any:
                     why="a runtime would need a library for it; a model file is untrusted, and none is loaded for one",
                     fix="export the model with operators of ONNX only",
                 )
+    for value in (*model.graph.input, *model.graph.output):
+        for length in value.type.tensor_type.shape.dim:
+            if length.HasField("dim_value") and length.dim_value <= 0:  # free, as the importer has it
+                length.ClearField("dim_value")
     return model
 
 

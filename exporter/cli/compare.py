@@ -58,7 +58,6 @@ def compare_command(
             progress=progress,
         )
     console.verified(report, ", ".join(map(str, candidates)))
-    console.check_rules([report])
     console.json({"reports": [report.to_dict()]})
     console.write_reports(lambda: [Entry(report, steps=options.steps)])
     if report.passed is False:

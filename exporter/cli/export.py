@@ -127,7 +127,6 @@ def export_command(
             results.append(result)
             progress.clear()
             console.result(result)
-    console.check_rules([r.report for r in results if r.report is not None])
     console.json({"policies": [_result_dict(r) for r in results]})
     console.next_step(results, compiling.names, job.targets, profile)
     console.write_reports(lambda: _entries(results, options.steps))

@@ -27,12 +27,13 @@ from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun, ReadOptions
 from exporter.export.sources import naming, read_source
+from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, unload
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
-from exporter.verify.tolerances import Tolerance
+from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import verify
 from signatures.contract import POLICY
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
@@ -116,6 +117,10 @@ def compare_artefacts(
         for label, (_, kind, ports) in zip(labels, artefacts, strict=True)
     ]
     used, known = chosen_runtimes(runtimes, [m.format for m in matched])
+    if options is not None:
+        check_budget(options.budget, {m.label: 0 for m in matched})
+        outputs = {policy.name: [s.name for s in policy.signature.outputs]}
+        check_rules(options.rules, outputs, {m.format.key: m.format.runtimes for m in matched}, used)
     with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
         reference_file = Path(folder, "reference.bytes")
         reference_file.write_bytes(frozen(policy))

@@ -26,10 +26,12 @@ from converters.targets.profile import Profile
 from converters.targets.profiles import profile
 from exporter.export.labels import Labels, labelled, read_labels
 from exporter.export.sources import Source, naming, read_source
+from exporter.verify.checks.size import check_budget
 from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.report import ParityReport
+from exporter.verify.tolerances import check_rules
 from exporter.verify.verification import verify
 from exporter.version import __version__
 from signatures.contract import PARITY, POLICY, Contract, Origin, parse, safe_name
@@ -106,6 +108,8 @@ def export(
     if not formats:
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
     runtimes, known = chosen_runtimes(options.verify, formats)
+    if runtimes:
+        check_budget(options.parity.budget, {f.key: 0 for f in formats})
     labels = read_labels(options.labels)
     jobs: list[_Job] = []
     origins: list[tuple[str, str]] = []
@@ -119,6 +123,9 @@ def export(
         origins.extend((p.name, f"{source.path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
     bundle.distinct_names(origins)
     jobs = [replace(j, policy=p) for j, p in zip(jobs, labelled([j.policy for j in jobs], labels), strict=True)]
+    if runtimes:
+        outputs = {j.policy.name: [s.name for s in j.policy.signature.outputs] for j in jobs}
+        check_rules(options.parity.rules, outputs, {f.key: f.runtimes for f in formats}, runtimes)
     for job in jobs:
         bundle.check_replaceable(options.out / job.policy.name)
     made = [(j, *_write(j, formats, options)) for j in jobs]

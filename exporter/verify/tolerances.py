@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from signatures.errors import UsageError
 from signatures.spec import PolicySignature
 
 #: |a − b| ≤ ATOL + RTOL·|b| for every element.
@@ -68,3 +69,31 @@ def tolerance_for(signature: PolicySignature, output: str, default: Tolerance) -
 def ruled(rules: Sequence[ToleranceRule], policy: str, kind: str, runtime: str, output: str) -> Tolerance | None:
     """What a user's rules say of a comparison: the last one that covers it decides; None where none does."""
     return next((r.tolerance for r in reversed(rules) if r.covers(policy, kind, runtime, output)), None)
+
+
+def check_rules(
+    rules: Sequence[ToleranceRule],
+    policies: Mapping[str, Collection[str]],
+    formats: Mapping[str, Collection[str]],
+    runtimes: Collection[str],
+) -> None:
+    """Raise UsageError where a user's rule can cover no comparison: a name in it is mistyped, or it is not run.
+
+    ``policies`` has the outputs of each, ``formats`` the runtimes that run each, ``runtimes`` are those that will.
+    """
+    run = {key: {*names} & {*runtimes} for key, names in formats.items()}
+    pairs = [*((key, name) for key, names in run.items() for name in names), ("reference", "numpy")]
+    pairs += [(key, name) for key in ("golden", "source") for name in runtimes]
+    for number, rule in enumerate(rules, 1):
+        outputs = (o for name, found in policies.items() for o in found if rule.policy in (None, name))
+        covered = any(rule.output in (None, o) for o in outputs)
+        if covered and any(rule.format in (None, f) and rule.runtime in (None, r) for f, r in pairs):
+            continue
+        parts = {n: getattr(rule, n) for n in ("policy", "format", "runtime", "output")}
+        said = ", ".join(f"{n} {v!r}" for n, v in parts.items() if v is not None)
+        raise UsageError(
+            f"--tolerances: entry {number} covers no comparison",
+            why=f"it is for {said}; outputs: {', '.join(dict.fromkeys(o for f in policies.values() for o in f))}; "
+            f"run: {', '.join(f'{key} in {name}' for key, name in pairs if key in formats) or 'nothing'}",
+            fix="correct its names, or take it out",
+        )

@@ -14,6 +14,7 @@ from converters.read import ports_of
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from tests.commands import export_model
 
 
 @pytest.fixture(scope="module")
@@ -99,3 +100,17 @@ def test_a_saved_model_without_a_signature_cannot_be_called(tmp_path: Path, bund
     (tmp_path / "saved_model.pb").write_bytes(message.SerializeToString())
     with pytest.raises(NotAPolicyError, match="no signature"):
         ports_of(tmp_path)
+
+
+@pytest.mark.parametrize("length", [-1, 0])
+def test_a_batch_of_no_length_is_any(length: int, tmp_path: Path, bundle: Path) -> None:
+    """Exporters write -1 or 0 for a free axis; as the importer has it, so has ``compare``."""
+    model = onnx.load(next(bundle.glob("*.onnx")))
+    for value in (*model.graph.input, *model.graph.output):
+        value.type.tensor_type.shape.dim[0].dim_value = length
+    file = tmp_path / "model.onnx"
+    onnx.save(model, file)
+    ((_, found),) = ports_of(file)
+    assert {port.shape[0] for port in (*found.inputs, *found.outputs) if port.shape is not None} == {None}
+    ran = export_model("compare", file, file, "--runtimes", "onnxruntime")
+    assert ran.status == 0, ran.err + ran.out

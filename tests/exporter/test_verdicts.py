@@ -42,6 +42,40 @@ def test_a_tolerance_for_nothing_is_refused(tmp_path: Path) -> None:
     assert ran.status == 2
     assert "entry 1 covers no comparison" in ran.err
     assert "valu_estimate" in ran.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ('policy = "walker"', "policy 'walker'"),
+        ('runtime = "tfjs-cpu"', "runtime 'tfjs-cpu'"),
+        ('format = "tfjs"', "format 'tfjs'"),
+        ('format = "onnx"\nruntime = "numpy"', "format 'onnx', runtime 'numpy'"),
+    ],
+)
+def test_a_tolerance_for_what_is_not_run_is_refused_before_anything_is_written(
+    entry: str, words: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "tolerances.toml"
+    file.write_text(f'[[tolerance]]\n{entry}\natol = 1.0\nreason = "a slip"\n')
+    ran = export_model(
+        BALL, "-o", tmp_path / "out", "--to", "bytes,onnx", "--verify", "onnxruntime", "--tolerances", file
+    )
+    assert ran.status == 2
+    assert "entry 1 covers no comparison" in ran.err
+    assert words in ran.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_budget_for_a_format_that_is_not_written_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    nothing = tmp_path / "nothing.bytes"  # not even looked for
+    ran = export_model(
+        nothing, "-o", tmp_path / "out", "--to", "onnx", "--verify", "onnxruntime", "--max-size", "tfjs=60kB"
+    )
+    assert ran.status == 2
+    assert "--max-size tfjs=…: there is no such format here" in ran.err
+    assert "there are onnx, total" in ran.err
 
 
 @pytest.mark.parametrize(("flag", "value"), [("--step", "3"), ("--sensors", "8")])
