@@ -20,7 +20,7 @@ from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE
 from converters.graph.shapes import Types, add_types
 from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
-from signatures.errors import UnsupportedOpError
+from signatures.errors import GraphError, UnsupportedOpError
 
 #: A policy has some hundreds.
 MAX_NODES = 1 << 16
@@ -83,8 +83,15 @@ class Builder:
         return self.const(np.asarray(numbers, FLOAT32), name)
 
     def ints(self, numbers: npt.ArrayLike, name: str = "const") -> str:
-        """An int32 constant: a vector, or a scalar."""
-        return self.const(np.array(numbers, INT32), name)
+        """An int32 constant: a vector, or a scalar. Raises GraphError where a number is larger."""
+        try:
+            return self.const(np.array(numbers, INT32), name)
+        except OverflowError as error:
+            raise GraphError(
+                f"a length or an index of {name!r} has more than 32 bits",
+                why=str(error),
+                fix="the model is damaged, or is no policy; export it again",
+            ) from error
 
     def number(self, like: str, value: float, name: str = "const") -> str:
         """A scalar constant of the dtype of ``like``."""

@@ -27,7 +27,7 @@ from converters.understand.further_outputs import leave_out_without_rows
 from converters.understand.inputs import classify_inputs
 from converters.understand.signature import sign, understand_actions
 from converters.understand.source_map import source_map
-from signatures.errors import UsageError
+from signatures.errors import NotAPolicyError, UsageError
 
 FOLD = Pass("fold", on_graph(fold), (has.no_control_flow,), (has.constants_folded,))
 DROP = Pass(
@@ -54,6 +54,10 @@ PASSES = (
     Pass("sign", sign, (has.no_dead_nodes, has.meanings), (has.signature,)),
     Pass("name", name_ports, (has.signature,), (has.signature, has.names_of_the_signature, has.one_spelling)),
 )
+
+
+#: Nodes upstream of a policy's outputs.
+MAX_NODES = 1 << 14
 
 
 def compile_graph(
@@ -85,6 +89,12 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         canonical = brain.canonical
         outputs = [(canonical[base], reference) for base, _, reference in brain.outputs if base in canonical]
         upstream = graph.pruned([reference for _, reference in outputs])
+        if len(upstream.nodes) > MAX_NODES:
+            raise NotAPolicyError(
+                f"{len(upstream.nodes)} nodes lead to the policy's outputs",
+                why=f"no more than {MAX_NODES} are converted; a policy has some hundreds",
+                fix="give the policy alone, or say which node is its action: --output NODE=action",
+            )
         sources = {out: _source_of(graph, reference) for out, reference in outputs}
         # Outputs are pinned by nodes of their own, which every pass keeps.
         fetches = {out: f"__output_{i}" for i, (out, _) in enumerate(outputs)}

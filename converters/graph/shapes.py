@@ -17,8 +17,9 @@ Types = dict[str, TensorType]
 
 #: Folding may not make a constant of more elements than this out of smaller ones.
 _MAX_FOLD = 1 << 20
-#: No tensor may have more elements than this per row (256 MiB in float32), unless the op was given as many: a Fill,
-#: Tile, Pad, Range or OneHot of a few bytes may ask for any amount of memory.
+#: No tensor may have more elements than this per row (256 MiB in float32), unless one that the op was given has as
+#: many: a Fill, Tile, Pad, Range or OneHot of a few bytes may ask for any amount of memory, thirty Concats of a tensor
+#: with itself, too.
 MAX_ELEMENTS = 1 << 26
 
 
@@ -93,7 +94,7 @@ def _elements(kind: TensorType) -> int:
 def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> None:
     """Raise GraphError where a result is larger than any policy's, before anything of that size is allocated."""
     largest = max(map(_elements, results), default=0)
-    if largest > max(MAX_ELEMENTS, sum(map(_elements, args)) if node.op != "Placeholder" else 0):
+    if largest > max(MAX_ELEMENTS, max(map(_elements, args), default=0) if node.op != "Placeholder" else 0):
         raise GraphError(
             f"node {node.name!r} ({node.op}) makes a tensor of {largest} elements",
             why=f"no policy has one of more than {MAX_ELEMENTS} per row",

@@ -19,6 +19,8 @@ from signatures.errors import DamagedFileError, UnsupportedOpError
 
 _MAX_AXES = 32
 _EXTERNAL = 1  # TensorProto.DataLocation
+#: How often all bytes of the files beside a model may be named as weights: layers share some.
+_MAX_TIMES = 4
 _DOUBLE, _STRING = 11, 8
 #: TensorProto.DataType → (dtype, field of values that are not raw bytes)
 _STORED = {
@@ -149,6 +151,8 @@ def load_external(graph: Any, folder: Path) -> list[Path]:
             total += _bring(tensor, folder, files)
             if total > MAX_BYTES:
                 raise _damaged(tensor.name, "the model's weights together are larger than 2 GiB")
+            if total > _MAX_TIMES * sum(map(len, files.values())):
+                raise _damaged(tensor.name, "the same bytes of a file are named again and again as weights")
     return sorted(files)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,8 @@ from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
 
 #: Opsets that are read. Before 7 broadcasting was an attribute of each op.
 FIRST_OPSET = 7
+#: Numbers that a model with a fixed batch may take at a time (32 MiB).
+_MAX_NUMBERS = 1 << 23
 _FLOAT, _FLOAT16, _BFLOAT16, _DOUBLE = 1, 10, 16, 11
 _INT = 2  # AttributeProto.AttributeType
 #: The scalar that TensorFlow's recurrent policies take: how many steps a sequence has. A policy runs one.
@@ -281,7 +284,20 @@ def _fixed_batch(declared: Sequence[Any], axes: Mapping[str, int]) -> int | None
     if not leading:  # a discrete state: one number a row
         numbers = (v for v in declared if DTYPES.get(v.type.tensor_type.elem_type, np.dtype("f4")).kind in "iu")
         leading = {dims[0] for v in numbers if (dims := _dims(v)) is not None and len(dims) == 1}
-    return leading.pop() if len(leading) == 1 else None
+    batch = leading.pop() if len(leading) == 1 else None
+    return None if batch is None else _bearable(batch, shapes)
+
+
+def _bearable(batch: int, shapes: Sequence[tuple[int | None, ...] | None]) -> int:
+    """A number of rows, if a run of the model with so many is no more than a runtime can bear."""
+    numbers = sum(math.prod(d or 1 for d in dims) for dims in shapes if dims is not None)
+    if numbers > _MAX_NUMBERS:
+        raise NotAPolicyError(
+            f"was exported for {batch} rows at a time, which are {numbers} numbers",
+            why=f"it can be run with as many only, and no more than {_MAX_NUMBERS} are given to a runtime",
+            fix="export it with a free batch axis (dynamic_axes), or for one row",
+        )
+    return batch
 
 
 def _input(importer: Importer, value: Any, batch: int | None, axis: int) -> None:

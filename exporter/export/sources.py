@@ -21,7 +21,7 @@ _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint"
 #: What Python and numpy raise where a damaged graph breaks something that a step takes for granted.
 _BROKEN = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError),
-    *(MemoryError, RecursionError),
+    RecursionError,
 )
 
 
@@ -34,6 +34,13 @@ def naming(path: Path) -> Iterator[None]:
         raise error.at(str(path)) from error.__cause__
     except OSError as error:
         raise SourceError("cannot be read", where=str(path), why=str(error), fix="check its files") from error
+    except MemoryError as error:
+        raise GraphError(
+            "needs more memory than there is",
+            where=str(path),
+            why=str(error) or "the system gave no more",
+            fix="if it is no larger than other policies, it is damaged: freeze it again from its checkpoint",
+        ) from error
     except _BROKEN as error:
         raise GraphError(
             "the graph cannot be understood",

@@ -7,10 +7,13 @@ are then zero, masks allow everything. Arrays under the names of outputs are the
 
 from __future__ import annotations
 
+import math
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -21,6 +24,8 @@ from signatures.spec import PolicySignature, TensorSpec
 
 #: Rows that are run at once; a recording may hold thousands.
 _ROWS = 64
+#: A recording may unpack to this many bytes, and so many times its own.
+MAX_UNPACKED_FREE, MAX_UNPACKED_FACTOR = 1 << 26, 20
 _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
 
 
@@ -75,16 +80,45 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     try:
+        _check_sizes(path)
         with path.open("rb") as file:  # numpy leaves a file open that it opened itself and cannot read
             archive = np.load(file, allow_pickle=False)
             if isinstance(archive, np.ndarray):
                 raise UsageError("--golden: is one array, not an archive", where=str(path), fix="numpy.savez(FILE, …)")
             with archive:
                 return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, MemoryError, OverflowError, NotImplementedError, zlib.error) as error:
         raise UsageError(
             "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"
         ) from error
+    except (RuntimeError, zipfile.BadZipFile) as error:
+        raise UsageError(
+            "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"
+        ) from error
+
+
+def _check_sizes(path: Path) -> None:
+    """Raise ValueError where an archive's arrays say to be larger than any recording, before one is read."""
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        whole = sum(entry.file_size for entry in archive.infolist())
+        for entry in archive.infolist():
+            if not entry.filename.endswith(".npy"):
+                continue
+            with archive.open(entry) as file:
+                shape, dtype = _header(file)
+            if math.prod(shape) * dtype.itemsize > entry.file_size:
+                raise ValueError(f"{entry.filename} says to be {list(shape)[:8]} and has {entry.file_size} bytes")
+    if whole > MAX_UNPACKED_FREE + MAX_UNPACKED_FACTOR * path.stat().st_size:
+        raise ValueError(f"its {path.stat().st_size} bytes unpack to {whole}")
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    return shape, dtype
 
 
 def _by_name(specs: tuple[TensorSpec, ...]) -> dict[str, TensorSpec]:

@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.runtimes.process import LoadedModel
+from converters.runtimes.process import LoadedModel, RunFailedError
 from signatures.memories import divided, joined
 from signatures.roles import Role
 from signatures.spec import PolicySignature, SourceMap, TensorSpec
 
 Arrays = Mapping[str, np.ndarray]
+#: Rows that a source which takes one number of them only may ask for.
+MAX_ROWS = 1 << 16
 
 
 class Original:
@@ -26,6 +28,12 @@ class Original:
         self.model = model
         self.signature = signature
         self.source = source
+        if source.rows is not None and not 0 < source.rows <= MAX_ROWS:
+            raise RunFailedError(
+                f"the source is said to take {source.rows} rows at a time",
+                why=f"no more than {MAX_ROWS} are given to a runtime",
+                fix="export the policy again from its source",
+            )
         #: draws that the policy makes itself, and the source is given
         self.draws = np.random.default_rng(0)
         #: an action without chance → the action it belongs to
