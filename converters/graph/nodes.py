@@ -44,7 +44,8 @@ class Node:
 
     def with_inputs(self, inputs: Iterable[str]) -> Node:
         """The same node fed from other tensors."""
-        return replace(self, inputs=tuple(inputs))
+        fed = tuple(inputs)
+        return self if fed == self.inputs else replace(self, inputs=fed)
 
 
 def ref(name: str, index: int = 0) -> str:

@@ -81,6 +81,12 @@ REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array
             node("Loop", ["n", "c", "x"], "y", body=helper.make_graph([], "body", [], [])),
         ], X, {}, "it is a loop",
     ),
+    "an element behind the last": (
+        [constant("i", 4, np.int64), node("Gather", ["x", "i"], axis=1)], X, {}, "an axis of 4 does not have",
+    ),
+    "elements before the first": (
+        [constant("i", [0, -5], np.int64), node("Gather", ["x", "i"], axis=1)], X, {}, "an axis of 4 does not have",
+    ),
     "an equation with traces": ([node("Einsum", ["x"], equation="bb->b")], {"x": (np.float32, [4, 4])}, {}, "plain"),
 }  # fmt: skip
 

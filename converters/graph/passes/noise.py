@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.graph.compilation import Compilation, Dims
+from converters.graph.compilation import Compilation
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.table import traits
 from converters.graph.options import NoiseMode
-from converters.graph.shapes import Types, infer_types
+from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
@@ -37,16 +37,15 @@ def unseeded(graph: Graph) -> Graph:
 
 def settle_noise(c: Compilation) -> Compilation:
     """Noise as the options say, and a note of what it was."""
+    drawn = [n.name for n in samplers(c.graph)]
+    taken = [n for n, r in c.roles.items() if r is Role.NOISE and n in c.graph]
+    if not drawn and not taken:
+        return c
     types = infer_types(c.graph)
-    draws = {n.name: _dims(types, n.name) for n in samplers(c.graph)}
-    fed = {n: _dims(types, n) for n, r in c.roles.items() if r is Role.NOISE and n in c.graph}
+    draws, fed = ({n: static_shape(types[n].shape) or () for n in names} for names in (drawn, taken))
     graph = lift_noise(c.graph, "zero" if c.options.deterministic else c.options.noise, fed)
     noise = {tensor_of(c.graph[name]): dims for name, dims in (draws | fed).items()}
     return replace(c, graph=graph, draws=draws, fed=fed, noise=noise)
-
-
-def _dims(types: Types, name: str) -> Dims:
-    return static_shape(types[name].shape) or ()
 
 
 def tensor_of(node: Node) -> str:
