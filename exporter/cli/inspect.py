@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
-@click.option("--svg", type=click.Path(path_type=Path), metavar="FILE", help="Write a picture of the policy.")
+@click.option(
+    "--svg",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a picture of the policy (with --unity: of Behavior Parameters).",
+)
 @trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,3x84x84.")
 @click.option(
@@ -53,7 +58,7 @@ def inspect_command(
     With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
     """
     if releases:
-        sys.exit(_unity(source, releases, sensors, actions, brain_parameters, as_json))
+        sys.exit(_unity(source, releases, sensors, actions, brain_parameters, as_json, svg))
     if actions or brain_parameters is not None:
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
     from converters.source import ReadOptions
@@ -76,10 +81,24 @@ def inspect_command(
 
 
 def _unity(
-    source: Path, releases: tuple[str, ...], sensors: str, actions: str, parameters: Path | None, as_json: bool
+    source: Path,
+    releases: tuple[str, ...],
+    sensors: str,
+    actions: str,
+    parameters: Path | None,
+    as_json: bool,
+    svg: Path | None,
 ) -> int:
     from exporter.inspect.unity import accepted, check_for_unity, unity_report, unity_text
 
     verdicts = check_for_unity(source, releases, sensors, actions, parameters)
+    if svg is not None:
+        if len(verdicts) != 1:
+            raise UsageError("--svg draws one verdict", fix="name one release and one file")
+        from converters.bundle.bundle import writing
+        from exporter.inspect.behavior_parameters import behavior_parameters
+
+        with writing(svg):
+            svg.write_text(behavior_parameters(verdicts[0]), encoding="utf-8")
     click.echo(json.dumps(unity_report(verdicts), indent=1) if as_json else unity_text(verdicts))
     return 0 if accepted(verdicts) else 1

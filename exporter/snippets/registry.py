@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from converters.formats import WRITTEN
-from exporter.snippets import csharp, javascript, python, serving, unity
+from exporter.snippets import agent, csharp, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle
 from signatures.errors import BundleError, UsageError
 
@@ -37,6 +37,7 @@ TARGETS = (
     Target("tensorflowsharp", "C#, TensorFlowSharp", "csharp", ("bytes",), csharp.tensorflowsharp),
     Target("internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", ("bytes",), unity.internal_brain),
     Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", ("onnx",), csharp.inference_engine),
+    Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", ("onnx", "nn"), agent.agent),
 )
 
 

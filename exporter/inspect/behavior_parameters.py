@@ -1,0 +1,111 @@
+"""``inspect --unity --svg``: *Behavior Parameters* as the Inspector shows them for a file, with Unity's own messages.
+
+Drawn here from the verdict, in the order of Unity's fields; it is no photograph of the Editor, which was not run.
+"""
+
+from __future__ import annotations
+
+import textwrap
+
+from converters.targets.unity.checker import UnityVerdict
+from converters.targets.unity.findings import Thrown
+from exporter.reports.markup import Markup, el
+
+_WIDTH, _LINE, _MARGIN, _VALUE = 560, 22, 16, 250
+_LETTERS = 78
+_STYLE = """
+svg { --paper: #fff; --ink: #16191d; --soft: #5a626c; --rule: #c9ced6; --box: #f6f7f9; --bad: #9a5b00;
+  --bad-wash: #fdf3e1; --good: #1b7443; --good-wash: #e7f4ec; color-scheme: light dark;
+  font: 13px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+@media (prefers-color-scheme: dark) { svg { --paper: #14171b; --ink: #e7e9ec; --soft: #a0a8b3; --rule: #414955;
+  --box: #1c2026; --bad: #f0c274; --bad-wash: #33280f; --good: #69d19a; --good-wash: #14301f; } }
+.paper { fill: var(--paper); stroke: var(--rule); }
+text { fill: var(--ink); }
+.head { font-weight: 650; }
+.soft { fill: var(--soft); }
+.field { fill: var(--box); stroke: var(--rule); }
+.message { fill: var(--bad-wash); stroke: var(--bad); }
+.fine { fill: var(--good-wash); stroke: var(--good); }
+"""
+
+#: (indentation, label, value; None for a heading)
+Row = tuple[int, str, str | None]
+
+
+def behavior_parameters(verdict: UnityVerdict) -> str:
+    """The picture as an SVG file of its own, light or dark as the reader's system is."""
+    parts = []
+    y = _MARGIN + _LINE
+    for indent, label, value in _rows(verdict):
+        kind = "head" if value is None and indent == 0 else "soft" if value is None else "label"
+        parts.append(el("text", label, class_=kind, x=_MARGIN + 16 * indent, y=y))
+        if value is not None:
+            box = {"x": _VALUE, "y": y - 15, "width": _WIDTH - _VALUE - _MARGIN, "height": 19, "rx": 3}
+            parts += [el("rect", class_="field", **box), el("text", value, x=_VALUE + 8, y=y)]
+        y += _LINE
+    for message, fine in _messages(verdict):
+        lines = [line for part in message.strip().split("\n") for line in textwrap.wrap(part, _LETTERS)]
+        height = 18 * len(lines) + 12
+        box = {"x": _MARGIN, "y": y - 14, "width": _WIDTH - 2 * _MARGIN, "height": height, "rx": 3}
+        parts.append(el("rect", class_="fine" if fine else "message", **box))
+        parts += [el("text", line, x=_MARGIN + 10, y=y + 5 + 18 * i) for i, line in enumerate(lines)]
+        y += height + 8
+    title = f"Behavior Parameters for {verdict.path.name}, {verdict.consumer.title}"
+    drawing = el(
+        "svg",
+        el("title", title),
+        el("style", Markup(_STYLE)),
+        el("rect", class_="paper", x=1, y=1, width=_WIDTH - 2, height=y - 2, rx=6),
+        *parts,
+        xmlns="http://www.w3.org/2000/svg",
+        viewBox=f"0 0 {_WIDTH} {y}",
+        width=_WIDTH,
+        height=y,
+        role="img",
+    )
+    return f"{drawing}\n"
+
+
+def _rows(verdict: UnityVerdict) -> list[Row]:
+    brain = verdict.brain
+    modes = [mode for mode, said in verdict.accepted.items() if said]
+    rows: list[Row] = [
+        (0, f"Behavior Parameters (Script)        {verdict.consumer.package}", None),
+        (0, "Behavior Name", verdict.path.stem),
+        (0, "Vector Observation", None),
+        (1, "Space Size", str(brain.vector_observation_size or _vector(verdict))),
+        (1, "Stacked Vectors", str(brain.stacked)),
+        (0, "Actions", None),
+        (1, "Continuous Actions", str(brain.continuous)),
+        (1, "Discrete Branches", str(len(brain.branches))),
+        *((2, f"Branch {i} Size", str(size)) for i, size in enumerate(brain.branches)),
+        (0, "Model", verdict.path.name),
+        (1, "Deterministic Inference", "off or on" if len(modes) == 2 else "on" if "deterministic" in modes else "off"),
+        (0, "Behavior Type", "Inference Only"),
+    ]
+    others = [(i, s) for i, s in enumerate(brain.sensors) if len(s.shape) > 1]
+    if others:
+        rows.append((0, "Sensor components, in the order of their names", None))
+        rows += [(1, f"{i} {s.name}", "×".join(map(str, s.shape))) for i, s in others]
+    return rows
+
+
+def _vector(verdict: UnityVerdict) -> int:
+    return next((s.shape[0] for s in reversed(verdict.brain.sensors) if len(s.shape) == 1), 0)
+
+
+def _messages(verdict: UnityVerdict) -> list[tuple[str, bool]]:
+    """(text, whether it is good news), each once."""
+    if verdict.refused is not None:
+        return [(_thrown("Importing it", verdict.refused), False)]
+    found: list[tuple[str, bool]] = []
+    chosen = next((m for m in verdict.modes.values() if m.accepted), next(iter(verdict.modes.values()), None))
+    if chosen is not None:
+        found += [(f.message, False) for f in chosen.checks]
+        found += [(_thrown("In the console", chosen.load), False)] if chosen.load is not None else []
+    found += [(f"In play: {f.message}", False) for f in verdict.overlooked]
+    return list(dict.fromkeys(found)) or [("No message: the model is accepted.", True)]
+
+
+def _thrown(where: str, thrown: Thrown) -> str:
+    return f"{where}: {thrown.exception}: {thrown.message}"

@@ -1,0 +1,141 @@
+"""A complete ML-Agents ``Agent`` for a policy, with what to set in its *Behavior Parameters*.
+
+Source: the C# interface of com.unity.ml-agents 1.0 to 4.0 (CollectObservations, WriteDiscreteActionMask,
+OnActionReceived, Heuristic); read, not compiled here.
+"""
+
+from __future__ import annotations
+
+import re
+
+from exporter.snippets.contract import Bundle, branch_lines, class_name, folded, numbered
+from exporter.snippets.frames import filled
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+#: The order in which a policy's observations are sensors where their names do not say it.
+_ORDER = (Role.ENTITIES, Role.VISUAL, Role.VECTOR)
+
+
+def agent(bundle: Bundle) -> str:
+    """The class, and the settings as a comment above it."""
+    sensors = _sensors(bundle)
+    vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR), None)
+    methods = [] if vector is None else _observations(bundle, vector)
+    if bundle.signature.branches:
+        methods += _masks(bundle)
+    methods += _actions(bundle, bundle.signature.labels.get("actions", []))
+    return filled(
+        "agent.cs",
+        type=_class(bundle.name),
+        head="\n".join(_head(bundle, sensors, vector)),
+        methods="".join(f"\n    {line}".rstrip(" ") if line else "\n" for line in methods) + "\n",
+    )
+
+
+def _class(name: str) -> str:
+    word = class_name(name)
+    return f"Agent{word.removeprefix('Policy')}" if word.startswith("Policy") else f"{word.removesuffix('Policy')}Agent"
+
+
+def _sensors(bundle: Bundle) -> list[TensorSpec]:
+    specs = list(bundle.signature.observations)
+    numbers = {s.name: int(s.name.removeprefix("obs_")) for s in specs if re.fullmatch("obs_[0-9]+", s.name)}
+    if len(numbers) == len(specs):
+        return sorted(specs, key=lambda s: numbers[s.name])
+    return sorted(specs, key=lambda s: _ORDER.index(s.role))
+
+
+def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) -> list[str]:
+    signature = bundle.signature
+    size = 0 if vector is None else vector.shape[-1]
+    sizes = ", ".join(map(str, signature.branches))
+    lines = [
+        f"The policy {bundle.name} ({signature.family}, {signature.action_space} actions) as an ML-Agents agent.",
+        "Behavior Parameters, on the same GameObject:",
+        f"  Vector Observation: Space Size {size}, Stacked Vectors 1",
+        f"  Actions: Continuous Actions {_continuous(bundle)}, Discrete Branches {len(signature.branches)}"
+        + (f" of the sizes {sizes}" if sizes else ""),
+        f"  Model: {bundle.name}.onnx of a bundle made with --for; Behavior Type: Inference Only",
+    ]
+    others = [s for s in sensors if s is not vector]
+    if others:
+        lines.append("Sensor components, called so that they sort in this order (Unity feeds them by name):")
+        lines += [f"  {number} {_component(bundle, spec)}" for number, spec in enumerate(others)]
+    if signature.memory is not None:
+        lines.append(
+            f"Its memory ({signature.memory.size} numbers) is kept by ML-Agents, and is empty at an episode's start."
+        )
+    return [f"// {line}" for line in lines]
+
+
+def _component(bundle: Bundle, spec: TensorSpec) -> str:
+    lengths = [n or 0 for n in spec.shape[1:]]
+    if spec.role is Role.VISUAL and len(lengths) == 3:
+        layout = bundle.signature.preprocess.get(spec.name, {}).get("layout", "NHWC")
+        channels, height, width = lengths if layout == "NCHW" else (lengths[2], *lengths[:2])
+        colours = "Grayscale" if channels == 1 else "colour" if channels == 3 else f"{channels} channels"
+        return f"{spec.name}: a Camera Sensor, Width {width}, Height {height}, {colours}"
+    if spec.role is Role.ENTITIES and len(lengths) == 2:
+        return f"{spec.name}: a Buffer Sensor, Observation Size {lengths[1]}, Max Num Observables {lengths[0]}"
+    return f"{spec.name}: a sensor of {'x'.join(map(str, lengths))} numbers (rays, a grid, as it was trained)"
+
+
+def _observations(bundle: Bundle, spec: TensorSpec) -> list[str]:
+    names = bundle.signature.labels.get("observations", {}).get(spec.name, [])
+    size = spec.shape[-1] or 0
+    lines = folded(f"{size} numbers, in the order of training", numbered(names))
+    return [
+        "public override void CollectObservations(VectorSensor sensor)",
+        "{",
+        *(f"    // {line}" for line in lines),
+        f"    var observations = new float[{size}];",
+        "    sensor.AddObservation(observations);",
+        "}",
+        "",
+    ]
+
+
+def _masks(bundle: Bundle) -> list[str]:
+    return [
+        "public override void WriteDiscreteActionMask(IDiscreteActionMask actionMask)",
+        "{",
+        "    // forbid what cannot be done now: actionMask.SetActionEnabled(branch, action, false);",
+        "}",
+        "",
+    ]
+
+
+def _continuous(bundle: Bundle) -> int:
+    for head in bundle.heads:
+        if head.role is Role.CONTINUOUS:
+            return head.shape[-1] or 0
+    return 0
+
+
+def _actions(bundle: Bundle, labels: list[str]) -> list[str]:
+    count = _continuous(bundle)
+    received, own = [], []
+    if count:
+        received += [f"// {line}" for line in folded(f"{count} continuous actions", numbered(labels))]
+        received.append("var continuous = actions.ContinuousActions;")
+        own.append("var continuous = actionsOut.ContinuousActions;")
+        own += [f"continuous[{i}] = 0f;" for i in range(min(count, 8))]
+    if bundle.signature.branches:
+        received += [f"// {line}" for line in branch_lines(bundle)]
+        received.append("var discrete = actions.DiscreteActions;")
+        own.append("var discrete = actionsOut.DiscreteActions;")
+        own += [f"discrete[{i}] = 0;" for i in range(len(bundle.signature.branches))]
+    return [
+        "public override void OnActionReceived(ActionBuffers actions)",
+        "{",
+        *(f"    {line}" for line in received),
+        "    // move the agent by them, as in training",
+        "}",
+        "",
+        "public override void Heuristic(in ActionBuffers actionsOut)",
+        "{",
+        "    // what a player would do, for Behavior Type: Heuristic Only",
+        *(f"    {line}" for line in own),
+        "}",
+    ]
