@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
-from converters.graph.ops.table import TABLE
+from converters.graph.ops.table import TABLE, op_of
 from converters.graph.shapes import Types, add_types
 from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
@@ -173,9 +173,9 @@ class Builder:
         return value
 
     def producer(self, reference: str) -> Node:
-        """The node that makes a tensor, looked for behind identities."""
+        """The node that makes a tensor, looked for behind what passes it on."""
         node = self.nodes[self.position[node_of(reference)]]
-        while node.op == "Identity":
+        while op_of(node).moves == "same":
             node = self.nodes[self.position[node_of(node.inputs[0])]]
         return node
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,10 +56,6 @@ class Editor(Builder):
     def replace_const(self, name: str, array: np.ndarray, origin: str | tuple[str, ...] | None) -> str:
         """A Const under the name of the node of the old graph that it stands for."""
         return self.append(Node(name, "Const", value=array, origin=origin))
-
-    def placeholder(self, name: str, node: Node) -> str:
-        """A new Placeholder that is ``node`` under a fresh name like ``name``."""
-        return self.append(replace(node, name=self.names.fresh(name)))
 
     def graph(self) -> Graph:
         """The new graph, redirections applied to all nodes, in topological order."""

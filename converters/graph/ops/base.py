@@ -21,7 +21,7 @@ Kernel = Callable[..., Any]
 Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]
 #: A shape as far as it is known; a string is a free axis.
 Shape = Sequence[Dim] | None
-AttrKind = Literal["type", "int", "ints", "float", "bool", "str", "shape"]
+AttrKind = Literal["type", "int", "float", "bool", "str", "shape"]
 
 #: Marks an attribute that a GraphDef must carry.
 REQUIRED: Any = object()

@@ -12,6 +12,7 @@ import numpy as np
 from converters.graph.builder import Builder
 from converters.graph.nn import activations as nn
 from converters.graph.nn import trigonometry
+from converters.graph.ops.table import op_of
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
 
@@ -62,7 +63,9 @@ def is_bias(net: Importer, x: str, bias: str) -> bool:
     value, shape = net.constant(bias), net.type_of(x).shape
     if value is None or value.ndim != 1 or not shape or len(shape) < 2 or not net.is_float(x):
         return False
-    return shape[-1] == value.shape[0] and net.producer(x).op in ("MatMul", "Conv2D", "DepthwiseConv2dNative")
+    layer = op_of(net.producer(x)).layer
+    product = layer == "convolution" or (layer == "dense" and len(shape) == 2)
+    return product and shape[-1] == value.shape[0]
 
 
 def _div(op: Op, net: Importer) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.ops.table import op_of
 from converters.graph.types import FLOAT32, TensorType
 from converters.onnx.importer.fixed_batch import FixedBatch
 from converters.onnx.importer.node import STANDARD, Op, Translate
@@ -131,7 +132,7 @@ class Importer(Builder):
         self._bound.add(name)
 
     def _may_rename(self, node: Node) -> bool:
-        if node.op in ("Placeholder", "Const") or node.name in self._bound or node.name in self.lengths.values():
+        if op_of(node).start or node.name in self._bound or node.name in self.lengths.values():
             return False
         return self.outputs(node.name) == 1
 
