@@ -20,6 +20,8 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: A checkpoint of ML-Agents has some thousands of opcodes; with a critic and an optimizer some ten thousands.
 MAX_OPCODES = 1 << 21
+#: Items that its calls (OrderedDict, Size) may copy in all: a call of few bytes copies whatever the memo holds.
+MAX_COPIED = 1 << 20
 #: Of a tensor: kernels of images have four, and no axis is longer than a file can be.
 MAX_AXES, MAX_LENGTH = 8, 1 << 31
 _FIX = "give a checkpoint as ML-Agents wrote it (checkpoint.pt, <behavior>-<step>.pt)"
@@ -95,6 +97,7 @@ class _Machine:
         self.storage = storage
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
+        self.copied = 0
 
     def run(self, name: str, argument: Any) -> None:
         """Carry out one opcode."""
@@ -227,6 +230,9 @@ class _Machine:
         arguments, function = self.pop(), self.pop()
         if not isinstance(function, _Function) or not isinstance(arguments, tuple):
             raise _damaged("its pickle calls something that is no function")
+        self.copied += sum(len(a) for a in arguments if isinstance(a, tuple | list | dict | str | bytes))
+        if self.copied > MAX_COPIED:
+            raise _damaged(f"the calls of its pickle copy more than {MAX_COPIED} items")
         self.stack.append(function.make(arguments))
 
     def _build(self, _: Any) -> None:

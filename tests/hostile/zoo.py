@@ -770,3 +770,36 @@ def _large_graphs() -> None:
 
 
 _large_graphs()
+
+
+# ------------------------------------------------------------------ pickles
+
+
+def _pickles() -> None:
+    import zipfile
+
+    def archive(data: bytes) -> Maker:
+        def make(folder: Path, marker: Path) -> Path:
+            path = folder / "policy.pt"
+            with zipfile.ZipFile(path, "w") as made:
+                made.writestr("archive/data.pkl", data.replace(b"MARKER", str(marker).encode()))
+                made.writestr("archive/version", "3\n")
+            return path
+
+        return make
+
+    start, copies = b"\x80\x02", b"0(" + b"h\x00h\x01\x85R" * 20_000 + b"l."
+    pickles = {
+        "a command": start + b"cposix\nsystem\n(Vtouch MARKER\ntR.",
+        "a command by its other name": start + b"cos\nsystem\n(Vtouch MARKER\ntR.",
+        "an instance of a builtin": start + b"(Vopen('MARKER','w')\ni__builtin__\nexec\n.",
+        "20,000 copies of a Size": start + b"ctorch\nSize\nq\x00(" + b"K\x01" * 50_000 + b"tq\x01" + copies,
+        "20,000 copies of an OrderedDict": (
+            start + b"ccollections\nOrderedDict\nq\x00(" + b"(K\x01K\x02l" * 50_000 + b"lq\x01" + copies
+        ),
+    }
+    for label, data in pickles.items():
+        case(f"PyTorch checkpoint, {label}")(archive(data))
+
+
+_pickles()
