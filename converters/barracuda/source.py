@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from converters.barracuda.answers import contract_of
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import to_graph
+from converters.barracuda.writer import CONTRACT_KEY, PRODUCER
 from converters.fetch import Fetched
 from converters.source import SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.roles import ACTION_NAMES
+from signatures.spec import PolicySignature
 
 #: Suffixes that ML-Agents' converter gives to memories: the cell state and the hidden state of an LSTM; a GRU has h.
 _PARTS = ("_c", "_h")
@@ -24,7 +29,20 @@ def read(given: Fetched) -> list[SourceModel]:
         memory_layout=_memory_layout(model),
         notes=(*_notes(model), *reading.notes),
     )
+    if model.metadata(CONTRACT_KEY) is not None:
+        facts = _told(facts, contract_of(model))
     return [SourceModel(reading.graph, (given.path,), facts)]
+
+
+def _told(facts: SourceFacts, signature: PolicySignature) -> SourceFacts:
+    """What the contract of a file of ours says that its layers do not."""
+    return replace(
+        facts,
+        family=signature.family,
+        algorithm=signature.algorithm or "",
+        memory_layout=() if signature.memory is None else signature.memory.layout,
+        labels=signature.labels,
+    )
 
 
 def _memory_layout(model: NnModel) -> tuple[str, ...]:
@@ -35,7 +53,7 @@ def _memory_layout(model: NnModel) -> tuple[str, ...]:
 
 def _notes(model: NnModel) -> list[str]:
     notes = ["no runtime but Unity's reads a .nn: the verdict on the export is that its formats are self-consistent"]
-    if model.trailer is not None and model.trailer.producer not in ("", "Script"):
+    if model.trailer is not None and model.trailer.producer not in ("", "Script", PRODUCER):
         notes.append(f"Unity wrote this .nn from a model of {model.trailer.producer}")
     if model.half:
         notes.append("the weights were stored as halves (16 bits); they are float32 here")

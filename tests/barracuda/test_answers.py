@@ -25,7 +25,8 @@ from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.errors import BundleError, DamagedFileError
 from signatures.roles import Role
 from tests.barracuda.conftest import SHARED, params
-from tests.barracuda.nn_running import some
+from tests.barracuda.nn_running import fed, some
+from tests.barracuda.reference import evaluate
 from tests.barracuda.test_writer import FIXTURES, policies
 
 
@@ -100,6 +101,36 @@ def test_a_nn_whose_numbers_or_contract_were_changed_is_found(tmp_path: Path, po
     put(encode(replace(model, trailer=replace(model.trailer, metadata=((CONTRACT_KEY, changed),)))))
     with pytest.raises(BundleError, match="has been changed"):
         verify_folder(result.folder, runtimes="numpy")
+
+
+FORMS = ("bytes", "saved_model", "tfjs", "onnx", "nn")
+
+
+@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("form", FORMS)
+def test_a_nn_taken_to_another_format_and_back_acts_the_same(path: Path, form: str, tmp_path: Path) -> None:
+    for number, first in enumerate(export([path], ExportOptions(tmp_path / "a", ["nn"], verify="none"))):
+        place, out = first.folder / f"{first.policy.name}.nn", tmp_path / f"{number}"
+        (between,) = export([place], ExportOptions(out / "b", [form], verify="none"))
+        source = between.folder / WRITTEN[form].main_of(between.policy.name)
+        (last,) = export([source], ExportOptions(out / "c", ["nn"], verify="none"))
+        begun, ended = parse(place.read_bytes()), parse((last.folder / f"{last.policy.name}.nn").read_bytes())
+        assert {i.name: i.shape for i in begun.inputs} == {i.name: i.shape for i in ended.inputs}
+        assert [(m.input, m.output, m.shape) for m in begun.memories] == [
+            (m.input, m.output, m.shape) for m in ended.memories
+        ]
+        constants = ("version_number", "memory_size", "is_continuous_control", "action_output_shape")
+        assert [begun.number(c) for c in constants] == [ended.number(c) for c in constants]
+        feeds = fed(first.policy, begun, some(first.policy, 3))
+        before, after = evaluate(begun, feeds), evaluate(ended, feeds)
+        for name in (*begun.outputs, *(m.output for m in begun.memories)):
+            np.testing.assert_allclose(after[name], before[name], atol=2e-5, rtol=2e-5, err_msg=name)
+        signature = between.policy.signature
+        assert signature.family == first.policy.signature.family
+        assert signature.algorithm == first.policy.signature.algorithm
+        assert not any("Unity wrote" in note for note in signature.notes)
+        memory = first.policy.signature.memory
+        assert memory is None or (signature.memory is not None and signature.memory.layout == memory.layout)
 
 
 GENUINE = sorted(SHARED.glob("genuine/*/Brain*.nn")) + sorted(SHARED.glob("corpus/onnx/*.onnx"))

@@ -1,0 +1,79 @@
+"""What ML-Agents' own checker (release 20, by the rules that were measured) says to a ``.nn`` of ours."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from converters.format import WriteOptions
+from converters.formats import WRITTEN
+from converters.policy import Policy
+from converters.targets.unity.checker import check_file
+from converters.targets.unity.consumers import CONSUMERS
+from converters.targets.unity.settings import Brain, sensors_of
+from signatures.errors import ExportModelError, SignatureError, UnsupportedOpError
+from signatures.roles import Role
+from tests.barracuda.conftest import SHARED, params
+from tests.barracuda.test_writer import FIXTURES, policies, sources
+
+_MEMORY = "Models from com.unity.ml-agents 1.x that use recurrent neural networks are not supported"
+
+
+def agent_of(policy: Policy) -> Brain:
+    """The Behavior Parameters and sensors of the agent that a policy was trained for."""
+    signature, shapes, vector = policy.signature, [], 0
+    for spec in (s for s in signature.inputs if s.role is Role.VECTOR):
+        vector += math.prod(int(d or 0) for d in spec.shape[1:])
+    for spec in (s for s in signature.inputs if s.role is Role.VISUAL):
+        turned = signature.preprocess.get(spec.name, {}).get("layout") == "NCHW"
+        a, b, c = (int(d or 0) for d in spec.shape[1:])
+        shapes.append((a, b, c) if turned else (c, a, b))
+    if vector:
+        shapes.append((vector,))
+    heads = {s.name.rpartition("/")[2]: s for s in signature.outputs}
+    continuous = heads.get("continuous_actions", heads.get("action"))
+    wide = 0
+    if signature.action_space != "discrete" and continuous is not None:
+        wide = math.prod(int(d or 0) for d in continuous.shape[1:])
+    branches = signature.branches if signature.action_space != "continuous" else ()
+    return Brain(wide, tuple(branches), vector, sensors=sensors_of(shapes))
+
+
+def assert_accepted(policy: Policy, folder: Path) -> None:
+    (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
+    file = folder / "policy.nn"
+    file.write_bytes(data)
+    verdict = check_file(file, CONSUMERS["R20"], agent_of(policy))
+    assert verdict.refused is None
+    mode = verdict.modes["stochastic"]
+    if policy.signature.memory is not None:
+        # Release 17 and later take no memory of version 2; there is nothing else that they find.
+        assert mode.load is not None
+        assert _MEMORY in mode.load.message
+        assert [f.message for f in mode.checks if _MEMORY not in f.message] == []
+        return
+    assert mode.accepted, [f.message for f in mode.checks]
+    assert mode.fetched
+
+
+@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
+def test_release_20_accepts_a_policy_of_ours(path: Path, tmp_path: Path) -> None:
+    for policy in policies(path):
+        assert_accepted(policy, tmp_path)
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("path", params(list(sources()), lambda p: "/".join(p.relative_to(SHARED).parts)[-90:]))
+def test_release_20_accepts_every_policy_that_is_written(path: Path, shared: Path, tmp_path: Path) -> None:
+    try:
+        found = policies(path)
+    except ExportModelError:
+        pytest.skip("the file is no policy, or is damaged: its own tests say which")
+    for policy in found:
+        try:
+            assert_accepted(policy, tmp_path)
+        except (UnsupportedOpError, SignatureError):
+            continue  # tests/barracuda/test_writer.py says which, and why
