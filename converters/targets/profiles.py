@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import difflib
 
-from converters.targets import barracuda3, barracuda10, barracuda14, unity6
+from converters.targets import barracuda3, barracuda10, barracuda14, tfsharp, unity6
 from converters.targets.profile import Profile
 from signatures.errors import UsageError
 
 #: The newest first; ``--for help`` shows them in this order.
-PROFILES: tuple[Profile, ...] = (unity6.PROFILE, barracuda3.PROFILE, barracuda14.PROFILE, barracuda10.PROFILE)
+PROFILES: tuple[Profile, ...] = (
+    unity6.PROFILE,
+    barracuda3.PROFILE,
+    barracuda14.PROFILE,
+    barracuda10.PROFILE,
+    *tfsharp.PROFILES,
+)
 
 
 def profile(name: str) -> Profile:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import onnxruntime
 from converters.format import WriteOptions
 from converters.formats import written
 from converters.graph.options import CompileOptions
+from converters.graph.run import run_graph
 from converters.onnx.edit import lifted
 from converters.policy import Policy
 from converters.source import ReadOptions
@@ -27,6 +28,8 @@ from signatures.roles import Role
 from signatures.spec import TensorSpec
 
 Feeds = dict[str, np.ndarray]
+#: (feeds, fetches) → what was fetched, by name
+Runner = Callable[[Mapping[str, np.ndarray], Sequence[str]], Mapping[str, np.ndarray]]
 ATOL = RTOL = 1e-5
 CONTRACT = '{"tool": {"version": "test"}}'
 
@@ -44,6 +47,7 @@ class Pair:
     profile: Profile
     dressed: Policy
     plain: onnx.ModelProto
+    #: the ModelProto, None where the profile's format is .bytes
     made: onnx.ModelProto
     data: bytes
 
@@ -51,9 +55,10 @@ class Pair:
     def of(cls, policy: Policy, profile: Profile) -> Pair:
         """Raises ProfileError where the profile cannot hold the policy."""
         dressed = profile.dress(policy)
-        artifact = written("onnx").artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
-        assert profile.check is not None
-        profile.check(profile, artifact.files, policy.name)
+        form = profile.formats[0]
+        artifact = written(form).artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
+        if profile.check is not None:
+            profile.check(profile, artifact.files, policy.name)
         data = artifact.files[artifact.main]
         plain = written("onnx").artifact(policy, WriteOptions(CONTRACT))
         return cls(
@@ -61,7 +66,7 @@ class Pair:
             profile,
             dressed,
             onnx.ModelProto.FromString(plain.files[plain.main]),
-            onnx.ModelProto.FromString(data),
+            onnx.ModelProto.FromString(data if form == "onnx" else b""),
             data,
         )
 
@@ -87,14 +92,21 @@ class Pair:
 
     # ------------------------------------------------------------------ running both
 
-    def difference(self, rows: int, seed: int) -> str | None:
-        """What the dressed policy does otherwise than the policy, None for nothing."""
+    def difference(self, rows: int, seed: int, runner: Runner | None = None, atol: float = ATOL) -> str | None:
+        """What the dressed policy does otherwise than the policy, None for nothing.
+
+        ``runner`` runs a .bytes: it is fed the draws in the place of its samplers. The default is numpy.
+        """
         rng = np.random.default_rng(seed)
         own = {s.name: _sample(s, self.policy, rows, rng) for s in self.policy.signature.inputs}
         masks = self._masks(rows, rng)
         if masks is not None and self.policy.signature.has_input("action_masks"):
             own["action_masks"] = masks.astype(self.policy.signature.input("action_masks").dtype)
         theirs = {s.name: self._mapped(s, own, masks) for s in self.dressed.signature.inputs}
+        if self.profile.formats[0] == "bytes":
+            expected = run_graph(self.policy.graph, own, [s.name for s in self.policy.signature.outputs])
+            noise = [own[s.name] for s in self.policy.signature.noise]
+            return self._frozen_difference(expected, theirs, noise, runner, atol)
         expected = run(self.plain, own, None)
         draws = [n.output[0] for n in self.made.graph.node if n.op_type == "RandomNormalLike"]
         noise = {s.name: own[s.name] for s in self.policy.signature.noise}
@@ -103,7 +115,31 @@ class Pair:
         scores = [n.input[0] for n in self.made.graph.node if n.op_type == "Multinomial"]
         model = lifted(_copied(self.made), draws) if len(draws) == 1 and len(noise) == 1 else self.made
         actual = run(model, theirs, scores)
-        return self._compared(expected, actual, scores, masks, drawn=len(draws) != len(noise) or len(draws) > 1)
+        return self._compared(expected, actual, scores, drawn=len(draws) != len(noise) or len(draws) > 1)
+
+    def _frozen_difference(
+        self, expected: Feeds, theirs: Feeds, noise: list[np.ndarray], runner: Runner | None, atol: float
+    ) -> str | None:
+        nodes = self.dressed.graph.nodes
+        draws = [n.name for n in nodes if n.op == "RandomStandardNormal"]
+        scores = [n.inputs[0] for n in nodes if n.op == "Multinomial"]
+        if len(draws) == len(noise) == 1:
+            theirs[draws[0]] = noise[0]
+        if "sequence_length" in self.dressed.graph:
+            theirs["sequence_length"] = np.array(1, np.int32)
+        constants = [n.name for n in nodes if n.op == "Const" and n.name in self.dressed.signature.constants]
+        wanted = [*(s.name for s in self.dressed.signature.outputs), *scores, *constants]
+        if runner is None:
+            known = {n.name for n in nodes}
+            fed = {k: v for k, v in theirs.items() if k in known}
+            actual = run_graph(self.dressed.graph, fed, wanted)
+        else:
+            actual = dict(runner(theirs, wanted))
+        for name in constants:
+            if actual[name].dtype != np.int32 or actual[name].shape != ():
+                return f"constant {name} is {actual[name]!r}"
+        drawn = len(draws) != len(noise) or len(draws) > 1
+        return self._compared(expected, actual, scores, drawn=drawn, atol=atol)
 
     def _masks(self, rows: int, rng: np.random.Generator) -> np.ndarray | None:
         """Masks that leave one action of each branch allowed, and forbid others now and then."""
@@ -115,8 +151,8 @@ class Pair:
             part = (rng.random((rows, size)) > 0.3).astype(np.float32)
             part[np.arange(rows), rng.integers(0, size, rows)] = 1
             parts.append(part)
-        own = self.policy.signature.has_input("action_masks")
-        return np.concatenate(parts, 1) if own else np.ones((rows, sum(sizes)), np.float32)
+        both = all(p.signature.has_input("action_masks") for p in (self.policy, self.dressed))
+        return np.concatenate(parts, 1) if both else np.ones((rows, sum(sizes)), np.float32)
 
     def _mapped(self, spec: TensorSpec, own: Feeds, masks: np.ndarray | None) -> np.ndarray:
         if spec.role is Role.MASKS:
@@ -130,12 +166,14 @@ class Pair:
         value = own[source[0].name]
         if spec.role is Role.VISUAL:
             done = self.policy.signature.preprocess[source[0].name]
-            value = value.transpose(0, 3, 1, 2) if done["layout"] == "NHWC" else value
+            given = self.dressed.signature.preprocess[spec.name]["layout"]
+            turn = {("NHWC", "NCHW"): (0, 3, 1, 2), ("NCHW", "NHWC"): (0, 2, 3, 1)}.get((done["layout"], given))
+            value = value.transpose(turn) if turn is not None else value
             value = value / np.float32(done["range"][1])
-        return value.astype(np.float32).reshape([len(value), *(d or -1 for d in spec.shape[1:])])
+        return value.astype(spec.dtype).reshape([len(value), *(d or -1 for d in spec.shape[1:])])
 
     def _compared(
-        self, expected: Feeds, actual: Feeds, scores: list[str], masks: np.ndarray | None, *, drawn: bool
+        self, expected: Feeds, actual: Feeds, scores: list[str], *, drawn: bool, atol: float = ATOL
     ) -> str | None:
         for spec in self.dressed.signature.outputs:
             if spec.role is Role.SAMPLED or (drawn and spec.role is Role.CONTINUOUS):
@@ -148,7 +186,11 @@ class Pair:
             name = self._own_name(spec)
             want, got = expected[name], actual[spec.name]
             if got.size != want.size or not np.allclose(
-                got.reshape(want.shape).astype(np.float64), want.astype(np.float64), ATOL, RTOL, equal_nan=True
+                got.reshape(want.shape).astype(np.float64),
+                want.astype(np.float64),
+                rtol=RTOL,
+                atol=atol,
+                equal_nan=True,
             ):
                 return f"{spec.name} is not {name}: {got.reshape(-1)[:6]} instead of {want.reshape(-1)[:6]}"
         for name, value in self.dressed.constants.items():

@@ -73,13 +73,16 @@ class Branches:
     best: str | None
 
 
-def branches(dressing: Dressing, spec: TensorSpec, masks: str | None) -> Branches:
-    """The branches of the discrete action ``spec``; masks are supplied and applied where ``masks`` is None."""
+def branches(dressing: Dressing, spec: TensorSpec, masks: str | None, *, masked: bool = True) -> Branches:
+    """The branches of the discrete action ``spec``; masks are supplied and applied where ``masks`` is None.
+
+    Not ``masked``: the consumer knows no masks, so none are supplied.
+    """
     builder, signature = dressing.builder, dressing.policy.signature
     scores, sizes = _scores(dressing, spec)
     dressing.branches = sizes
     samples = best = None
-    if masks is None:
+    if masks is None and masked:
         masks = supply_masks(dressing, sum(sizes))
         scores = tuple(_masked(dressing, score, masks, at, size) for score, at, size in _cuts(scores, sizes))
     else:

@@ -6,14 +6,14 @@ turned, a float cast, a row of memory reshaped); behind it the actions are broug
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node, TensorShape, ref, split_ref
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape, ref, split_ref
 from converters.graph.passes.fold import fold
 from converters.graph.passes.naming import name_tensors
 from converters.graph.passes.simplify import collapse_views, drop_identities
@@ -53,18 +53,18 @@ class Dressing:
 
     # ------------------------------------------------------------------ in front of the graph
 
-    def take(self, name: str, spec: TensorSpec, shape: tuple[int | None, ...]) -> str:
-        """A new float32 input of the consumer that stands for the policy's input ``spec``."""
+    def take(self, name: str, spec: TensorSpec, shape: tuple[int | None, ...], dtype: np.dtype[Any] = FLOAT32) -> str:
+        """A new input of the consumer that stands for the policy's input ``spec``."""
         made = self.builder.append(
             Node(
                 self.builder.names.fresh(f"{self.profile}/{name}"),
                 "Placeholder",
-                attrs={"dtype": FLOAT32, "shape": TensorShape(shape)},
+                attrs={"dtype": dtype, "shape": TensorShape(shape)},
                 origin=spec.source if isinstance(spec.source, str) else None,
             )
         )
         self.feeds[name] = made
-        self.inputs.append(replace(spec, name=name, dtype="float32", shape=shape))
+        self.inputs.append(replace(spec, name=name, dtype=dtype.name, shape=shape))
         return made
 
     def give_in(self, spec: TensorSpec, tensor: str) -> None:
@@ -118,13 +118,13 @@ class Dressing:
         self.fetches[name] = pinned
         self.outputs.append(TensorSpec(name, role, kind.dtype.name, static_shape(kind.shape) or (None,), source))
 
-    def finished(self, memory: Memory | None, preprocess: Mapping[str, object]) -> Policy:
-        """The policy in the consumer's names."""
+    def finished(self, memory: Memory | None, preprocess: Mapping[str, object], beside: Sequence[Node] = ()) -> Policy:
+        """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up."""
         graph = self.builder.graph().pruned(self.fetches.values())
         work, fetches = drop_identities(fold(graph).pruned(self.fetches.values()), self.fetches)
         work, fetches = cancel_transposes(*collapse_views(work, fetches))
         feeds = {name: node for name, node in self.feeds.items() if node in work}
-        work = name_tensors(work, feeds, fetches, tuple(self.constants))
+        work = name_tensors(work, feeds, fetches, (*self.constants, *(n.name for n in beside)))
         signature = replace(
             self.policy.signature,
             inputs=tuple(s for s in self.inputs if s.name in feeds),
@@ -132,14 +132,17 @@ class Dressing:
             memory=memory,
             branches=self.branches,
             preprocess=preprocess,
-            constants={k: _plain(v) for k, v in self.constants.items()},
+            constants={
+                **{n.name: _plain(n.value) for n in beside if n.value is not None},
+                **{k: _plain(v) for k, v in self.constants.items()},
+            },
             notes=(*self.policy.signature.notes, *self.notes),
             labels={},
         )
         names = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
         return Policy(
             self.policy.name,
-            work,
+            Graph((*work.nodes, *beside)),
             signature,
             {n: n for n in names[0]},
             {n: n for n in names[1]},

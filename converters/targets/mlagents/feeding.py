@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import NoReturn
 
 import numpy as np
 
@@ -55,16 +56,65 @@ def _take_image(dressing: Dressing, name: str, spec: TensorSpec) -> None:
         _unknown_length(dressing, spec)
     _, *sizes = spec.shape
     tensor = dressing.take(name, spec, (None, sizes[2], sizes[0], sizes[1]) if nhwc else (None, *sizes))
-    colours = done.get("range")
-    if isinstance(colours, list) and colours[-1] == 255:
-        tensor = builder.add("Mul", [tensor, builder.floats(255.0, "colours")], f"{name}/as_bytes")
-        dressing.notes.append(
-            f"{name}: Unity gives colours of 0 to 1; this policy takes 0 to 255 and gets them times 255"
-        )
+    tensor = _as_colours(dressing, name, tensor, done)
     dressing.give_in(spec, builder.transpose(tensor, [0, 2, 3, 1]) if nhwc else tensor)
 
 
-def _unknown_length(dressing: Dressing, spec: TensorSpec) -> None:
+def take_joined(dressing: Dressing, name: str, vectors: list[TensorSpec]) -> None:
+    """One input for all vectors, which the C# side joins in the order of its sensors."""
+    if len(vectors) == 1:
+        take_observation(dressing, name, vectors[0])
+        return
+    widths = [s.shape[-1] for s in vectors]
+    if any(w is None or len(s.shape) != 2 for w, s in zip(widths, vectors, strict=True)):
+        dressing.refuse(
+            f"the shape of its observation {vectors[0].name} is {list(vectors[0].shape)}",
+            why="vectors are fed as one row of a known width",
+            fix="export the model again with all lengths but the batch fixed",
+        )
+    known = [int(w or 0) for w in widths]
+    joined = TensorSpec(name, Role.VECTOR, "float32", (None, sum(known)), tuple(str(s.source) for s in vectors))
+    taken = dressing.take(name, joined, (None, sum(known)))
+    for number, (spec, width) in enumerate(zip(vectors, known, strict=True)):
+        begin = sum(known[:number])
+        dressing.give_in(spec, dressing.builder.slice(taken, 1, begin, begin + width))
+    names = ", ".join(f"{s.name} ({w})" for s, w in zip(vectors, known, strict=True))
+    dressing.notes.append(f"{name} is {names}, one behind the other")
+
+
+def take_image_rows(dressing: Dressing, name: str, spec: TensorSpec) -> None:
+    """An input of the consumer for an image as TensorFlow had it: [B, H, W, C]."""
+    builder = dressing.builder
+    done: Mapping[str, object] = dressing.policy.signature.preprocess.get(spec.name, {})
+    if len(spec.shape) != 4 or None in spec.shape[1:]:
+        _unknown_length(dressing, spec)
+    _, *sizes = spec.shape
+    nhwc = done.get("layout", "NHWC") == "NHWC"
+    tensor = dressing.take(name, spec, (None, *sizes) if nhwc else (None, sizes[1], sizes[2], sizes[0]))
+    tensor = _as_colours(dressing, name, tensor, done)
+    dressing.give_in(spec, tensor if nhwc else builder.transpose(tensor, [0, 3, 1, 2]))
+
+
+def refuse_lost_memory(dressing: Dressing, name: str) -> NoReturn:
+    """A memory that the source takes and does not give back."""
+    dressing.refuse(
+        f"its memory ({name}) is taken but not given back",
+        why="recurrent_out was lost in the export of the source, so that every step would begin anew",
+        fix="export from the checkpoint of the run, or from another of its files, which has the memory",
+    )
+
+
+def _as_colours(dressing: Dressing, name: str, tensor: str, done: Mapping[str, object]) -> str:
+    """Colours as the policy takes them; ML-Agents gives 0 to 1."""
+    colours = done.get("range")
+    if not isinstance(colours, list) or colours[-1] != 255:
+        return tensor
+    dressing.notes.append(f"{name}: Unity gives colours of 0 to 1; this policy takes 0 to 255 and gets them times 255")
+    builder = dressing.builder
+    return builder.add("Mul", [tensor, builder.floats(255.0, "colours")], f"{name}/as_bytes")
+
+
+def _unknown_length(dressing: Dressing, spec: TensorSpec) -> NoReturn:
     dressing.refuse(
         f"the shape of its observation {spec.name} is {list(spec.shape)}",
         why="Unity compares the lengths of a sensor with those of the model's input",

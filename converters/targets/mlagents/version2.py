@@ -15,7 +15,6 @@ from converters.targets.mlagents import feeding
 from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities
 from converters.targets.mlagents.dressing import Dressing
 from signatures.roles import Role
-from signatures.spec import TensorSpec
 
 _VERSION = 2
 VECTOR = "vector_observation"
@@ -56,30 +55,9 @@ def _take_observations(dressing: Dressing) -> dict[str, object]:
         feeding.take_observation(dressing, name, spec)
         images[name] = {"layout": "NCHW", "range": [0, 1], "from_bytes": "divide by 255"}
     vectors = [s for s in signature.observations if s.role is Role.VECTOR]
-    if len(vectors) == 1:
-        feeding.take_observation(dressing, VECTOR, vectors[0])
-    elif vectors:
-        _take_joined(dressing, vectors)
+    if vectors:
+        feeding.take_joined(dressing, VECTOR, vectors)
     return images
-
-
-def _take_joined(dressing: Dressing, vectors: list[TensorSpec]) -> None:
-    """Several vectors, which the C# side joins in the order of its sensors."""
-    widths = [s.shape[-1] for s in vectors]
-    if any(w is None or len(s.shape) != 2 for w, s in zip(widths, vectors, strict=True)):
-        dressing.refuse(
-            f"the shape of its observation {vectors[0].name} is {list(vectors[0].shape)}",
-            why="vectors are fed as one row of a known width",
-            fix="export the model again with all lengths but the batch fixed",
-        )
-    known = [int(w or 0) for w in widths]
-    joined = TensorSpec(VECTOR, Role.VECTOR, "float32", (None, sum(known)), tuple(str(s.source) for s in vectors))
-    taken = dressing.take(VECTOR, joined, (None, sum(known)))
-    for number, (spec, width) in enumerate(zip(vectors, known, strict=True)):
-        begin = sum(known[:number])
-        dressing.give_in(spec, dressing.builder.slice(taken, 1, begin, begin + width))
-    names = ", ".join(f"{s.name} ({w})" for s, w in zip(vectors, known, strict=True))
-    dressing.notes.append(f"{VECTOR} is {names}, one behind the other")
 
 
 def _give_actions(dressing: Dressing, found: Heads, masks: str | None) -> None:

@@ -68,11 +68,7 @@ def _take_memory(dressing: Dressing) -> int:
     if memory is None or memory.input is None:
         return 0
     if memory.output is None:
-        dressing.refuse(
-            f"its memory ({memory.input}) is taken but not given back",
-            why="recurrent_out was lost in the export of the source, so that every step would begin anew",
-            fix="export from the checkpoint of the run, or from another of its files, which has the memory",
-        )
+        feeding.refuse_lost_memory(dressing, memory.input)
     spec = dressing.policy.signature.input(memory.input)
     dressing.give_in(spec, dressing.take("recurrent_in", spec, (None, 1, memory.size)))
     return memory.size

@@ -1,0 +1,23 @@
+"""ML-Agents 0.1 to 0.6 on the TensorFlowSharp plugin: a ``.bytes`` for each generation."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from converters.targets.mlagents.tensorflowsharp import Generation, dress
+from converters.targets.profile import Profile
+
+_GENERATIONS = (
+    (Generation("tfsharp-0.6", masks=True, branches=True, version=1), "ML-Agents 0.6 (plugin of TensorFlow 1.7)"),
+    (Generation("tfsharp-0.5", masks=True, branches=True), "ML-Agents 0.5 (plugin of TensorFlow 1.7)"),
+    (Generation("tfsharp-0.4"), "ML-Agents 0.4 (plugin of TensorFlow 1.7)"),
+    (Generation("tfsharp-0.3"), "ML-Agents 0.3 (plugin of TensorFlow 1.4)"),
+    (
+        Generation("tfsharp-0.2", vector="state", visual="observation_", memory_constant=False),
+        "ML-Agents 0.1 and 0.2 (plugin of TensorFlow 1.1 or 1.2; the file was run in 1.4)",
+    ),
+)
+PROFILES = tuple(
+    Profile(name=g.name, purpose=purpose, formats=("bytes",), dress=partial(dress, generation=g))
+    for g, purpose in _GENERATIONS
+)

@@ -1,0 +1,97 @@
+"""``.bytes`` of the tfsharp profiles in TensorFlow 1.4 and 1.7, fed as the C# side of that generation feeds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from converters.frozen_graph.reader import read_graph
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.tensorflow1.found import RELEASES
+from converters.targets import tfsharp
+from converters.targets.profile import Profile
+from fixtures import FIXTURES
+from fixtures import path as fixture
+from signatures.errors import ExportModelError, ProfileError
+from tests.legacy.installed import ensure
+from tests.targets.dressed import Pair, compiled
+
+pytestmark = [pytest.mark.legacy, pytest.mark.slow]
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+#: Generation → the TensorFlow of its plugin. That of 0.1 and 0.2 had 1.1 or 1.2, which are not here.
+TENSORFLOW = {"0.2": "tf1.4", "0.3": "tf1.4", "0.4": "tf1.7", "0.5": "tf1.7", "0.6": "tf1.7"}
+#: File → (atol, why): float32 rounding that a policy makes larger.
+ATOL = {
+    "AliBharwani+ml-agents__Hallway.nn": (5e-5, "its LSTM under N(0, 1) memory: 2.9e-5 from numpy on values up to 3.7"),
+}
+
+
+@pytest.fixture(scope="session")
+def pool(processes: RuntimePool) -> RuntimePool:
+    return processes
+
+
+def runtime_of(wanted: Profile) -> str:
+    name = TENSORFLOW[wanted.name.removeprefix("tfsharp-")]
+    return ensure(next(r for r in RELEASES if r.runtime == name))
+
+
+def held(path: Path, wanted: Profile, pool: RuntimePool, folder: Path) -> int:
+    """Run each policy of a file as the generation does; returns how many are held."""
+    runtime, count = runtime_of(wanted), 0
+    atol, _ = ATOL.get(path.name, (1e-5, ""))
+    for policy in compiled(path):
+        try:
+            pair = Pair.of(policy, wanted)
+        except ProfileError as error:
+            assert any(word in error.what for word in ("branches", "not given back", "entities", "discrete actions"))
+            continue
+        file = folder / f"{count}.bytes"
+        file.write_bytes(pair.data)
+        model = pool.process(runtime).load(str(file))
+        for seed, rows in enumerate((1, 3, 16)):
+            assert pair.difference(rows, seed, model.run, atol) is None, (policy.name, rows)
+        model.unload()
+        count += 1
+    return count
+
+
+@pytest.mark.parametrize("wanted", tfsharp.PROFILES, ids=lambda p: p.name)
+@pytest.mark.parametrize("name", FIXTURES)
+def test_a_fixture_acts_the_same(name: str, wanted: Profile, pool: RuntimePool, tmp_path: Path) -> None:
+    assert held(fixture(name), wanted, pool, tmp_path) > 0 or name in ("discrete", "recurrent", "sampled")
+
+
+def _known() -> list[Any]:
+    files = [p for room in ("genuine", "corpus", "foreign") for p in sorted((SHARED / room).rglob("*"))]
+    files = [p for p in files if p.suffix in (".bytes", ".pb", ".nn", ".onnx", ".pt") and p.is_file()]
+    turns = [(p, tfsharp.PROFILES[i % len(tfsharp.PROFILES)]) for i, p in enumerate(files)]
+    return [pytest.param(p, w, id=f"{p.parent.name}/{p.name}-{w.name}") for p, w in turns] or [
+        pytest.param(Path("absent"), tfsharp.PROFILES[0], id="shared-is-absent")
+    ]
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize(("path", "wanted"), _known())
+def test_a_known_policy_acts_the_same(path: Path, wanted: Profile, pool: RuntimePool, tmp_path: Path) -> None:
+    if not path.is_file():
+        pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
+    try:
+        held(path, wanted, pool, tmp_path)
+    except ExportModelError as error:
+        pytest.skip(f"no policy: {error.what}")
+
+
+def test_the_constants_of_0_6_are_int32_nodes(tmp_path: Path) -> None:
+    (policy,) = compiled(fixture("discrete"))
+    pair = Pair.of(policy, next(p for p in tfsharp.PROFILES if p.name == "tfsharp-0.6"))
+    graph = read_graph(pair.data)
+    values = {n.name: n.value for n in graph.nodes if n.op == "Const"}
+    found = {k: int(values[k]) for k in ("version_number", "memory_size", "is_continuous_control")}
+    assert found == {"version_number": 1, "memory_size": 0, "is_continuous_control": 0}
+    assert int(values["action_output_shape"]) == sum(policy.signature.branches)
+    assert {values[k].dtype.name for k in found} == {"int32"}
+    taken = {n.name for n in graph.nodes if n.op == "Placeholder"}
+    assert taken == {"vector_observation", "action_masks"}
