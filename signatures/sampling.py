@@ -1,11 +1,13 @@
 """Inputs to try a policy on, drawn from the policy itself and seeded.
 
-Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, values of 1e3, float32
-denormals, all but one action masked), images in 0..1, batches of 1, 2 and 7, and one of 64 where there are no images.
+Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, 30 to 300, 1e3, float32
+denormals, every two inputs at opposite extremes, all but one action masked, a memory far from zero), images in 0..1,
+batches of 1, 2 and 7, and a large odd one where there are no images.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -17,7 +19,9 @@ from signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
 #: Tried once, and not with images, which take long.
-LARGE_BATCH = 64
+LARGE_BATCH = 131
+#: Values that are far from typical ones and near enough to be met: between eight deviations and 1e3.
+FAR = (30.0, 100.0, 300.0)
 #: What a free axis behind the batch is tried with (image sides, number of entities).
 _FREE_AXIS = 8
 
@@ -30,6 +34,9 @@ class Case:
     feeds: dict[str, np.ndarray]
     batch: int
 
+
+#: A memory far from zero, in its standard deviations: what an LSTM's cell may reach.
+_FAR_MEMORY = 5.0
 
 #: Quoted: naming the generator's class would load numpy.random, which an export that verifies nothing does not need.
 Style: TypeAlias = "Callable[[np.random.Generator, TensorSpec, tuple[int, ...]], np.ndarray]"
@@ -49,8 +56,16 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     if any(s.role is Role.MASKS for s in signature.inputs):
         cases.append(_case(signature, rng, "all but one action masked", 7, _typical, masks=_one_allowed))
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
-    if not any(s.role is Role.VISUAL for s in signature.inputs):
-        cases.append(_case(signature, rng, f"typical, batch {LARGE_BATCH}", LARGE_BATCH, _typical))
+    if any(s.role is Role.VISUAL for s in signature.inputs):
+        if any(_is_free(s) for s in signature.inputs):
+            cases.append(_case(signature, rng, "30 to 300", len(FAR), _far(signature, few=True)))
+        return cases
+    cases.append(_case(signature, rng, f"typical, batch {LARGE_BATCH}", LARGE_BATCH, _typical))
+    if not any(_is_free(s) for s in signature.inputs):
+        return cases
+    pattern = len(_opposed(signature))
+    cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature)))
+    cases.append(_case(signature, rng, "30 to 300", pattern * len(FAR), _far(signature)))
     return cases
 
 
@@ -96,7 +111,7 @@ def _other(
     if spec.role is Role.NOISE:
         return rng.standard_normal(shape)
     if spec.role is Role.MEMORY_IN:
-        return rng.standard_normal(shape) * 0.5
+        return rng.standard_normal(shape) * (_FAR_MEMORY if style in (_clip_edges, _beyond) else 0.5)
     if np.dtype(spec.dtype).kind in "iu":
         high = int((spec.distribution or {}).get("high", 1))
         return rng.integers(0, high + 1, shape)
@@ -138,6 +153,56 @@ def _large(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -
 def _denormals(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     """Below the smallest normal float32: runtimes may take them for zero."""
     return np.asarray(np.finfo(np.float32).tiny * rng.uniform(-1.0, 1.0, shape))
+
+
+def _is_free(spec: TensorSpec) -> bool:
+    """Whether a style decides its values."""
+    decided = (Role.MASKS, Role.PREV_ACTION, Role.VISUAL, Role.NOISE, Role.MEMORY_IN, Role.PARAMETER)
+    return spec.role not in decided and np.dtype(spec.dtype).kind not in "iu"
+
+
+def _opposed(signature: PolicySignature) -> np.ndarray:
+    """Signs, [rows, numbers of all inputs]: every two numbers have both pairs of opposite signs in some row.
+
+    Of two numbers, some bit of their places differs; a row for each bit and one for its complement, and one for each
+    sign alone.
+    """
+    count = sum(_numbers(s.shape) for s in signature.inputs if _is_free(s))
+    bits = np.arange(max(1, (count - 1).bit_length()))[:, None]
+    signs = np.where(np.arange(count) >> bits & 1, 1.0, -1.0)
+    return np.concatenate([signs, -signs, np.ones((1, count)), -np.ones((1, count))])
+
+
+def _numbers(shape: Sequence[int | None]) -> int:
+    return math.prod(_FREE_AXIS if n is None else n for n in shape[1:])
+
+
+def _signs(signature: PolicySignature, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """The part of ``_opposed`` that is ``spec``'s, repeated as often as ``shape`` has room for it."""
+    before = [s for s in signature.inputs[: signature.inputs.index(spec)] if _is_free(s)]
+    start = sum(_numbers(s.shape) for s in before)
+    own = _opposed(signature)[:, start : start + _numbers(spec.shape)]
+    return own[np.arange(shape[0] if shape else 1) % len(own)].reshape(shape)
+
+
+def _opposite(signature: PolicySignature) -> Style:
+    def style(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+        mean, std = _statistics(spec)
+        return np.asarray(mean + 5 * std * _signs(signature, spec, shape))
+
+    return style
+
+
+def _far(signature: PolicySignature, *, few: bool = False) -> Style:
+    """The numbers of ``FAR`` with the signs of ``_opposed``, or with ``few`` a row of each, signs drawn."""
+
+    def style(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+        signs = rng.choice([-1.0, 1.0], shape) if few else _signs(signature, spec, shape)
+        rows = shape[0] if shape else 1
+        sizes = np.asarray(FAR)[np.arange(rows) * len(FAR) // rows]
+        return np.asarray(signs * sizes.reshape(shape[:1] + (1,) * len(shape[1:])))
+
+    return style
 
 
 def _all_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:

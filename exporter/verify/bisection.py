@@ -8,7 +8,7 @@ outputs is asked, rounding allowed for. What comes after a sampler in the graph 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +49,7 @@ class Bisector:
         self._opened: tuple[tuple[str, str], InnerTensors] | None = None
         self._stack = contextlib.ExitStack()
         self._sources: dict[str, str] | None = None
+        self._compared: set[Path] = set()
 
     def close(self) -> None:
         """Free what was loaded to look inside."""
@@ -68,6 +69,37 @@ class Bisector:
         except (ExportModelError, OSError) as error:
             why = getattr(error, "why", None)
             return Bisection(None, reason=f"the inside could not be looked at: {error if why is None else why}")
+
+    def constants(self, participant: Participant, feeds: Feeds) -> list[Bisection]:
+        """The policy's numbers that ``participant`` has otherwise, to the last bit; none where it cannot be told.
+
+        Weights that were rounded change outputs by less than any tolerance where these hardly vary. A format is looked
+        at in the first runtime that runs it.
+        """
+        if participant.path is None or participant.fed is not None or participant.path in self._compared:
+            return []
+        self._compared.add(participant.path)
+        if not self._differing(plain(self.tested.graph), participant, feeds):
+            return []
+        graph = self.graph()  # a bundle's graph is that of its .bytes, which may be what is wrong
+        return [] if graph is None else self._differing(graph, participant, feeds)
+
+    def _differing(self, graph: Graph, participant: Participant, feeds: Feeds) -> list[Bisection]:
+        upstream = graph.ancestors([s.name for s in self.tested.signature.outputs])
+        known = {n.name: n.value for n in graph.nodes if n.name in upstream and n.value is not None}
+        known = {name: value for name, value in known.items() if value.dtype.kind == "f" and value.size}
+        found = []
+        try:
+            inner = self._within(participant)
+            for chunk in _chunks(list(known), known):
+                got = inner.fetch(feeds, chunk)
+                for name, array in got.items():
+                    difference = compare(known[name], array, Tolerance(0, 0))
+                    if not difference.passed:
+                        found.append(_found(graph.producer(name), name, known[name], array, difference, self._source))
+        except (ExportModelError, OSError):
+            return found
+        return found
 
     def graph(self) -> Graph | None:
         """The first graph that agrees with the reference: the policy's, the .bytes', the SavedModel's."""
@@ -177,39 +209,40 @@ class _Search:
             if difference.passed:
                 return None
         hidden = tuple(r for r in dict.fromkeys(node.inputs) if r not in seen and not self._is_setting(r))
-        return self._found(tensor, node, expected, got, difference, hidden)
+        return _found(node, tensor, expected, got, difference, self.source, hidden)
 
     def _is_setting(self, tensor: str) -> bool:
         """An axis, a shape: other formats have it as an attribute."""
         value = self.graph.producer(tensor).value
         return value is not None and value.dtype.kind != "f"
 
-    def _found(
-        self,
-        tensor: str,
-        node: Node,
-        expected: np.ndarray,
-        got: np.ndarray,
-        difference: Difference,
-        hidden: tuple[str, ...],
-    ) -> Bisection:
-        at = difference.worst
-        index = None if at is None else tuple(int(i) for i in np.unravel_index(at, expected.shape))
-        return Bisection(
-            tensor,
-            node.op,
-            self.source(node),
-            index,
-            None if index is None else float(expected[index]),
-            None if index is None else float(got[index]),
-            difference.max_abs,
-            difference.smallest_tolerance,
-            hidden,
-            reason=difference.reason,
-        )
+
+def _found(
+    node: Node,
+    tensor: str,
+    expected: np.ndarray,
+    got: np.ndarray,
+    difference: Difference,
+    source: Callable[[Node], str | tuple[str, ...] | None],
+    hidden: tuple[str, ...] = (),
+) -> Bisection:
+    at = difference.worst
+    index = None if at is None else tuple(int(i) for i in np.unravel_index(at, expected.shape))
+    return Bisection(
+        tensor,
+        node.op,
+        source(node),
+        index,
+        None if index is None else float(expected[index]),
+        None if index is None else float(got[index]),
+        difference.max_abs,
+        difference.smallest_tolerance,
+        hidden,
+        reason=difference.reason,
+    )
 
 
-def _chunks(tensors: Sequence[str], values: dict[str, np.ndarray]) -> Iterator[list[str]]:
+def _chunks(tensors: Sequence[str], values: Mapping[str, np.ndarray]) -> Iterator[list[str]]:
     """``tensors`` in order, as many at a time as ``FETCH_BYTES`` hold."""
     chunk: list[str] = []
     size = 0

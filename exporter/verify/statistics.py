@@ -10,6 +10,8 @@ import numpy as np
 FALSE_ALARM = 1e-6
 #: Classes expected less often than this are pooled: the chi-square approximation needs it.
 _MIN_EXPECTED = 5.0
+#: Groups of classes by how likely they are.
+_GROUPS = 8
 
 
 def chi_square_survival(statistic: float, freedom: int) -> float:
@@ -68,6 +70,27 @@ def fit(draws: np.ndarray, log_probs: np.ndarray) -> float:
     if expected.size < 2:
         return 1.0
     return chi_square_survival(float(((counts - expected) ** 2 / expected).sum()), expected.size - 1)
+
+
+def fit_all(draws: np.ndarray, log_probs: np.ndarray) -> float:
+    """The p-value of ``draws`` [inputs, draws] under ``log_probs`` [inputs, classes], of all inputs together.
+
+    Twice: by class, and by how likely the class was at its input, in groups of about the same expectation. (The counts
+    of several inputs vary less than those of one whose probabilities are the mean: p is never too small.)
+    """
+    if draws.size == 0 or draws.min() < 0 or draws.max() >= log_probs.shape[1]:
+        return 0.0
+    probabilities = np.exp(log_probs.astype(np.float64))
+    probabilities /= probabilities.sum(axis=1, keepdims=True) * len(probabilities)
+    indices = draws.astype(int)
+    flat = probabilities.reshape(-1)
+    order = np.argsort(flat, kind="stable")
+    group = np.empty(flat.size, int)
+    group[order] = np.minimum(np.cumsum(flat[order]) * _GROUPS, _GROUPS - 1).astype(int)
+    seen = np.take_along_axis(group.reshape(probabilities.shape), indices, axis=1)
+    with np.errstate(divide="ignore"):
+        groups, classes = np.log(np.bincount(group, flat, _GROUPS)), np.log(probabilities.sum(axis=0))
+    return min(fit(indices.reshape(-1), classes), fit(seen.reshape(-1), groups))
 
 
 def same_distribution(reference: np.ndarray, draws: np.ndarray, atol: float, rtol: float) -> float:

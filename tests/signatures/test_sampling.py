@@ -65,15 +65,36 @@ def test_every_batch_size_is_tried() -> None:
     assert [c.batch for c in typical] == [b for b in BATCHES for _ in range(3)]
     assert [c.name for c in cases[len(typical) :]] == [
         *("zeros", "clip edges", "beyond the clip", "1e3", "denormals"),
-        *("all but one action masked", "random masks"),
+        *("all but one action masked", "random masks", "30 to 300"),
     ]
     assert len({c.name for c in cases}) == len(cases)
 
 
 def test_a_large_batch_is_tried_once_and_never_with_images() -> None:
     plain = draw_cases(signature(spec("state", Role.VECTOR, None, 3)), samples=3)
-    assert [c.name for c in plain if c.batch == LARGE_BATCH] == ["typical, batch 64"]
+    assert [c.name for c in plain if c.batch == LARGE_BATCH] == ["typical, batch 131"]
     assert all(c.batch < LARGE_BATCH for c in draw_cases(EVERYTHING, samples=3))
+
+
+def test_every_two_numbers_are_at_opposite_extremes_of_two_inputs_too() -> None:
+    known = spec("state", Role.VECTOR, None, 4, mean=[1.0] * 4, std=[2.0] * 4)
+    two = signature(known, spec("state_1", Role.VECTOR, None, 7))
+    cases = {c.name: c for c in draw_cases(two)}
+    fed = cases["opposite extremes"].feeds
+    rows = np.concatenate([(fed["state"] - 1) / 2, fed["state_1"]], axis=1)
+    assert (np.abs(rows) == 5).all()
+    for i in range(11):
+        for j in range(11):
+            assert ((rows[:, i] > 0) & (rows[:, j] < 0)).any() or i == j
+    far = np.concatenate([cases["30 to 300"].feeds[s.name] for s in two.inputs], axis=1)
+    assert {*np.unique(np.abs(far))} == {30, 100, 300}
+    assert all(((far[:, i] == a) & (far[:, j] == -a)).any() for a in (30, 300) for i in (0, 5) for j in (3, 10))
+
+
+def test_the_memory_is_tried_far_from_zero() -> None:
+    cases = {c.name: c for c in draw_cases(EVERYTHING)}
+    assert np.abs(cases["clip edges"].feeds["recurrent_in"]).max() > 3
+    assert np.abs(cases["typical, batch 7, #0"].feeds["recurrent_in"]).max() < 3
 
 
 def test_masks_are_tried_only_where_there_are_some() -> None:
@@ -94,7 +115,7 @@ def test_arrays_have_the_dtypes_and_shapes_of_the_contract() -> None:
 def test_the_rows_are_those_of_the_observation_even_where_a_parameter_is_longer() -> None:
     case = draw_cases(EVERYTHING)[0]
     assert (case.batch, case.feeds["gain"].shape, EVERYTHING.rows(case.feeds)) == (1, (5,), 1)
-    assert EVERYTHING.rows(draw_cases(EVERYTHING)[-1].feeds) == 7
+    assert EVERYTHING.rows(draw_cases(EVERYTHING)[-2].feeds) == 7
     assert signature(spec("gain", Role.PARAMETER, 5)).rows({"gain": np.zeros(5)}) == 1
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from exporter.verify.difference import Difference, wrong
-from exporter.verify.findings import Finding, Numbers, Shape
+from exporter.verify.findings import Bisection, Finding, Numbers, Shape
 from exporter.verify.histogram import added
 from exporter.verify.participants import Participant
 from exporter.verify.trial import Trial
@@ -35,11 +35,21 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
             needed.setdefault(name, []).append(difference.smallest_tolerance)
             if name not in worst or rank(difference) > rank(worst[name][0]):
                 worst[name] = (difference, case)
+    rounded = trial.bisector.constants(participant, trial.cases[0].feeds)
     for name, (difference, case) in worst.items():
         kind = Shape if trial.drawn(name, participant) else Numbers
         difference = replace(difference, smallest_tolerance=largest(needed[name]), histogram=spread[name])
         begins = trial.bisected(participant, name, difference, case.feeds)
+        if difference.passed and (other := _upstream(trial, name, rounded)) is not None:
+            difference = replace(difference, passed=False, reason=f"the constant {other.tensor} has another value")
+            begins = other
         yield trial.finding(kind, participant, name, difference, case.name, bisection=begins)
+
+
+def _upstream(trial: Trial, name: str, constants: Sequence[Bisection]) -> Bisection | None:
+    """The first of ``constants`` that an output is made of."""
+    upstream = trial.tested.graph.ancestors([name]) if constants else frozenset()
+    return next((c for c in constants if c.tensor in upstream), None)
 
 
 def plausible(signature: PolicySignature, name: str, got: np.ndarray, case: Case) -> Difference:

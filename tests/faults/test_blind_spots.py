@@ -1,0 +1,179 @@
+"""Large faults of kinds that verification was once blind to, each planted into a runtime that is otherwise right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from converters.formats import DEFAULTS
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import LoadedModel
+from converters.runtimes.registry import RuntimeInfo
+from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.checks.draws import least_likely
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
+from exporter.verify.report import ParityReport
+from exporter.verify.verification import verify
+from fixtures import path as fixture
+from tests.faults.artefacts import FORMATS, opened
+
+Arrays = dict[str, npt.NDArray[Any]]
+#: What it was fed and what it answers → what it says instead.
+Spoil = Callable[[Feeds, Arrays], Arrays]
+
+KNOWN = tuple(RuntimeInfo(name, True, "1.0", "") for name in ("numpy", "onnxruntime"))
+
+
+def verified(
+    name: str, tmp_path: Path, pool: RuntimePool, spoil: Spoil, feeding: Callable[[Feeds], Feeds] = lambda feeds: feeds
+) -> ParityReport:
+    """The report on a fixture in the numpy kernels, and in a runtime of which ``spoil`` is what is wrong with it."""
+    (result,) = export([fixture(name)], ExportOptions(tmp_path / "out", verify="none"))
+    policy = result.policy
+    file = result.folder / f"{name}.bytes"
+    tested = PolicyUnderTest(policy.name, policy.signature, policy.graph, {}, {}, file)
+
+    def participants(numpy: LoadedModel, failed: object) -> Iterator[Participant]:
+        def run(feeds: Feeds, fetch: Any) -> Arrays:
+            return spoil(feeds, dict(numpy.run(feeding(feeds), fetch)))
+
+        outputs = [s.name for s in policy.signature.outputs]
+        yield Participant("onnx", "onnxruntime", run, outputs, numpy)
+
+    return verify(tested, ("numpy", "onnxruntime"), KNOWN, pool, VerifyOptions(), participants=participants)
+
+
+def honest(feeds: Feeds, answers: Arrays) -> Arrays:
+    return answers
+
+
+def where(rows: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]) -> Spoil:
+    """The action is off at the rows of the observation that a condition holds for."""
+
+    def spoil(feeds: Feeds, answers: Arrays) -> Arrays:
+        if "action" in answers:
+            answers["action"] = answers["action"] + 0.1 * rows(feeds["state"])[:, None].astype(np.float32)
+        return answers
+
+    return spoil
+
+
+@pytest.mark.parametrize("name", ["continuous", "sampled", "recurrent"])
+def test_without_a_fault_all_is_well(name: str, tmp_path: Path, processes: RuntimePool) -> None:
+    report = verified(name, tmp_path, processes, honest)
+    assert report.passed is True, [f.explanation() for f in report.failures]
+
+
+REGIONS = {
+    "rows from the 65th on": lambda x: np.arange(len(x)) >= 64,
+    "the last of an odd number of rows": lambda x: np.arange(len(x)) == 130,
+    "large observations": lambda x: (np.abs(x) > 12).any(1) & (np.abs(x) < 900).all(1),
+    "opposite extremes": lambda x: (x[:, 0] > 4) & (x[:, 5] < -4),
+    "far and opposite": lambda x: (x[:, 7] < -200) & (x[:, 6] > 200) & (np.abs(x) < 900).all(1),
+}
+
+
+@pytest.mark.parametrize("region", REGIONS)
+def test_a_region_that_is_wrong_is_met(region: str, tmp_path: Path, processes: RuntimePool) -> None:
+    report = verified("continuous", tmp_path, processes, where(REGIONS[region]))
+    assert "action" in {f.output for f in report.failures if f.kind == "numbers"}
+
+
+def test_a_memory_that_is_clipped_is_met(tmp_path: Path, processes: RuntimePool) -> None:
+    def clipped(feeds: Feeds) -> Feeds:
+        return {**feeds, "recurrent_in": np.clip(feeds["recurrent_in"], -3, 3)}
+
+    report = verified("recurrent", tmp_path, processes, honest, clipped)
+    assert "recurrent_out" in {f.output for f in report.failures if f.kind == "numbers"}
+
+
+# ------------------------------------------------------------------ draws
+
+
+def log_softmax(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.asarray(logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))
+
+
+def drawn(rng: np.random.Generator, log_probs: npt.NDArray[Any], count: int = 512) -> npt.NDArray[Any]:
+    return np.stack([rng.choice(len(row), count, p=np.exp(row) / np.exp(row).sum()) for row in log_probs])
+
+
+def test_a_right_sampler_is_called_right() -> None:
+    """The p-value is uniform or larger, so of 200 hardly one is below 1/1000."""
+    rng = np.random.default_rng(0)
+    lowest = []
+    for _ in range(200):
+        parts = [log_softmax(rng.standard_normal((12, size)) * rng.uniform(0, 6)) for size in (3, 4)]
+        classes = np.stack([drawn(rng, part, 64) for part in parts], axis=2)
+        lowest.append(least_likely(classes, np.concatenate(parts, axis=1), (3, 4))[0])
+    assert sum(p < 1e-3 for p in lowest) <= 3
+    assert min(lowest) > 1e-5
+
+
+def test_a_temperature_is_seen() -> None:
+    rng = np.random.default_rng(1)
+    log_probs = log_softmax(rng.standard_normal((12, 4)))
+    classes = drawn(rng, log_softmax(log_probs / 0.8))
+    assert least_likely(classes[:, :, None], log_probs, (4,))[0] < 1e-6
+
+
+def test_a_rare_class_that_is_never_drawn_is_seen() -> None:
+    rng = np.random.default_rng(2)
+    log_probs = log_softmax(np.concatenate([rng.standard_normal((12, 3)) / 2, np.full((12, 1), -3.5)], axis=1))
+    classes = drawn(rng, log_probs)
+    assert least_likely(classes[:, :, None], log_probs, (4,))[0] > 1e-6
+    classes[classes == 3] = 0
+    assert least_likely(classes[:, :, None], log_probs, (4,))[0] < 1e-6
+
+
+def test_branches_that_are_drawn_from_one_seed_are_seen() -> None:
+    rng = np.random.default_rng(3)
+    log_probs = log_softmax(rng.standard_normal((12, 3)))
+    once, again = drawn(rng, log_probs), drawn(rng, log_probs)
+    both = np.concatenate([log_probs, log_probs], axis=1)
+    assert least_likely(np.stack([once, again], axis=2), both, (3, 3))[0] > 1e-6
+    p_value, branch, _ = least_likely(np.stack([once, once], axis=2), both, (3, 3))
+    assert p_value < 1e-6
+    assert branch == 1
+
+
+# ------------------------------------------------------------------ weights
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_weights_that_were_rounded_are_met_where_outputs_hardly_vary(
+    kind: str, tmp_path: Path, pool: RuntimePool
+) -> None:
+    """Half precision moves these outputs by less than the tolerance: only the weights themselves tell."""
+    from converters import schema
+    from converters.frozen_graph.tensors import from_array, to_array
+    from exporter.export.pipeline import verify_folder
+
+    graph = schema.parse(schema.GraphDef, fixture("continuous").read_bytes(), "GraphDef")
+    for node in graph.node:
+        value = node.attr["value"].tensor
+        if node.op == "Const" and len(value.tensor_shape.dim) == 2:
+            value.CopyFrom(from_array((to_array(value) * np.float32(1e-3)).astype(np.float32)))
+    source = tmp_path / "small.bytes"
+    source.write_bytes(schema.serialise(graph))
+    (result,) = export([source], ExportOptions(tmp_path / "out", targets=DEFAULTS, verify="none"))
+    artefact = opened(kind, result.folder)
+    value = artefact.constant("dense/kernel/read")
+    artefact.set_constant("dense/kernel/read", value.astype(np.float16).astype(np.float32))
+    artefact.save()
+    report = verify_folder(result.folder, source=source, runtimes="tensorflow,onnxruntime,tfjs-cpu")
+    assert report.passed is False
+    # A bundle's own graph is that of its .bytes: where these were rounded, it is the others that differ from them.
+    assert {f.format.partition(":")[0] for f in report.failures} == (
+        {*FORMATS} - {"bytes"} if kind == "bytes" else {kind}
+    )
+    for found in report.failures:
+        assert found.bisection is not None
+        assert found.bisection.tensor == "dense/kernel/read"
+        assert "the constant dense/kernel/read has another value" in found.explanation()[0]
