@@ -79,7 +79,7 @@ class Bisector:
         if participant.path is None or participant.fed is not None or participant.path in self._compared:
             return []
         self._compared.add(participant.path)
-        if not self._differing(plain(self.tested.graph), participant, feeds):
+        if not self._differing(runnable(self.tested.graph), participant, feeds):
             return []
         graph = self.graph()  # a bundle's graph is that of its .bytes, which may be what is wrong
         return [] if graph is None else self._differing(graph, participant, feeds)
