@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
-#: How a child process is told to load an artefact that has no signatures.
-_GRAPH: Mapping[str, Any] = MappingProxyType({"kind": "graph"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +92,16 @@ class Member:
     files: tuple[Path, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Code:
+    """A snippet: how to call an artefact of a format. ``text`` has ``$path`` for what a loader is given, in quotes."""
+
+    name: str
+    title: str
+    language: str
+    text: str
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Format:
     """A form in which policies are given, written or both. What it has not is None or empty.
@@ -132,6 +139,7 @@ class Format:
     runtimes: tuple[str, ...] = ()
     signatures: bool = False
     predicts: bool = False
+    snippets: tuple[Code, ...] = ()
     dtypes: frozenset[str] = frozenset()
     answers: Callable[[PolicySignature], list[str]] | None = None
 
@@ -160,4 +168,6 @@ class Format:
 
     def loader(self, signature: str = "") -> Mapping[str, Any]:
         """What a child process is told beside the path; ``signature`` is the one to call, where it has some."""
-        return {"kind": self.key, "signature": signature} if self.signatures else _GRAPH
+        if self.signatures:
+            return {"kind": self.key, "signature": signature}
+        return {"kind": "graph", "format": self.key}

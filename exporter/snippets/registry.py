@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from string import Template
 from typing import Any
 
+from converters.format import Code, Format
 from converters.formats import WRITTEN
 from exporter.snippets import agent, csharp, javascript, python, serving, unity
-from exporter.snippets.contract import Bundle
+from exporter.snippets.contract import Bundle, quoted
 from signatures.errors import BundleError, UsageError
 
 
@@ -23,7 +26,7 @@ class Target:
     render: Callable[[Bundle], str]
 
 
-TARGETS = (
+TARGETS: tuple[Target, ...] = (
     Target("load-policy", "Python, exporter.load_policy", "python", ("onnx", "bytes"), python.load_policy),
     Target("onnxruntime", "Python, onnxruntime", "python", ("onnx",), python.onnxruntime),
     Target("saved-model", "Python, tf.saved_model.load", "python", ("saved_model",), python.saved_model),
@@ -39,6 +42,20 @@ TARGETS = (
     Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", ("onnx",), csharp.inference_engine),
     Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", ("onnx", "nn"), agent.agent),
 )
+
+
+def _of_formats() -> Iterator[Target]:
+    """The snippets that formats bring themselves."""
+    for found in WRITTEN.values():
+        for code in found.snippets:
+            yield Target(code.name, code.title, code.language, (found.key,), partial(_filled, found, code))
+
+
+def _filled(found: Format, code: Code, bundle: Bundle) -> str:
+    return Template(code.text).substitute(path=quoted(bundle.path(found.main_of(bundle.name))))
+
+
+TARGETS += tuple(_of_formats())
 
 
 @dataclass(frozen=True)

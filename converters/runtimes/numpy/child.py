@@ -1,6 +1,6 @@
 """The numpy reference in its own process: a frozen graph of ours, run by the kernels of the op table.
 
-A ``.nn`` of ours runs here as well, through this project's reader, since no runtime outside Unity has it.
+What no other runtime loads (a ``.nn``, formats that name numpy alone) runs here as well, through its own reader.
 
 ``python -m converters.runtimes.numpy.child``
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.bundle.embed import read_runnable
+from converters.bundle.embed import read_runnable, runnable
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
@@ -44,8 +44,24 @@ class _NnModel:
 
 def _load(header: Mapping[str, Any]) -> _Model | _NnModel:
     reseed(int(header.get("seed", 0)))
-    data = Path(header["path"]).read_bytes()
-    return _NnModel(data) if header["path"].endswith(".nn") else _Model(read_runnable(data))
+    path, key = Path(header["path"]), header.get("format", "bytes")
+    if key == "bytes":
+        return _Model(read_runnable(path.read_bytes()))
+    return _NnModel(path.read_bytes()) if key == "nn" else _Model(_read_back(path, key))
+
+
+def _read_back(path: Path, key: str) -> Graph:
+    """The graph of an artefact in a format that no other runtime runs, as its own reader gives it."""
+    from converters.fetch import Fetched
+    from converters.formats import WRITTEN
+    from converters.graph.compile import compile_graph
+    from converters.source import ReadOptions
+
+    read = WRITTEN[key].read
+    assert read is not None, f"{key} is not read"
+    (model,) = read(Fetched(path), ReadOptions())
+    (policy,) = compile_graph(model.graph, "policy", None, model.facts)
+    return runnable(policy.graph)
 
 
 def main() -> None:
