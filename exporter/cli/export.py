@@ -50,7 +50,7 @@ def _formats() -> str:
     default=_formats,
     show_default=True,
     metavar="FORMATS",
-    help="Formats to write.",
+    help="Formats to write; nn (Unity's Barracuda) is written on request.",
 )
 @click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")

@@ -237,10 +237,8 @@ REFUSED = {
     "genuine/0.3.0-bc-continuous-recurrent/MyEnv_ppo.bytes": "takes a memory and gives none",
     "foreign/autoregressive__dynamo.onnx": "(ArgMax)",
     "foreign/autoregressive__legacy.onnx": "(ArgMax)",
-    "foreign/entity_attention__legacy.onnx": "'entities' (Placeholder)",
-    "foreign/grucell__dynamo.onnx": "'h_in' (Placeholder)",
-    "foreign/lidar_conv1d__dynamo.onnx": "'lidar' (Placeholder)",
-    "foreign/lstmcell__legacy.onnx": "'h_in' (Placeholder)",
+    "foreign/entity_attention__legacy.onnx": "'entities_0' (Placeholder)",
+    "foreign/lidar_conv1d__dynamo.onnx": "'entities_0' (Placeholder)",
 }
 
 
