@@ -286,7 +286,9 @@ def test_an_integer_state_is_shown_with_its_range(tmp_path: Path) -> None:
 def test_the_runtimes_are_listed_whether_they_are_here_or_not() -> None:
     ran = export_model("runtimes")
     assert (ran.status, ran.err) == (0, "")
-    names = [line.split()[0] for line in ran.out.splitlines()[2:]]
+    table, said = ran.out.split("\n\n")
+    assert said.startswith("a runtime's process ")
+    names = [line.split()[0] for line in table.splitlines()[2:]]
     assert names == [r["name"] for r in export_model("runtimes", "--json").json["runtimes"]]
     assert names == [r.name for r in RUNTIMES]
 
@@ -350,7 +352,7 @@ def test_a_file_name_that_is_no_text_is_no_trouble(tmp_path: Path) -> None:
     ran = python("-m", "exporter", name, "-o", tmp_path / "out", *UNVERIFIED)
     assert (ran.status, ran.err) == (0, "")
     assert "out/b-/policy.json" in files_in(tmp_path)
-    assert json.loads((tmp_path / "out" / "b-" / "policy.json").read_text())["source"]["path"] == name.name
+    assert json.loads((tmp_path / "out" / "b-" / "policy.json").read_text())["source"]["path"] == "b\ufffd.bytes"
     assert python("-m", "exporter", "inspect", name).status == 0
 
 

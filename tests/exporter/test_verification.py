@@ -12,6 +12,7 @@ import pytest
 from converters.graph.options import CompileOptions
 from exporter.cli.summary import failure_lines, not_run_lines, parity_table, verdict
 from exporter.export.pipeline import ExportResult
+from exporter.verify.checks.numbers import plausible
 from exporter.verify.findings import Failure, Finding, Numbers
 from exporter.verify.options import VerifyOptions
 from exporter.verify.original import Original
@@ -19,7 +20,9 @@ from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
 from fixtures import FIXTURES
 from fixtures import path as fixture
+from signatures.errors import SignatureError
 from signatures.roles import Role
+from signatures.sampling import Case
 from signatures.spec import PolicySignature, SourceMap, TensorSpec
 from tests.exporter.rehearsal import ActingPool, Array, Spoil, Tensors, export, honest
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder
@@ -513,8 +516,8 @@ def test_a_source_that_takes_some_rows_only_is_asked_in_parts(rows: int) -> None
 # ------------------------------------------------------------------ an action without chance
 
 
-def test_an_action_without_chance_that_is_drawn_fails(exporting: Exporting, tmp_path: Path) -> None:
-    """However little: every runtime draws the same shape and range, so nothing else would see it."""
+def test_an_action_without_chance_that_is_drawn_is_refused(exporting: Exporting, tmp_path: Path) -> None:
+    """However little: every runtime draws the same shape and range, so no comparison would see it."""
     nodes = [
         *continuous_policy(),
         constant("drawn/shape", np.array([1, 2], np.int32)),
@@ -523,10 +526,14 @@ def test_an_action_without_chance_that_is_drawn_fails(exporting: Exporting, tmp_
     ]
     source = tmp_path / "drawn.bytes"
     source.write_bytes(graph_bytes(nodes))
-    result = exporting(source)
-    assert result.passed is False
-    found = [c for c in report_of(result).failures if c.output == "deterministic_action"]
-    assert {(c.format, c.runtime) for c in found} >= {("onnx", "onnxruntime"), ("bytes", "tensorflow")}
-    assert all(
-        "without chance, and it is drawn" in line for line in failure_lines(report_of(result)) if "[shape" in line
-    )
+    with pytest.raises(SignatureError, match="drawn/uniform"):
+        exporting(source)
+
+
+def test_verification_by_itself_fails_an_action_without_chance_that_is_drawn() -> None:
+    """Where a graph comes to it that no compiler of ours has seen."""
+    spec = TensorSpec("deterministic_action", Role.DETERMINISTIC, "float32", (None, 1))
+    signature = PolicySignature((), (spec,), "test", "continuous")
+    found = plausible(signature, spec.name, np.zeros((2, 1), np.float32), Case("zeros", 2, {}))
+    assert not found.passed
+    assert "without chance, and it is drawn" in found.reason
