@@ -18,6 +18,7 @@ class Profile:
     layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
     ``converters/targets/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
     releases of ``converters/targets/unity/consumers.py`` that must accept it. ``opset`` is the ONNX opset.
+    ``undressed`` are formats whose writer gives the consumer's names by itself (``.nn``).
     """
 
     name: str
@@ -25,6 +26,7 @@ class Profile:
     purpose: str
     formats: tuple[str, ...]
     dress: Callable[[Policy], Policy]
+    undressed: tuple[str, ...] = ()
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()

@@ -105,6 +105,8 @@ def export(
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
     wanted = None if options.profile is None else profile(options.profile)
     formats = _formats(options, wanted)
+    if wanted is not None and all(f.key in wanted.undressed for f in formats):
+        wanted = None
     if not formats:
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
     runtimes, known = chosen_runtimes(options.verify, formats)
@@ -162,6 +164,12 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
                 why=f"{wanted.purpose}: it loads {', '.join(wanted.formats)}",
                 fix="leave --to out",
             )
+    if 0 < sum(t in wanted.undressed for t in targets) < len(targets):
+        raise UsageError(
+            f"--to {','.join(targets)} does not go with --for {wanted.name} at once",
+            why="a bundle has one set of names, and these formats have different ones",
+            fix="export twice, with another -o",
+        )
     if options.compile.names != "canonical":
         raise UsageError(
             f"--names {options.compile.names} does not go with --for {wanted.name}",

@@ -210,6 +210,7 @@ def test_help_lists_every_profile_with_its_purpose() -> None:
         ({"for_": "unity7"}, "did you mean unity6"),
         ({"for_": "unity6", "to": "bytes"}, "does not go with --for unity6"),
         ({"for_": "unity6", "names": "source"}, "the consumer decides the names"),
+        ({"for_": "barracuda-1.0", "to": "onnx,nn"}, "export twice"),
     ],
 )
 def test_what_does_not_go_together_is_refused(how: dict[str, str], said: str, tmp_path: Path) -> None:
@@ -221,3 +222,11 @@ def test_what_does_not_go_together_is_refused(how: dict[str, str], said: str, tm
 def test_an_export_for_unity_is_verified_in_theruntimes(tmp_path: Path) -> None:
     (result,) = export_model(ROOT / "fixtures" / "recurrent.bytes", tmp_path, for_="unity6", verify="onnxruntime")
     assert result.passed
+
+
+def test_a_memory_goes_to_old_barracuda_as_nn(tmp_path: Path) -> None:
+    recurrent = ROOT / "fixtures" / "recurrent.bytes"
+    with pytest.raises(ProfileError, match="it has a memory"):
+        export_model(recurrent, tmp_path, for_="barracuda-1.0", verify="none")
+    (result,) = export_model(recurrent, tmp_path, for_="barracuda-1.0", to="nn", verify="none")
+    assert [p.suffix for p in result.folder.iterdir() if p.suffix != ".json"] == [".nn"]

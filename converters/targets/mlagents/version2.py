@@ -28,7 +28,7 @@ def dress(policy: Policy, profile: str) -> Policy:
         dressing.refuse(
             "it has a memory",
             why="the ONNX of API version 2 gave no memory back, or one that was right for a single agent alone",
-            fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
+            fix="write a .nn, which has memories (--to nn), or use release 17 or later (--for barracuda-3)",
         )
     images = _take_observations(dressing)
     masks = feeding.take_masks(dressing)
