@@ -87,6 +87,8 @@ class _Job:
     model: SourceModel
     policy: Policy
     profile: Profile | None = None
+    #: the policy under its own names, where ``policy`` has those of a consumer
+    own: Policy | None = None
 
 
 def export(
@@ -121,7 +123,10 @@ def export(
         compiled = list(source.compiled(options.compile))
         named = _named([policy for _, policy in compiled], options, len(paths))
         dressed = [p if wanted is None else wanted.dress(p) for p in named]
-        jobs.extend(_Job(source, model, p, wanted) for (model, _), p in zip(compiled, dressed, strict=True))
+        jobs.extend(
+            _Job(source, model, p, wanted, None if wanted is None else own)
+            for (model, _), p, own in zip(compiled, dressed, named, strict=True)
+        )
         origins.extend((p.name, f"{source.path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
     bundle.distinct_names(origins)
     jobs = [replace(j, policy=p) for j, p in zip(jobs, labelled([j.policy for j in jobs], labels), strict=True)]
@@ -142,6 +147,11 @@ def export(
                 if runtimes:
                     tested = _tested(job, stage, artifacts, Path(scratch))
                     report = verify(tested, runtimes, known, pool, options.parity, progress)
+                    if job.own is not None:
+                        plain = replace(job, policy=job.own, profile=None)
+                        under = _tested_in(plain, formats, Path(scratch) / "own")
+                        rules = replace(options.parity, rules=(), golden=None, budget={})
+                        report = _joined(report, verify(under, runtimes, known, pool, rules, progress))
                     with bundle.writing(options.out):
                         (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
                 failed = report is not None and report.passed is False
@@ -243,6 +253,24 @@ def _tested(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path
         policy.source,
         keys,
     )
+
+
+def _tested_in(job: _Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
+    """A policy written to a folder that is thrown away."""
+    artifacts = [f.artifact(job.policy, WriteOptions("{}")) for f in formats]
+    for artifact in artifacts:
+        for relative, data in artifact.files.items():
+            target = folder / relative
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(data)
+    return _tested(job, folder, artifacts, folder)
+
+
+def _joined(report: ParityReport, own: ParityReport) -> ParityReport:
+    """The report of a policy in a consumer's names, with what came of the policy that it was made from."""
+    note = f"the policy under its own names, from which this was made: {own.verdict}, against {own.reference}"
+    passed = False if own.passed is False else report.passed
+    return replace(report, passed=passed, comparisons=(*report.comparisons, *own.failures), notes=(*report.notes, note))
 
 
 def verify_folder(

@@ -221,7 +221,8 @@ def test_what_does_not_go_together_is_refused(how: dict[str, str], said: str, tm
 
 def test_an_export_for_unity_is_verified_in_theruntimes(tmp_path: Path) -> None:
     (result,) = export_model(ROOT / "fixtures" / "recurrent.bytes", tmp_path, for_="unity6", verify="onnxruntime")
-    assert result.passed
+    assert result.passed and result.report is not None
+    assert any("under its own names" in note for note in result.report.notes)
 
 
 def test_a_memory_goes_to_old_barracuda_as_nn(tmp_path: Path) -> None:
