@@ -14,7 +14,7 @@ from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
 from converters.barracuda.lower import HEADS, INPUT_NAMES, base_name
 from converters.barracuda.writer import CONTRACT_KEY
-from converters.graph.nodes import Graph, Node
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.passes.noise import samplers
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
@@ -51,10 +51,14 @@ def answered(signature: PolicySignature) -> list[str]:
 def outline(signature: PolicySignature, *, noise_kept: bool) -> Graph:
     """What a verification asks of a policy's graph, where there is none but the ``.nn``: which outputs are drawn."""
     size = Node("size", "Const", value=np.array([1, 1], np.int32))
-    nodes = [size, *(Node(s.name, "Placeholder", attrs={"dtype": np.dtype(s.dtype)}) for s in signature.inputs)]
+    nodes = [size]
+    for spec in signature.inputs:
+        attrs = {"dtype": np.dtype(spec.dtype), "shape": TensorShape(spec.shape)}
+        nodes.append(Node(spec.name, "Placeholder", attrs=attrs))
     for spec in signature.outputs:
         drawn = spec.role is Role.SAMPLED or (spec.role is Role.CONTINUOUS and noise_kept)
-        nodes.append(Node(spec.name, "RandomStandardNormal" if drawn else "Identity", ("size",)))
+        attrs = {"dtype": np.dtype(np.float32)} if drawn else {}
+        nodes.append(Node(spec.name, "RandomStandardNormal" if drawn else "Identity", ("size",), attrs))
     return Graph(tuple(nodes))
 
 

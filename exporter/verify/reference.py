@@ -23,7 +23,9 @@ class Reference:
     def __init__(self, tested: PolicyUnderTest, runtimes: Sequence[str], pool: RuntimePool, seed: int) -> None:
         self.signature = tested.signature
         #: the numpy kernels, in their child
-        self.model: LoadedModel = pool.process("numpy").load(str(tested.reference), seed=seed)
+        # A bundle of one format that no other runtime runs (a .nn) is its own reference.
+        form = next((kind for kind, path in tested.artefacts.items() if path == tested.reference), "bytes")
+        self.model: LoadedModel = pool.process("numpy").load(str(tested.reference), seed=seed, format=form)
         self.original: Original | None = None
         #: outputs that a sampler in the graph decides
         self.drawn = random_outputs(tested.graph, [s.name for s in self.signature.outputs])
