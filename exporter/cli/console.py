@@ -216,8 +216,8 @@ class Console:
                 f"next: put {files} of {last.folder} into the project, for the agent's Model    (docs/tasks/unity.md)"
             )
             return
-        if "bytes" in targets and names == "canonical":
-            click.echo("note: Unity looks nodes up by the trainer's names: export with --names source for Unity")
+        if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(targets):
+            click.echo("note: Unity looks up other names: export for it with --for NAME    (--for help lists them)")
         folder = results[-1].folder
         if results[-1].report is None:
             click.echo(f"next: export-model verify {folder}    (nothing was compared yet)")

@@ -162,7 +162,8 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
         faults.append("its memory does not work")
     asked = [n for n in ("memory_size", "sequence_length") if f"{_scope(bundle)}{n}" not in bundle.nodes]
     if signature.memory is not None and generation.asks and asked:
-        faults.append(f"it asks a policy with memory for {' and '.join(asked)}: export with --names source")
+        wanted = f"tfsharp-{generation.name[-3:]}"
+        faults.append(f"it asks a policy with memory for {' and '.join(asked)}: export with --for {wanted}")
     previous = bundle.previous
     if previous is not None and generation.previous_rank != len(previous.shape):
         faults.append(f"it does not feed {previous.name} {list(previous.shape)}".replace("None", "agents"))
@@ -180,4 +181,4 @@ def _learning_brain(bundle: Bundle) -> str:
         return f"ML-Agents 0.6: drop {bundle.name}.bytes on the Model of the Learning Brain; it finds the rest itself"
     wrong = f"it wants {', '.join(missing)}" if missing else "it wants version_number 1"
     why = f"it does not know {', '.join(odd)}" if odd else wrong
-    return f"ML-Agents 0.6: not this bundle: {why} (a policy trained with 0.6: export it with --names source)"
+    return f"ML-Agents 0.6: not this bundle: {why} (export it with --for tfsharp-0.6)"

@@ -348,12 +348,21 @@ def test_the_internal_brain_knows_its_generations(out: Path) -> None:
     assert "ML-Agents 0.3-0.4: not this policy: it has one branch of discrete actions" in text
     assert "Branches Size 3: 3, 2, 4" in text
     assert "ML-Agents 0.6: not this bundle: it does not know state" in text
-    assert "asks a policy with memory for memory_size and sequence_length" in code_of(
+    assert "asks a policy with memory for memory_size and sequence_length: export with --for tfsharp-0.5" in code_of(
         out, "recurrent", "internal-brain"
     )
+    assert "(export it with --for tfsharp-0.6)" in text
     scoped = code_of(out, "own-names-Goalie-Brain-2", "internal-brain")
     assert re.search("Graph Scope +Goalie-Brain-2/", scoped)
     assert re.search(r"Node Name +state\n", scoped)
+
+
+@pytest.mark.parametrize("name", ["discrete", "recurrent"])
+def test_what_the_internal_brain_lacks_is_there_with_the_profile_it_names(name: str, tmp_path: Path) -> None:
+    for release, said in (("0.5", "ML-Agents 0.5: Brain Type Internal"), ("0.6", "ML-Agents 0.6: drop ")):
+        (result,) = export_model(fixture(name), tmp_path / release, for_=f"tfsharp-{release}", verify="none")
+        (told,), _ = snippets(read_bundle(result.folder), "internal-brain")
+        assert said in told.code
 
 
 # ------------------------------------------------------------------ the command

@@ -112,13 +112,20 @@ def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) 
     assert [line.split()[0] for line in lines[3:7]] == list(DEFAULTS)
 
 
-def test_an_export_of_bytes_says_that_unity_wants_the_trainers_names(tmp_path: Path) -> None:
+def test_an_export_that_unity_does_not_take_says_how_to_make_one(tmp_path: Path) -> None:
     def says_so(*flags: str) -> bool:
-        return "--names source for Unity" in export_model(BALL, "-o", tmp_path, *UNVERIFIED, *flags).out
+        return (
+            "note: Unity looks up other names: export for it with --for NAME"
+            in export_model(BALL, "-o", tmp_path, *UNVERIFIED, *flags).out
+        )
 
     assert says_so()
+    assert says_so("--to", "onnx")
+    assert says_so("--to", "bytes")
+    assert not says_so("--to", "saved_model,tfjs")
+    assert not says_so("--to", "nn")
     assert not says_so("--names", "source")
-    assert not says_so("--to", "onnx")
+    assert not says_so("--for", "unity6")
 
 
 def test_the_result_as_json_has_every_policy(tmp_path: Path) -> None:
