@@ -23,6 +23,9 @@ from fixtures import path
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("exporter", "converters", "signatures")
+#: Suffixes of what is in the packages beside modules: pages, scripts, schemas, templates of snippets.
+DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl"}
 #: What the packages of a base install may take together, in 10^6 bytes.
 LARGEST = 150
 #: Python's own, in every environment that has pip.
@@ -92,18 +95,18 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
         names = archive.namelist()
         metadata = archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))).decode()
     assert {n.split("/")[0] for n in names} == {
-        "exporter",
-        "converters",
-        "signatures",
+        *PACKAGES,
         f"export_model-{__version__}.dist-info",
     }
-    scripts = {p.name for p in (ROOT / "converters" / "runner" / "js").glob("*.mjs")}
-    assert "runner.mjs" in scripts
-    for name in ("package.json", "package-lock.json", *scripts):
-        assert f"converters/runtimes/javascript/js/{name}" in names
+    data = {p.relative_to(ROOT).as_posix() for t in PACKAGES for p in files(t, "*") if p.suffix in DATA}
+    js, templates = "converters/runtimes/javascript/js", "exporter/snippets/templates"
+    assert data >= {f"{js}/package.json", f"{js}/package-lock.json", f"{js}/runner.mjs", f"{js}/browser.mjs"}
+    assert data >= {"exporter/serve/page/index.html", "exporter/reports/parity.schema.json"}
+    assert data >= {f"{templates}/agent.cs.tmpl", "converters/tfjs/js/policy.mjs"}
+    assert {n for n in names if Path(n).suffix in DATA} == data
     strays = [n for n in names if "node_modules" in n or "__pycache__" in n or "/test" in n or n.endswith(".bytes")]
     assert not strays
-    code = {str(p.relative_to(ROOT).as_posix()) for t in ("exporter", "converters", "signatures") for p in modules(t)}
+    code = {p.relative_to(ROOT).as_posix() for t in PACKAGES for p in files(t, "*.py")}
     assert {n for n in names if n.endswith(".py")} == code
     required = [line for line in metadata.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
     names_required = sorted(re.split(r"[<>=!~;]", line.split()[1])[0] for line in required)
@@ -111,8 +114,8 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     assert any(n.endswith("/licenses/LICENSE") for n in names)
 
 
-def modules(package: str) -> Iterator[Path]:
-    return (p for p in (ROOT / package).rglob("*.py") if "node_modules" not in p.parts)
+def files(package: str, pattern: str) -> Iterator[Path]:
+    return (p for p in (ROOT / package).rglob(pattern) if "node_modules" not in p.parts)
 
 
 # ------------------------------------------------------------------ the environment
