@@ -53,7 +53,8 @@ class RuntimeProcess:
             return
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
         self._scratch = tempfile.TemporaryDirectory(prefix="export-model-", ignore_cleanup_errors=True)
-        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), self._scratch.name)
+        # What is not confined (a browser) has its own folders where the user's are, and sweeps them by itself.
+        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), self._scratch.name) if self.confined else {}
         try:
             command = confined(self.command, self._scratch.name) if self.confined else self.command
             self._process = subprocess.Popen(

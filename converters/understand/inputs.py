@@ -46,7 +46,7 @@ def classify_inputs(
         if role is None and node.op == "PlaceholderWithDefault":
             continue
         roles[node.name] = role or Role.PARAMETER
-        if override is not None or roles[node.name] is not Role.PARAMETER:
+        if override is not None or node.name in (known or {}) or roles[node.name] is not Role.PARAMETER:
             decided.add(node.name)
         if override is not None and override not in INPUT_ROLES:
             raise UsageError(

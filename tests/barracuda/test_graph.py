@@ -15,6 +15,7 @@ from converters.graph.compile import compile_graph
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.ops.samplers import reseed
 from converters.graph.options import CompileOptions
+from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from signatures.errors import DamagedFileError, SignatureError
@@ -239,15 +240,19 @@ def test_noise_of_a_fixed_shape_is_shared_by_all_agents() -> None:
     np.testing.assert_array_equal(run_graph(policy.graph, {"state": state}, ["action"])["action"], state)
 
 
-def test_uniform_noise_stays_in_the_graph() -> None:
+def test_uniform_noise_has_no_action_without_chance() -> None:
+    """The reader keeps it as what it is; the compiler refuses, since no value of it stands for no chance."""
     m = Maker()
     m.input(X, 1, 1, 2)
     m.layer("noise", 65, X, alpha=3.0, beta=1.0)
     m.layer("zero", 102, X, m.load("nothing", 0.0))
     m.layer("action", 100, "zero", "noise")
-    policy = policy_of(m.model())
+    with pytest.raises(SignatureError, match="RandomUniform"):
+        policy_of(m.model())
     reseed(0)
-    drawn = run_graph(policy.graph, {"state": draw(4000, 2)}, ["action"])["action"]
+    graph = to_graph(m.model()).graph
+    (placeholder,) = (n.name for n in graph.nodes if n.op == "Placeholder")
+    drawn = run_graph(normalise(graph), {placeholder: draw(4000, 2)}, ["action"])["action"]
     assert 1 <= drawn.min() < 1.01
     assert 3.99 < drawn.max() <= 4
     assert abs(drawn.mean() - 2.5) < 0.05

@@ -135,7 +135,7 @@ def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path:
     count = 0
     for row, inputs, expected in recorded:
         size = len(next(iter(inputs.values())))
-        feeds = feeds_of(policy, {**inputs, **renamed_inputs(about, inputs)}, size)
+        feeds = feeds_of(policy, {**renamed_inputs(about, inputs), **inputs}, size)
         for where, model in models.items():
             count += compared(policy, model.run(feeds, names), expected, f"{row}, {where}")
     for model in models.values():

@@ -15,10 +15,11 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.checks.draws import least_likely
+from exporter.verify.checks.draws import least_likely, with_zeros
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.report import ParityReport
+from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.verification import verify
 from fixtures import path as fixture
 from tests.faults.artefacts import FORMATS, opened
@@ -177,3 +178,18 @@ def test_weights_that_were_rounded_are_met_where_outputs_hardly_vary(
         assert found.bisection is not None
         assert found.bisection.tensor == "dense/kernel/read"
         assert "the constant dense/kernel/read has another value" in found.explanation()[0]
+
+
+def test_a_sampler_whose_uniform_number_is_sometimes_zero_is_expected_to_draw_the_first_class() -> None:
+    """TensorFlow.js' WebGL shader; what has no probability at all stays without."""
+    with np.errstate(divide="ignore"):
+        log_probs = np.log(np.array([[0.0, 1e-10, 1 - 1e-10, 0.25, 0.75]]))
+    probs = np.exp(with_zeros(log_probs, [3, 2], 2.0**-12))[0]
+    np.testing.assert_allclose(probs[:3], [0, 1e-10 + 2.0**-12, 1 - 2.0**-12], rtol=1e-6)
+    np.testing.assert_allclose(probs[3:].sum(), 1)
+    generator = np.random.default_rng(0)
+    rare = np.where(generator.random((1, 512, 1)) < 2.0**-12, 0, 1)
+    ordinary = np.log(np.array([[1e-10, 1 - 1e-10]]))
+    rare[0, 0] = 0
+    assert least_likely(rare, ordinary, [2])[0] < FALSE_ALARM
+    assert least_likely(rare, with_zeros(ordinary, [2], 2.0**-12), [2])[0] >= FALSE_ALARM
