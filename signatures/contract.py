@@ -130,6 +130,8 @@ def parse(content: Any) -> Contract:
     )
     files = {_key(path, entry): _file(entry) for path, entry in whole["files"].members().items()}
     made = {key: tool[key].text() for key in ("name", "version")}
+    if not tool["profile"].missing:  # the consumer that it was made for
+        made["profile"] = tool["profile"].text()
     return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
 
 

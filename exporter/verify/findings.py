@@ -223,6 +223,21 @@ class Failure(Finding):
         return f"{self.where}: {self.reason}"
 
 
+class Accepted(Finding):
+    """What a consumer's own checker says to a file; ``runtime`` is the release."""
+
+    __slots__ = ()
+    kind: ClassVar[str] = "accepted"
+
+    def cell(self) -> str:
+        """Whether it is accepted."""
+        return "accepted" if self.passed else "refused"
+
+    def sentence(self) -> str:
+        """What the consumer says."""
+        return f"{self.format} is not accepted by {self.runtime}: {self.reason}"
+
+
 class Size(Finding):
     """The bytes of a format beside its budget; ``max_abs_diff`` is what there is too many."""
 

@@ -42,6 +42,9 @@ class PolicyUnderTest:
     source_map: SourceMap = field(default_factory=SourceMap)
     #: signatures of the SavedModel: key → (inputs, outputs)
     signatures: Mapping[str, tuple[Sequence[str], Sequence[str]]] = field(default_factory=dict)
+    #: the profile that it was made for (``--for``), and format → the bundle's own file
+    profile: str | None = None
+    files: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass

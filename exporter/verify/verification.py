@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from converters.runtimes.pool import INDEPENDENT, RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.runtimes.registry import RuntimeInfo
+from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
 from exporter.verify.checks.golden import recorded
@@ -57,6 +58,7 @@ def verify(
         with Reference(tested, runtimes, pool, options.seed) as answering:
             reference = answering.name
             findings += _findings(trial, answering, runtimes, progress, participants)
+    findings += consumers(tested.profile, tested.files)
     return _report(trial, reference, runtimes, known, in_order(findings, tested))
 
 

@@ -1,0 +1,43 @@
+"""Bundles that were made for a consumer: the export and ``verify`` ask that consumer's own checkers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from exporter import export_model, verify_bundle
+from exporter.verify.checks.consumer import consumers
+from fixtures import path as fixture
+
+
+@pytest.mark.parametrize(("name", "releases"), [("unity6", {"R22", "R23", "R23-2.4"}), ("barracuda-3", {"R20"})])
+def test_a_bundle_that_was_made_for_a_consumer_is_held_to_its_checkers(
+    name: str, releases: set[str], tmp_path: Path
+) -> None:
+    (result,) = export_model(fixture("recurrent"), tmp_path, for_=name, verify="numpy")
+    assert result.contract["tool"]["profile"] == name
+    for report in (result.report, verify_bundle(result.folder)):
+        assert report is not None
+        asked = {c.runtime: c for c in report.comparisons if c.kind == "accepted"}
+        assert set(asked) == releases
+        assert all(c.passed for c in asked.values()), [c.reason for c in asked.values()]
+        assert report.passed is not False
+
+
+def test_what_the_consumer_refuses_is_a_finding_in_its_words(tmp_path: Path) -> None:
+    (result,) = export_model(fixture("continuous"), tmp_path, to="onnx", verify="none")
+    found = list(consumers("unity6", {"onnx": result.folder / "continuous.onnx"}))
+    assert [c.runtime for c in found] == ["R22", "R23", "R23-2.4"]
+    assert not any(c.passed for c in found)
+    assert all(c.reason for c in found)
+    assert found[0].sentence().startswith("onnx is not accepted by R22: ")
+    assert json.dumps(found[0].to_dict())
+
+
+def test_a_bundle_for_everyone_asks_nobody(tmp_path: Path) -> None:
+    (result,) = export_model(fixture("continuous"), tmp_path, to="onnx", verify="numpy")
+    assert result.report is not None
+    assert not [c for c in result.report.comparisons if c.kind == "accepted"]
+    assert "profile" not in result.contract["tool"]
