@@ -53,7 +53,10 @@ class Actor:
         self.process.must_live()
         jitter = request.get("jitter")
         generator = None if jitter is None else np.random.default_rng(jitter)
-        answer = run_graph(self.graph, feeds, list(fetch), generator)
+        try:
+            answer = run_graph(self.graph, feeds, list(fetch), generator)
+        except KeyError as error:
+            raise RunFailedError(f"{self.process.name} has no tensor {error}") from error
         answer = self.process.pool.spoil(self.kind, self.process.name, dict(answer))
         missing = [name for name in fetch if name not in answer]
         if missing:

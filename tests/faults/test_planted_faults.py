@@ -148,7 +148,8 @@ def test_the_command_line_points_at_the_fault(kind: str, bundle: Bundle) -> None
 def test_the_smallest_tolerance_is_one_that_passes(bundle: Bundle) -> None:
     planted = bundle("continuous")
     artefact = opened("onnx", planted.folder)
-    FAULTS[0].plant(artefact)
+    # Of numbers: a constant that is another one is a finding at any tolerance.
+    next(fault for fault in FAULTS if fault.name == "swish replaced by relu").plant(artefact)
     artefact.save()
     report = verified(planted, "onnx")
     least = max(c.smallest_tolerance or 0.0 for c in report.failures)
