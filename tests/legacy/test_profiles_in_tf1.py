@@ -24,6 +24,10 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 TENSORFLOW = {"0.2": "tf1.4", "0.3": "tf1.4", "0.4": "tf1.7", "0.5": "tf1.7", "0.6": "tf1.7"}
 #: File → (atol, why): float32 rounding that a policy makes larger.
 ATOL = {
+    "Unity-Technologies+marathon-envs__TerrainAntBrain-v0-100m-29d47f.nn": (
+        5e-5,
+        "between 2e-5 and 3e-5 from numpy on actions clipped to 1; the same weights in float64 were not tried",
+    ),
     "AliBharwani+ml-agents__Hallway.nn": (5e-5, "its LSTM under N(0, 1) memory: 2.9e-5 from numpy on values up to 3.7"),
 }
 
