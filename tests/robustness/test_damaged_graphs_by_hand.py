@@ -437,15 +437,21 @@ def test_names_of_nodes_may_be_anything(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ what nobody foresaw
 
 
-@pytest.mark.parametrize("fault", [IndexError("x"), RecursionError("x"), MemoryError("x"), OverflowError("x")])
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        *((e("x"), ("cannot be understood", e.__name__)) for e in (IndexError, RecursionError, OverflowError)),
+        (MemoryError("x"), ("memory",)),
+    ],
+)
 def test_a_fault_of_a_pass_names_the_file_too(
-    fault: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fault: Exception, said: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(*_: object) -> None:
         raise fault
 
     monkeypatch.setattr("exporter.export.sources.compile_graph", failing)
-    message = refused(continuous_policy(), tmp_path, "cannot be understood", type(fault).__name__)
+    message = refused(continuous_policy(), tmp_path, *said)
     assert "\n  why: " in message
 
 
