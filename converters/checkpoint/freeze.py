@@ -15,14 +15,11 @@ import numpy as np
 from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
+from converters.graph.ops.outside import EFFECTS, VARIABLES
 from converters.graph.ops.table import hands_on, is_fed
 from converters.understand.brains import find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.roles import CONSTANT_NAMES
-
-VARIABLES = frozenset(("VariableV2", "Variable", "VarHandleOp", "AutoReloadVariable"))
-#: What only training runs: it changes or keeps variables.
-_EFFECTS = ("Assign", "Apply", "ResourceApply", "SparseApply", "Scatter", "ResourceScatter", "Save", "Restore")
 
 
 class Values(Protocol):
@@ -43,7 +40,7 @@ class Values(Protocol):
 
 def is_effect(node: Node) -> bool:
     """Whether a node changes a variable, or writes or reads a checkpoint."""
-    return node.op.startswith(_EFFECTS)
+    return node.op.startswith(EFFECTS)
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,8 @@ from converters.checkpoint.tensor_bundle import Extents
 from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.tensors import to_array
 from converters.graph.nodes import Graph, node_of, split_ref
+from converters.graph.ops.outside import ASSIGNS, RESTORES
 from signatures.errors import DamagedFileError, NotAPolicyError
-
-#: Initial values that were written as one repeated value unfold when they are read, and nothing needs them.
-_ASSIGN = frozenset(("Assign", "AssignVariableOp"))
-_RESTORE = frozenset(("RestoreV2", "Restore", "RestoreSlice"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +75,7 @@ def _without_initial_values(graph_def: Any) -> list[Any]:
     for proto in graph_def.node:
         for reference in _inputs(proto):
             readers.setdefault(node_of(reference), []).append(proto)
-    dropped = {p.name for p in graph_def.node if p.op in _ASSIGN and p.name not in readers}
+    dropped = {p.name for p in graph_def.node if p.op in ASSIGNS and p.name not in readers}
     return [
         proto
         for proto in graph_def.node
@@ -96,10 +93,10 @@ def saved_places(graph_def: Any) -> dict[str, Saved]:
     found: dict[str, Saved] = {}
     for proto in graph_def.node:
         inputs = _inputs(proto)
-        if proto.op not in _ASSIGN or len(inputs) != 2:
+        if proto.op not in ASSIGNS or len(inputs) != 2:
             continue
         restore, index = _producer(nodes, inputs[1])
-        if restore is None or restore.op not in _RESTORE:
+        if restore is None or restore.op not in RESTORES:
             continue
         names, slices = (_strings(nodes, restore, position) for position in (1, 2))
         if index < len(names):

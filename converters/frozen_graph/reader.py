@@ -13,6 +13,7 @@ import numpy as np
 from converters import schema
 from converters.frozen_graph.tensors import Allowance, to_array
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
+from converters.graph.ops.outside import CALLS
 from converters.graph.ops.table import is_fed
 from signatures.errors import DamagedFileError, NotAPolicyError
 
@@ -45,7 +46,7 @@ def from_graph_def(graph_def: Any) -> Graph:
     allowance = Allowance()
     nodes = [_node(n, graph_def.versions.producer, allowance) for n in graph_def.node]
     for node in nodes:
-        if node.op in calls or node.op in ("PartitionedCall", "StatefulPartitionedCall"):
+        if node.op in calls or node.op in CALLS:
             raise NotAPolicyError(
                 f"node {node.name!r} calls the function {node.op!r}",
                 why="the graph was saved from TensorFlow 2 functions and is not flat",

@@ -15,13 +15,12 @@ from typing import Any
 
 from converters import schema
 from converters.graph.nodes import Node, node_of
+from converters.graph.ops.outside import ORDERING
 from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, SPELLINGS, TABLE, unsupported
 from signatures.errors import GraphError
 
 #: Ops that compute a value from their inputs (or draw one) and do nothing else.
 COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *SPELLINGS))
-#: Ops that may hang behind a control input, where they are left out: they compute nothing that anyone reads.
-ORDERING = frozenset(("NoOp", "Assert"))
 
 
 def subgraph(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) -> Any:

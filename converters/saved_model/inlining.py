@@ -13,20 +13,13 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from converters import schema
-from converters.frozen_graph.subgraph import COMPUTING, ORDERING, is_pivot
+from converters.frozen_graph.subgraph import COMPUTING, is_pivot
 from converters.graph.nodes import NameScope, Node, ref, split_ref
+from converters.graph.ops.outside import CALLING, IFS, ORDERING, READS, WHILES
 from converters.graph.ops.table import RESULTS, unsupported
 from signatures.errors import DamagedFileError, NotAPolicyError
 
-#: Ops that call the function which their attribute ``f`` names.
-CALLS = frozenset(("PartitionedCall", "StatefulPartitionedCall", "TPUPartitionedCall"))
-_WHILE = frozenset(("While", "StatelessWhile"))
-_IF = frozenset(("If", "StatelessIf"))
-#: Every op that calls functions.
-CALLING = CALLS | _WHILE | _IF
-#: What reads a variable; freezing replaces it.
-_READING = frozenset(("VarHandleOp", "ReadVariableOp", "ResourceGather", "VariableShape"))
-_ALLOWED = COMPUTING | _READING | ORDERING | CALLING
+_ALLOWED = COMPUTING | READS | ORDERING | CALLING
 _BOOL = 10  # DataType
 #: Copies of a graph's functions may hold this many nodes, and bytes: a small file could unfold to any size otherwise.
 MAX_NODES = 1 << 15
@@ -132,9 +125,9 @@ class _Flattening:
                     )
                 copy.attr[key].CopyFrom(value)
             self._add(copy)
-        elif node.op in _WHILE:
+        elif node.op in WHILES:
             self._loop(node, name, inputs, depth)
-        elif node.op in _IF:
+        elif node.op in IFS:
             self._branch(node, name, inputs, depth)
         else:
             called = node.op if node.op in self.functions else node.attr["f"].func.name

@@ -12,7 +12,7 @@ from typing import Any
 
 from converters import schema
 from converters.graph.nodes import TensorShape, node_of
-from converters.saved_model.inlining import CALLING
+from converters.graph.ops.outside import CALLING
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError
 

@@ -22,6 +22,7 @@ import numpy as np
 from converters import schema
 from converters.fetch import Fetched
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
+from converters.graph.ops.outside import IFS, WHILES
 from converters.graph.ops.table import is_fed
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
@@ -101,7 +102,7 @@ def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
 
 def _refuse_functions(topology: Mapping[str, Any]) -> None:
     names = {f["signature"]["name"] for f in topology["library"]["function"]}
-    calls = [n for n in topology["node"] if n["op"] in names or n["op"] in ("While", "StatelessWhile", "If")]
+    calls = [n for n in topology["node"] if n["op"] in names or n["op"] in WHILES | IFS]
     if calls:
         raise NotAPolicyError(
             f"node {calls[0]['name']!r} ({calls[0]['op']}) calls a function",

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from converters.fetch import MAX_BYTES, read_bytes
-from converters.frozen_graph.subgraph import COMPUTING, ORDERING
+from converters.frozen_graph.subgraph import COMPUTING
 from converters.graph.nodes import Node
+from converters.graph.ops.outside import CALLING, ORDERING
 from converters.graph.ops.table import unsupported
-from converters.saved_model.inlining import CALLING
 from converters.tfjs.reader import MODEL, shard
 from signatures.errors import DamagedFileError
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.ops.outside import VARIABLES
 from converters.runtimes.child import Model, claim_stdout, serve
 from converters.runtimes.tensorflow.freeze import frozen_function
 from converters.runtimes.wire import Tensors
@@ -67,7 +68,7 @@ def main() -> None:
                 value = values.get(operation.name)
                 if value is not None and operation.type == "VarHandleOp":
                     model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=value))
-                elif value is not None and operation.type in ("VariableV2", "Variable"):
+                elif value is not None and operation.type in VARIABLES:
                     model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=value).op)
         return model
 

@@ -9,10 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-_CALLS = frozenset(
-    (*("PartitionedCall", "StatefulPartitionedCall", "While", "StatelessWhile"),
-     *("If", "StatelessIf", "Case", "StatelessCase"))
-)  # fmt: skip
+from converters.graph.ops.outside import FUNCTIONAL
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ def flattened(graph: Any) -> bytes:
     The graph is not changed. Control flow becomes Switch and Merge, as in TensorFlow 1.
     """
     graph_def = graph.as_graph_def()
-    calls = _CALLS | {f.signature.name for f in graph_def.library.function}
+    calls = FUNCTIONAL | {f.signature.name for f in graph_def.library.function}
     if any(node.op in calls for node in graph_def.node):
         places = [node.name for node in graph_def.node if node.op == "Placeholder"]
         graph_def = _ordered(_inlined(graph_def, calls), places)
