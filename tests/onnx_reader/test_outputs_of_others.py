@@ -14,7 +14,7 @@ from converters.policy import Policy
 from converters.understand.state_names import looks_like_state, stem_of
 from exporter import export_model, load_policy
 from exporter.export.sources import read_source
-from signatures.errors import SignatureError
+from signatures.errors import ExportModelError, SignatureError
 from signatures.roles import Role
 
 WEIGHTS = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
@@ -175,6 +175,23 @@ def test_a_batch_that_was_baked_in_is_freed_only_where_the_numbers_stay_right(tm
     free(path, "action", 2)
     with pytest.raises(SignatureError, match="for one row only"):
         only(path)
+
+
+def test_a_batch_that_was_baked_in_is_not_tried_at_any_size(tmp_path: Path) -> None:
+    """A file of a few hundred bytes that claims a row of 2^31 - 1 numbers."""
+    nodes = [
+        helper.make_node("ReduceSum", ["obs", "axes"], ["x"], keepdims=1),
+        helper.make_node("Reshape", ["x", "target"], ["action"]),
+    ]
+    constants = {"axes": np.array([1]), "target": np.array([1, 1])}
+    path = model(tmp_path / "huge.onnx", {"obs": ["batch", 2**31 - 1]}, nodes, ["action"], constants)
+    free(path, "action", 1)
+    made = onnx.load(path)
+    made.graph.output[0].type.tensor_type.shape.dim.add().dim_value = 1
+    path.write_bytes(made.SerializeToString())
+    with pytest.raises(ExportModelError) as caught:
+        only(path)
+    assert not isinstance(caught.value.__cause__, MemoryError)
 
 
 def free(path: Path, output: str, rank: int) -> None:
