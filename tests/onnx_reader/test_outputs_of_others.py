@@ -14,7 +14,7 @@ from converters.policy import Policy
 from converters.understand.state_names import looks_like_state, stem_of
 from exporter import export_model, load_policy
 from exporter.export.sources import read_source
-from signatures.errors import ExportModelError, SignatureError
+from signatures.errors import SignatureError
 from signatures.roles import Role
 
 WEIGHTS = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
@@ -178,20 +178,19 @@ def test_a_batch_that_was_baked_in_is_freed_only_where_the_numbers_stay_right(tm
 
 
 def test_a_batch_that_was_baked_in_is_not_tried_at_any_size(tmp_path: Path) -> None:
-    """A file of a few hundred bytes that claims a row of 2^31 - 1 numbers."""
+    """A file of some hundred bytes whose row has as many numbers as a tensor may: the trial would take gigabytes."""
     nodes = [
         helper.make_node("ReduceSum", ["obs", "axes"], ["x"], keepdims=1),
         helper.make_node("Reshape", ["x", "target"], ["action"]),
     ]
     constants = {"axes": np.array([1]), "target": np.array([1, 1])}
-    path = model(tmp_path / "huge.onnx", {"obs": ["batch", 2**31 - 1]}, nodes, ["action"], constants)
+    path = model(tmp_path / "huge.onnx", {"obs": ["batch", 2**26]}, nodes, ["action"], constants)
     free(path, "action", 1)
     made = onnx.load(path)
     made.graph.output[0].type.tensor_type.shape.dim.add().dim_value = 1
     path.write_bytes(made.SerializeToString())
-    with pytest.raises(ExportModelError) as caught:
+    with pytest.raises(SignatureError, match="too large to be tried"):
         only(path)
-    assert not isinstance(caught.value.__cause__, MemoryError)
 
 
 def free(path: Path, output: str, rank: int) -> None:
