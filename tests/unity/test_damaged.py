@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
@@ -116,3 +117,26 @@ def test_a_negative_length_does_not_abort_the_process(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 1, done.stderr
     assert "not accepted by R22" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("op", "constants"),
+    [
+        ("Expand", {"one": np.ones(1, np.float32), "n": np.array([-3])}),
+        ("Pad", {"one": np.ones(1, np.float32), "n": np.array([-3, -3])}),
+    ],
+)
+def test_a_length_that_comes_out_negative_does_not_abort_the_process_either(
+    op: str, constants: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    draft = Draft(inputs={"obs_0": (TensorProto.FLOAT, ["N", 3])}, opset=13)
+    model = draft.model()
+    for name, value in {**constants, "s": np.array([0]), "e": np.array([2])}.items():
+        model.graph.initializer.append(numpy_helper.from_array(value, name))
+    model.graph.node.append(helper.make_node(op, list(constants), ["short"]))
+    model.graph.node.append(helper.make_node("Slice", ["short", "s", "e"], ["cut"]))
+    path = tmp_path / "negative.onnx"
+    path.write_bytes(model.SerializeToString())
+    command = [sys.executable, "-m", "exporter", "inspect", str(path), "--unity", "all"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode in (0, 1), done.stderr

@@ -107,14 +107,19 @@ class OnnxFile:
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int | None, ...]]:
         """Value → shape, of a run in which every free length of an input is 1."""
+        return self._inferred[0]
+
+    @cached_property
+    def _inferred(self) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
         return inferred_shapes(self)
 
     @property
     def has_negative_lengths(self) -> bool:
-        """Whether something is declared with a length below 0."""
+        """Whether something is declared with a length below 0, or comes out with one."""
         graph = self.model.graph
         declared = (*graph.input, *graph.output, *graph.value_info)
-        return any(d.dim_value < 0 for value in declared for d in value.type.tensor_type.shape.dim)
+        said = any(d.dim_value < 0 for value in declared for d in value.type.tensor_type.shape.dim)
+        return said or self._inferred[1]
 
 
 def read_onnx_file(path: Path) -> OnnxFile:

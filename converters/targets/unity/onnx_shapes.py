@@ -30,20 +30,23 @@ _SAYING = {
 }
 
 
-def inferred_shapes(file: OnnxFile) -> Mapping[str, tuple[int | None, ...]]:
-    """Value → shape, of inputs, initializers and results."""
-    types = _given(file)
+def inferred_shapes(file: OnnxFile) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
+    """(value → shape, of inputs, initializers and results; whether a length came out negative)."""
+    types, negative = _given(file), False
     for node in file.model.graph.node:
         if any(name and name not in types for name in node.input) or any(a.HasField("g") for a in node.attribute):
             continue
         for name, kind in _results(file, node, types).items():
-            if name and not any(d.HasField("dim_value") and d.dim_value < 0 for d in kind.tensor_type.shape.dim):
+            if any(d.HasField("dim_value") and d.dim_value < 0 for d in kind.tensor_type.shape.dim):
+                negative = True
+            elif name:
                 types[name] = kind
-    return {
+    shapes = {
         name: tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.tensor_type.shape.dim)
         for name, kind in types.items()
         if kind.tensor_type.HasField("shape")
     }
+    return shapes, negative
 
 
 def _given(file: OnnxFile) -> dict[str, Any]:
