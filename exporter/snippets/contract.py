@@ -89,11 +89,6 @@ def read_bundle(folder: Path) -> Bundle:
     return Bundle(folder, found.name, found.signature, frozenset(found.contract.files), nodes)
 
 
-def is_continuous(head: TensorSpec) -> bool:
-    """Whether an action is of numbers, not of choices."""
-    return head.is_continuous
-
-
 def example_shape(spec: TensorSpec) -> tuple[int, ...]:
     """The shape for one agent; 1 for every other free axis, too."""
     return tuple(1 if n is None else n for n in spec.shape)
@@ -116,7 +111,7 @@ def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
 
 def action_meaning(bundle: Bundle, head: TensorSpec) -> list[str]:
     """Comment lines on an action."""
-    if is_continuous(head):
+    if head.is_continuous:
         return folded(f"{head.shape[-1]} continuous actions", numbered(bundle.signature.labels.get("actions", [])))
     return branch_lines(bundle)
 

@@ -9,7 +9,6 @@ from exporter.snippets.contract import (
     class_name,
     example_shape,
     identifier,
-    is_continuous,
     meaning,
     quoted,
 )
@@ -70,7 +69,7 @@ def tensorflowsharp(bundle: Bundle) -> str:
 def _fetched(bundle: Bundle) -> dict[str, TensorSpec]:
     """Variable → the output without chance (a draw from log-probabilities is the caller's)."""
     single = len(bundle.heads) == 1
-    names = ("action" if single else "continuous" if is_continuous(h) else "discrete" for h in bundle.heads)
+    names = ("action" if single else "continuous" if h.is_continuous else "discrete" for h in bundle.heads)
     return {name: bundle.plain(head) for name, head in zip(names, bundle.heads, strict=True)}
 
 

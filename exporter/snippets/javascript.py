@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 
-from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, is_continuous, meaning, quoted
+from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, meaning, quoted
 from exporter.snippets.frames import filled
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -88,7 +88,7 @@ def _agents(bundle: Bundle) -> str:
         extra.append("  },")
     lines += ["}, {", *extra, "});"] if extra else ["});"]
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
-    shown = ", ".join("decision.continuous" if is_continuous(h) else "decision.discrete" for h in bundle.heads)
+    shown = ", ".join("decision.continuous" if h.is_continuous else "decision.discrete" for h in bundle.heads)
     lines.append(f"console.log({shown});  // a row per agent")
     start = [
         "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): without chance",
@@ -102,7 +102,7 @@ def _fetched(bundle: Bundle) -> dict[str, str]:
     names = (
         ["action"]
         if len(bundle.heads) == 1
-        else ["continuous" if is_continuous(h) else "discrete" for h in bundle.heads]
+        else ["continuous" if h.is_continuous else "discrete" for h in bundle.heads]
     )
     return {name: bundle.plain(head).name for name, head in zip(names, bundle.heads, strict=True)}
 

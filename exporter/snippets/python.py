@@ -7,7 +7,6 @@ from exporter.snippets.contract import (
     Bundle,
     action_meaning,
     example_shape,
-    is_continuous,
     meaning,
     quoted,
 )
@@ -53,7 +52,7 @@ def load_policy(bundle: Bundle) -> str:
     for head in bundle.heads:
         lines += [f"# {text}" for text in action_meaning(bundle, head)]
     lines.append(
-        f"print({', '.join('decision.continuous' if is_continuous(h) else 'decision.discrete' for h in bundle.heads)})"
+        f"print({', '.join('decision.continuous' if h.is_continuous else 'decision.discrete' for h in bundle.heads)})"
     )
     return filled("load_policy.py", path=quoted(bundle.folder.as_posix()), play=looped(bundle, lines))
 
@@ -116,7 +115,7 @@ def _draws(bundle: Bundle) -> bool:
 def _variable(bundle: Bundle, head: TensorSpec) -> str:
     if len(bundle.heads) == 1:
         return "action"
-    return "continuous" if is_continuous(head) else "discrete"
+    return "continuous" if head.is_continuous else "discrete"
 
 
 def _action(bundle: Bundle, head: TensorSpec) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exporter.snippets.contract import Bundle, branch_lines, is_continuous, numbered
+from exporter.snippets.contract import Bundle, branch_lines, numbered
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
@@ -119,7 +119,7 @@ def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) 
         colour = "Black And White" if channels == 1 else "colour"
         rows.append(("Camera Observation", f"Width {width}, Height {height}, {colour}"))
     head = bundle.heads[0]
-    if is_continuous(head):
+    if head.is_continuous:
         rows.append(("Vector Action", f"Space Type Continuous, Space Size {head.shape[-1]}"))
     else:
         sizes = bundle.signature.branches
@@ -133,7 +133,7 @@ def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) 
 def _action(bundle: Bundle) -> TensorSpec:
     """The node that CoreBrainInternal reads: float for continuous actions, int64 for discrete ones."""
     head = bundle.heads[0]
-    return head if is_continuous(head) or head.dtype == "int64" else bundle.plain(head)
+    return head if head.is_continuous or head.dtype == "int64" else bundle.plain(head)
 
 
 def _scope(bundle: Bundle) -> str:
@@ -150,7 +150,7 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
     faults = []
     if len(bundle.heads) > 1:
         faults.append("it has no hybrid actions")
-    elif not is_continuous(bundle.heads[0]) and _action(bundle).dtype != "int64":
+    elif not bundle.heads[0].is_continuous and _action(bundle).dtype != "int64":
         faults.append("it reads discrete actions as int64")
     if len(signature.branches) > 1 and not generation.branches:
         faults.append("it has one branch of discrete actions")

@@ -18,7 +18,7 @@ from converters.runtimes.javascript import RUNTIMES
 from converters.runtimes.javascript.node import JS_SOURCE, js_home, node_executable
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
-from tests.runner.graph_models import batch, twins, twins_by_numpy
+from tests.runtimes.graph_models import batch, twins, twins_by_numpy
 
 pytestmark = [
     pytest.mark.browser,

@@ -13,8 +13,8 @@ from onnx import TensorProto, helper
 
 from converters.runtimes.javascript.node import JS_SOURCE
 from converters.runtimes.process import RunFailedError, RuntimeProcess
-from tests.runner.graph_models import CHOICE_FEEDS, batch, choice, info, node, placeholder, twins, twins_by_numpy
-from tests.runner.graph_models import write_model as write_tfjs
+from tests.runtimes.graph_models import CHOICE_FEEDS, batch, choice, info, node, placeholder, twins, twins_by_numpy
+from tests.runtimes.graph_models import write_model as write_tfjs
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
 

@@ -1,4 +1,4 @@
-"""Small ONNX models, made here, and how they are run: raised, by the numpy kernels and TensorFlow; in onnxruntime."""
+"""Small ONNX models, made here, and how they are run: imported, by the numpy kernels and TensorFlow; in onnxruntime."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def save(message: Any, folder: Path, name: str = "model.onnx") -> Path:
     return path
 
 
-def raised_graph(path: Path, outputs: Sequence[str]) -> tuple[OnnxModel, Graph, list[str]]:
+def imported_graph(path: Path, outputs: Sequence[str]) -> tuple[OnnxModel, Graph, list[str]]:
     """(the model, its graph as the passes begin with it, the nodes that give ``outputs``)."""
     found = read_onnx(Fetched(path))
     assert not found.left_out, found.left_out
@@ -122,9 +122,9 @@ def raised_graph(path: Path, outputs: Sequence[str]) -> tuple[OnnxModel, Graph, 
     return found, normalise(Graph((*found.graph.nodes, *pins))), [p.name for p in pins]
 
 
-def raised(path: Path, feeds: Mapping[str, Array], outputs: Sequence[str]) -> list[Array]:
-    """The outputs of a model, raised to a graph and run by the numpy kernels; by the model's own names."""
-    found, graph, names = raised_graph(path, outputs)
+def imported(path: Path, feeds: Mapping[str, Array], outputs: Sequence[str]) -> list[Array]:
+    """The outputs of a model, imported as a graph and run by the numpy kernels; by the model's own names."""
+    found, graph, names = imported_graph(path, outputs)
     results = run_graph(graph, {found.inputs[n]: a for n, a in feeds.items()}, names)
     return [results[name] for name in names]
 
@@ -157,8 +157,8 @@ class Bench:
         return self.pool.process("onnxruntime").load(str(path), **options)
 
     def tensorflow(self, path: Path, feeds: Mapping[str, Array], outputs: Sequence[str]) -> list[Array]:
-        """What TensorFlow makes of the raised graph."""
-        found, graph, names = raised_graph(path, outputs)
+        """What TensorFlow makes of the imported graph."""
+        found, graph, names = imported_graph(path, outputs)
         file = path.with_suffix(".pb")
         file.write_bytes(schema.serialise(encode(graph.pruned([*names, *found.inputs.values()]))))
         loaded = self.pool.process("tensorflow").load(str(file), kind="graph")

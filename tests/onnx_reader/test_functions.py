@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from signatures.errors import DamagedFileError, UnsupportedOpError
-from tests.onnx_reader.models import Bench, floats, helper, model, node, raised, read
+from tests.onnx_reader.models import Bench, floats, helper, imported, model, node, read
 
 OPSETS = [helper.make_opsetid("", 18), helper.make_opsetid("own", 1)]
 
@@ -37,7 +37,7 @@ def test_functions_are_inlined(bench: Bench) -> None:
     ]
     path = bench.place(with_functions([call("Twice", "x", "h"), node("Tanh", ["h"])], functions))
     x = floats(3, 4)
-    (got,), (wanted,) = raised(path, {"x": x}, ["y"]), bench.onnxruntime(path, {"x": x}, ["y"])
+    (got,), (wanted,) = imported(path, {"x": x}, ["y"]), bench.onnxruntime(path, {"x": x}, ["y"])
     np.testing.assert_allclose(got, wanted, atol=1e-6)
 
 
@@ -59,12 +59,12 @@ def test_a_function_that_calls_itself_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_op_that_onnx_defines_by_others_is_inlined(bench: Bench) -> None:
-    """MeanVarianceNormalization has no entry of its own in the raising table."""
+    """MeanVarianceNormalization has no entry of its own in the importer's table."""
     from converters.onnx.importer.table import TABLE
 
     assert ("", "MeanVarianceNormalization") not in TABLE
     message = model([node("MeanVarianceNormalization", ["x"], axes=[1])], {"x": (np.float32, ["batch", 4])}, opset=13)
     path = bench.place(message)
     x = floats(3, 4)
-    (got,), (wanted,) = raised(path, {"x": x}, ["y"]), bench.onnxruntime(path, {"x": x}, ["y"])
+    (got,), (wanted,) = imported(path, {"x": x}, ["y"]), bench.onnxruntime(path, {"x": x}, ["y"])
     np.testing.assert_allclose(got, wanted, atol=1e-5)

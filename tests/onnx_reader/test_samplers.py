@@ -14,7 +14,7 @@ from converters.graph.run import run_graph
 from converters.onnx import edit
 from converters.onnx.vetted import contained
 from exporter.verify.statistics import fit
-from tests.onnx_reader.models import Array, Bench, constant, floats, model, node, raised_graph, read
+from tests.onnx_reader.models import Array, Bench, constant, floats, imported_graph, model, node, read
 
 X = floats(4, 3)
 
@@ -33,7 +33,7 @@ def noisy(kind: str, **attributes: Any) -> Any:
 def test_draws_of_normals_are_fed(mean: float, scale: float, bench: Bench) -> None:
     path = bench.place(noisy("RandomNormalLike", mean=mean, scale=scale))
     draws = floats(4, 3, seed=9)
-    found, graph, names = raised_graph(path, ["y"])
+    found, graph, names = imported_graph(path, ["y"])
     assert found.draws == ("n",)
     sampler = next(n for n in graph.nodes if n.op == "RandomStandardNormal")
     assert sampler.origin == "n"
@@ -45,7 +45,7 @@ def test_draws_of_normals_are_fed(mean: float, scale: float, bench: Bench) -> No
 
 def test_a_normal_of_a_given_shape(bench: Bench) -> None:
     path = bench.place(noisy("RandomNormal", shape=[4, 3]))
-    found, graph, _ = raised_graph(path, ["y"])
+    found, graph, _ = imported_graph(path, ["y"])
     assert found.draws == ("n",)
     assert [n.op for n in graph.nodes if n.origin == "n"] == ["RandomStandardNormal"]
 
@@ -53,7 +53,7 @@ def test_a_normal_of_a_given_shape(bench: Bench) -> None:
 def test_a_fixed_number_of_rows_becomes_the_batch(bench: Bench) -> None:
     message = model([node("RandomNormal", [], "n", shape=[1, 3]), node("Add", ["x", "n"])], {"x": (np.float32, [1, 3])})
     path = bench.place(message)
-    found, graph, names = raised_graph(path, ["y"])
+    found, graph, names = imported_graph(path, ["y"])
     assert found.batch == 1
     assert run_graph(graph, {"x": X}, names)[names[0]].shape == (4, 3)
 
@@ -66,7 +66,7 @@ def test_uniform_draws(kind: str, bench: Bench) -> None:
         [node(kind, ["x"] if kind.endswith("Like") else [], "n", low=-1.0, high=3.0, **more), node("Add", ["x", "n"])],
         {"x": (np.float32, ["batch", 1])},
     )
-    found, graph, names = raised_graph(bench.place(message), ["y"])
+    found, graph, names = imported_graph(bench.place(message), ["y"])
     assert found.draws == ()
     reseed(1)
     draws = run_graph(graph, {"x": np.zeros((rows, 1), np.float32)}, names)[names[0]]
@@ -81,7 +81,7 @@ def test_multinomial(number: int, dtype: Any, bench: Bench) -> None:
     logits = np.log(np.array([[0.1, 0.0, 0.6, 0.3]], np.float32) + 1e-30)
     message = model([node("Multinomial", ["x"], dtype=number, sample_size=2000)], {"x": (np.float32, ["batch", 4])})
     path = bench.place(message)
-    _, graph, names = raised_graph(path, ["y"])
+    _, graph, names = imported_graph(path, ["y"])
     reseed(1)
     for draws in (run_graph(graph, {"x": logits}, names)[names[0]], bench.onnxruntime(path, {"x": logits}, ["y"])[0]):
         assert draws.dtype == dtype

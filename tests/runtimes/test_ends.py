@@ -13,8 +13,8 @@ import pytest
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT
-from tests.runner.graph_models import info, node, placeholder, write_model
-from tests.runner.pipe import NEEDS_NODE
+from tests.runtimes.graph_models import info, node, placeholder, write_model
+from tests.runtimes.pipe import NEEDS_NODE
 
 #: A Python child that never ends a request.
 BUSY = f"""

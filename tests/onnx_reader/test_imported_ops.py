@@ -1,4 +1,4 @@
-"""Every ONNX op of the raising table: raised and run by the numpy kernels against onnxruntime on the model itself."""
+"""Every ONNX op of the importer's table: imported and run by the numpy kernels, against onnxruntime."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from converters.onnx.importer.table import TABLE
 from tests.onnx_reader.cases import arrays, elementwise, images, layers, linear
-from tests.onnx_reader.models import Array, Bench, Case, raised, referenced
+from tests.onnx_reader.models import Array, Bench, Case, imported, referenced
 
 pytestmark = pytest.mark.xdist_group("onnx-ops")
 
@@ -32,15 +32,15 @@ def test_agrees_with_onnxruntime(case: Case, bench: Bench) -> None:
         path = bench.place(case.model(opset))
         run = bench.onnxruntime if case.oracle == "onnxruntime" else referenced
         expected = run(path, case.feeds, case.outputs)
-        got = raised(path, case.feeds, case.outputs)
+        got = imported(path, case.feeds, case.outputs)
         compare(case, expected, got, f"opset {opset}")
 
 
 @each_case
-def test_tensorflow_runs_what_was_raised(case: Case, bench: Bench) -> None:
+def test_tensorflow_runs_what_was_imported(case: Case, bench: Bench) -> None:
     bench.need("tensorflow")
     path = bench.place(case.model(case.opsets[-1]))
-    expected = raised(path, case.feeds, case.outputs)
+    expected = imported(path, case.feeds, case.outputs)
     compare(case, expected, bench.tensorflow(path, case.feeds, case.outputs), "TensorFlow")
 
 

@@ -20,7 +20,7 @@ from hypothesis.extra import numpy as arrays
 from onnx import TensorProto, helper, numpy_helper
 
 from converters.runtimes.javascript.node import JS_SOURCE
-from tests.runner.pipe import HOME, NEEDS_NODE, Array, Runner, frame
+from tests.runtimes.pipe import HOME, NEEDS_NODE, Array, Runner, frame
 
 pytestmark = [
     *NEEDS_NODE,

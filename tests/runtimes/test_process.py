@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.runner.graph_models import (
+from tests.runtimes.graph_models import (
     batch,
     info,
     node,
@@ -19,7 +19,7 @@ from tests.runner.graph_models import (
     twins_by_numpy,
     write_model,
 )
-from tests.runner.pipe import HOME, NEEDS_NODE, NODE, RUNNER, Runner, frame
+from tests.runtimes.pipe import HOME, NEEDS_NODE, NODE, RUNNER, Runner, frame
 
 pytestmark = NEEDS_NODE
 

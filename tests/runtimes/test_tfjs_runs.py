@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from converters.runtimes.javascript.node import JS_SOURCE
-from tests.runner.graph_models import (
+from tests.runtimes.graph_models import (
     B2,
     CHOICE_FEEDS,
     W2,
@@ -23,7 +23,7 @@ from tests.runner.graph_models import (
     twins_by_numpy,
     write_model,
 )
-from tests.runner.pipe import NEEDS_NODE, Runner
+from tests.runtimes.pipe import NEEDS_NODE, Runner
 
 pytestmark = NEEDS_NODE
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.runner.pipe import Runner
+from tests.runtimes.pipe import Runner
 
 
 @pytest.fixture(scope="module", params=["tfjs-cpu", "tfjs-wasm"])

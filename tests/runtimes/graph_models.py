@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.runner.pipe import Array
+from tests.runtimes.pipe import Array
 
 DTYPES = {"float32": "DT_FLOAT", "int32": "DT_INT32", "int64": "DT_INT64", "bool": "DT_BOOL"}
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.runner.graph_models import (
+from tests.runtimes.graph_models import (
     batch,
     edit,
     info,
@@ -18,7 +18,7 @@ from tests.runner.graph_models import (
     twins,
     write_model,
 )
-from tests.runner.pipe import NEEDS_NODE, Runner
+from tests.runtimes.pipe import NEEDS_NODE, Runner
 
 pytestmark = NEEDS_NODE
 

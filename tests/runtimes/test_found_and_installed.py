@@ -22,8 +22,8 @@ from converters.runtimes.javascript import node as runtimes
 from converters.runtimes.javascript.node import install_packages, js_home, node_executable
 from converters.runtimes.registry import RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError
+from tests.commands import ROOT
 
-ROOT = Path(runtimes.__file__).resolve().parents[2]
 PACKAGES = runtimes._PACKAGES
 
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for npm are shell scripts")
