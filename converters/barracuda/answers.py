@@ -14,7 +14,7 @@ from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
 from converters.barracuda.lower import HEADS, INPUT_NAMES, base_name
 from converters.barracuda.writer import CONTRACT_KEY
-from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.nodes import Graph, Node
 from converters.graph.passes.noise import samplers
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
@@ -46,20 +46,6 @@ def contract_of(model: NnModel) -> PolicySignature:
 def answered(signature: PolicySignature) -> list[str]:
     """The outputs of a policy that its ``.nn`` answers."""
     return [s.name for s in signature.outputs if s.role not in _UNANSWERED]
-
-
-def outline(signature: PolicySignature, *, noise_kept: bool) -> Graph:
-    """What a verification asks of a policy's graph, where there is none but the ``.nn``: which outputs are drawn."""
-    size = Node("size", "Const", value=np.array([1, 1], np.int32))
-    nodes = [size]
-    for spec in signature.inputs:
-        attrs = {"dtype": np.dtype(spec.dtype), "shape": TensorShape(spec.shape)}
-        nodes.append(Node(spec.name, "Placeholder", attrs=attrs))
-    for spec in signature.outputs:
-        drawn = spec.role is Role.SAMPLED or (spec.role is Role.CONTINUOUS and noise_kept)
-        attrs = {"dtype": np.dtype(np.float32)} if drawn else {}
-        nodes.append(Node(spec.name, "RandomStandardNormal" if drawn else "Identity", ("size",), attrs))
-    return Graph(tuple(nodes))
 
 
 class NnPolicy:

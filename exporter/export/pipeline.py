@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from converters.barracuda.answers import outline
-from converters.barracuda.writer import contract_text
 from converters.bundle import bundle
 from converters.bundle.bundle import Bundle
 from converters.format import Artifact, Format, WriteOptions
@@ -22,13 +20,12 @@ from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from converters.targets.profile import Profile
-from converters.targets.profiles import profile
 from exporter.export.labels import Labels, labelled, read_labels
 from exporter.export.sources import Source, naming, read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
+from exporter.verify.outline import outline
 from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import check_rules
@@ -37,6 +34,9 @@ from exporter.version import __version__
 from signatures.contract import PARITY, POLICY, Contract, Origin, parse, safe_name
 from signatures.errors import BundleError, RuntimeUnavailableError, SignatureError, UsageError
 from signatures.fields import FieldError, printable
+
+if TYPE_CHECKING:
+    from converters.targets.profile import Profile
 
 Progress = Callable[[str], None]
 
@@ -105,7 +105,7 @@ def export(
     """
     if not paths:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
-    wanted = None if options.profile is None else profile(options.profile)
+    wanted = None if options.profile is None else _profile(options.profile)
     formats = _formats(options, wanted)
     if wanted is not None and all(f.key in wanted.undressed for f in formats):
         wanted = None
@@ -158,6 +158,12 @@ def export(
                 place = options.out / (f"{policy.name}.failed" if failed else policy.name)
                 bundle.put_in_place(stage, place)
             yield ExportResult(policy, place, contract, {a.format.key: a.size for a in artifacts}, report)
+
+
+def _profile(name: str) -> Profile:
+    from converters.targets.profiles import profile  # most exports are for no consumer in particular
+
+    return profile(name)
 
 
 def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
@@ -310,6 +316,8 @@ def verify_folder(
     asked = made_for is not None and not {"bytes", "nn"} & artefacts.keys()
     reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if asked else found.graph_file)
     if "nn" in artefacts:
+        from converters.barracuda.writer import contract_text
+
         with naming(artefacts["nn"]):
             found.verify_contract(contract_text(artefacts["nn"].read_bytes()))
     names = [s.name for s in (*signature.inputs, *signature.outputs)]

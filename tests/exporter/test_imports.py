@@ -132,6 +132,18 @@ def test_an_export_without_verification_loads_no_runtime(tmp_path: Path) -> None
     assert "onnx" in loaded_by("-m", "exporter", source, "-o", tmp_path, "--verify", "none", "--to", "onnx")
 
 
+def test_an_export_reads_no_room_that_it_has_no_use_for(tmp_path: Path) -> None:
+    """The ``.nn`` and the consumers of ``--for`` are a fifth of all modules."""
+    script = (
+        "import sys\nfrom exporter.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
+        "rooms = ('converters.barracuda.', 'converters.targets', 'converters.torch_checkpoint.', 'converters.keras.')\n"
+        "print([m for m in sys.modules if m.startswith(rooms)])"
+    )
+    ran = python("-c", script, ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
+    assert ran.out.splitlines()[-1] == "[]"
+
+
 def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
     code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
     assert python("-c", code).out.split() == ["False", "True"]
