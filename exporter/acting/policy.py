@@ -49,14 +49,24 @@ class Decision:
 class LoadedPolicy:
     """A policy that decides. ``signature`` says what it observes and does."""
 
-    def __init__(self, name: str, signature: PolicySignature, run: Run, runtime: str, seed: int = 0) -> None:
+    def __init__(
+        self,
+        name: str,
+        signature: PolicySignature,
+        run: Run,
+        runtime: str,
+        seed: int = 0,
+        *,
+        draws_itself: bool = False,
+    ) -> None:
+        """``draws_itself``: the noise of the source is still inside (``--noise keep``)."""
         self.name, self.signature, self.runtime = name, signature, runtime
         self._run = run
         self._generator = Generator(seed)
         self._scores = signature.log_probs
         # A mean beside its spread is drawn from here, unless the graph has drawn already.
         spread = next((s for s in signature.outputs if s.role in (Role.STD, Role.LOG_STD)), None)
-        self._spread = None if signature.noise else spread
+        self._spread = None if signature.noise or draws_itself else spread
 
     def seed(self, seed: int) -> None:
         """Start the draws anew: the same seed gives the same actions for the same inputs, here and in policy.mjs."""
@@ -94,6 +104,7 @@ class LoadedPolicy:
         given = self._named(observations)
         special = {Role.MASKS: masks, Role.MEMORY_IN: memory, Role.PREV_ACTION: previous}
         self._check_taken({"masks": masks, "memory": memory, "previous": previous})
+        self._check_parameters(parameters or {})
         feeds: dict[str, Array] = {}
         rows: int | None = None
         for spec in sorted(self.signature.inputs, key=lambda s: s.role not in OBSERVATIONS):
@@ -103,8 +114,6 @@ class LoadedPolicy:
             elif spec.role is Role.NOISE:
                 continue
             elif spec.role is Role.PARAMETER:
-                if spec.name not in (parameters or {}):
-                    raise UsageError(f"the parameter {spec.name!r} is missing", fix=f"parameters={{{spec.name!r}: …}}")
                 array = np.asarray((parameters or {})[spec.name], spec.dtype)
             else:
                 value = special.get(spec.role)
@@ -138,6 +147,20 @@ class LoadedPolicy:
         for word, value in given.items():
             if value is not None and not self.takes(_TAKEN[word]):
                 raise UsageError(f"the policy takes no {word}", why="it has no such input", fix=f"leave {word}= out")
+
+    def _check_parameters(self, given: Mapping[str, npt.ArrayLike]) -> None:
+        wanted = {s.name: s.shape for s in self.signature.inputs if s.role is Role.PARAMETER}
+        for name in given:
+            if name not in wanted:
+                known = ", ".join(wanted) or "none"
+                raise UsageError(f"there is no parameter {name!r}", fix=f"the policy's parameters: {known}")
+        for name, shape in wanted.items():
+            if name not in given:
+                raise UsageError(f"the parameter {name!r} is missing", fix=f"parameters={{{name!r}: …}}")
+            found = np.shape(given[name])
+            if len(found) != len(shape) or any(n not in (None, m) for n, m in zip(shape, found, strict=True)):
+                text = ", ".join("any" if n is None else str(n) for n in shape)
+                raise UsageError(f"the parameter {name!r} has the shape {list(found)}", why=f"[{text}] is wanted")
 
     def takes(self, role: Role) -> bool:
         """Whether an input has this role."""
@@ -276,8 +299,8 @@ def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0
     """The policy of a bundle, to be run in this process.
 
     ``runtime`` is ``onnxruntime`` (needs the bundle's ONNX and ``pip install 'export-model[onnxruntime]'``) or
-    ``numpy`` (needs its ``.bytes`` and nothing else; slower); without it, the first that is there. Raises BundleError,
-    RuntimeUnavailableError, UsageError.
+    ``numpy`` (needs its ``.bytes`` and nothing else; slower); without it, the first that is there. The file must be the
+    one that was exported, by its hash. Raises BundleError, RuntimeUnavailableError, UsageError.
     """
     from converters.bundle.bundle import Bundle
     from converters.formats import WRITTEN
@@ -300,7 +323,10 @@ def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0
             fix="export the policy with --to bytes,onnx",
         )
     chosen = runtime or here[0]
-    return LoadedPolicy(name, found.signature, _RUNS[chosen](files[chosen]), chosen, seed)
+    found.verify_hashes(WRITTEN["onnx" if chosen == "onnxruntime" else "bytes"])
+    source = found.contract.source
+    kept = source.noise_kept and bool(source.noise)
+    return LoadedPolicy(name, found.signature, _RUNS[chosen](files[chosen]), chosen, seed, draws_itself=kept)
 
 
 def _in_onnxruntime(file: Path) -> Run:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx import helper, numpy_helper
 
 from exporter import export_model, load_policy
 from exporter.acting.policy import LoadedPolicy
@@ -156,8 +158,6 @@ def test_what_is_missing_or_wrong_is_named(bundles: Bundles) -> None:
 
 
 def test_what_cannot_be_run_here_is_said(bundles: Bundles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import shutil
-
     folder = tmp_path / "continuous"
     shutil.copytree(bundles("continuous"), folder)
     with pytest.raises(UsageError, match="runtime='torch'"):
@@ -322,3 +322,64 @@ def test_a_mean_with_its_spread_is_drawn_from(role: Role, value: float) -> None:
     np.testing.assert_array_equal(drawn.outputs["action"], drawn.continuous)
     best = made.policy.decide(np.zeros((rows, 2)), deterministic=True)
     np.testing.assert_array_equal(best.continuous, answers["action"])
+
+
+def test_noise_that_was_kept_is_not_drawn_again(tmp_path: Path) -> None:
+    """The graph draws with σ = 0.5 and gives σ beside the action: drawing once more would make it 0.71."""
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["mean"]),
+        helper.make_node("MatMul", ["obs", "zero"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "log_half"], ["log_sigma"]),
+        helper.make_node("Exp", ["log_sigma"], ["sigma"]),
+        helper.make_node("RandomNormalLike", ["mean"], ["unit"], dtype=1),
+        helper.make_node("Mul", ["unit", "sigma"], ["noise"]),
+        helper.make_node("Add", ["mean", "noise"], ["action"]),
+    ]
+    weights = {
+        "w": np.ones((2, 1), np.float32),
+        "zero": np.zeros((2, 1), np.float32),
+        "log_half": np.log(np.full(1, 0.5, np.float32)),
+    }
+    graph = helper.make_graph(
+        nodes,
+        "drawn",
+        [helper.make_tensor_value_info("obs", 1, ["batch", 2])],
+        [helper.make_tensor_value_info(n, 1, ["batch", 1]) for n in ("action", "log_sigma")],
+        [numpy_helper.from_array(a, n) for n, a in weights.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    (tmp_path / "drawn.onnx").write_bytes(model.SerializeToString())
+    (result,) = export_model(
+        tmp_path / "drawn.onnx", tmp_path / "out", noise="keep", outputs={"log_sigma": "log_std"}, verify="none"
+    )
+    rows = 20_000
+    drawn = load_policy(result.folder).decide(np.zeros((rows, 2))).action
+    assert abs(drawn.std() - 0.5) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, "the parameter 'goal' is missing"),
+        ({"goal": [0, 0], "gaol": 1}, "there is no parameter 'gaol'"),
+        ({"goal": [0, 0, 0]}, r"the parameter 'goal' has the shape \[3\]"),
+    ],
+)
+def test_parameters_are_those_of_the_policy(given: dict[str, object], words: str) -> None:
+    goal = TensorSpec("goal", Role.PARAMETER, "float32", (2,))
+    outputs = [TensorSpec("action", Role.CONTINUOUS, "float32", (None, 1))]
+    made = stub([STATE, goal], outputs, {"action": np.zeros((1, 1), np.float32)}, action_space="continuous")
+    assert made.policy.decide(np.zeros(2), parameters={"goal": [1, 2]}).action.shape == (1, 1)
+    with pytest.raises(UsageError, match=words):
+        made.policy.decide(np.zeros(2), parameters=given)  # type: ignore[arg-type]
+
+
+def test_a_file_that_was_changed_is_not_run(bundles: Bundles, tmp_path: Path) -> None:
+    folder = tmp_path / "continuous"
+    shutil.copytree(bundles("continuous"), folder)
+    for name in ("continuous.onnx", "continuous.bytes"):
+        with (folder / name).open("ab") as file:
+            file.write(b"\0")
+    for runtime in ("onnxruntime", "numpy"):
+        with pytest.raises(BundleError, match="continuous"):
+            load_policy(folder, runtime=runtime)

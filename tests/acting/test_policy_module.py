@@ -133,8 +133,11 @@ def test_where_nothing_can_be_drawn_it_says_so(kind: str, bundles: Bundles) -> N
     width = load_policy(bundles("discrete")).signature.observations[0].shape[1]
     nan = {"state": {"data": [1e39] * (width or 1), "shape": [1, width]}}  # JSON has no NaN; infinities make one
     requests = [{"observations": nan, "options": o} for o in ({"seed": 1}, {})]
-    for answer in drive(bundles("discrete"), kind, requests):
+    requests.append({"observations": {"state": [0.0] * (width or 1)}, "options": {"parameters": {"gaol": 1}}})
+    *empty, unknown = drive(bundles("discrete"), kind, requests)
+    for answer in empty:
         assert "nothing can be drawn" in answer.get("error", ""), answer
+    assert "there is no parameter 'gaol'" in unknown["error"]
 
 
 def test_flat_and_nested_numbers_are_one(bundles: Bundles) -> None:

@@ -171,7 +171,8 @@ export class Policy {
     this.#plain = new Map(this.#heads.map((head) => [head.name, companion(head)]).filter(([, spec]) => spec));
     this.#scores = contract.outputs.find(({ role }) => role === "log_probs");
     // A mean beside its spread is drawn from here, unless the graph has drawn already.
-    const noisy = contract.inputs.some(({ role }) => role === "noise");
+    const kept = contract.source?.noise_kept && Object.keys(contract.source.noise ?? {}).length > 0;
+    const noisy = kept || contract.inputs.some(({ role }) => role === "noise");
     this.#spread = noisy ? undefined : contract.outputs.find(({ role }) => role === "std" || role === "log_std");
   }
 
@@ -209,6 +210,11 @@ export class Policy {
     const { masks, memory, previous, parameters = {}, deterministic = false, seed } = options;
     if (seed !== undefined) this.seed(seed);
     const given = this.#named(observations);
+    for (const name of Object.keys(parameters)) {
+      if (!this.contract.inputs.some((spec) => spec.role === "parameter" && spec.name === name)) {
+        throw new Error(`there is no parameter '${name}'`);
+      }
+    }
     const special = { masks, memory_in: memory, prev_action: previous };
     for (const [role, value] of Object.entries(special)) {
       if (value != null && !this.takes(role)) throw new Error(`the policy takes no ${TAKEN[role]}: it has no such input`);
@@ -319,9 +325,9 @@ export class Policy {
       return (branches.length > 0 ? branches : [row.length]).map((count) => {
         const part = row.slice(start, (start += count));
         if (!deterministic) return this.#generator.choice(part);
-        const best = part.indexOf(Math.max(...part));
-        if (best < 0) throw new Error(`the log-probabilities ${part} have no largest: ${NOTHING_LEFT}`);
-        return best;
+        const most = Math.max(...part);
+        if (!(most > -Infinity)) throw new Error(`nothing can be drawn from the log-probabilities ${part}: ${NOTHING_LEFT}`);
+        return part.indexOf(most);
       });
     });
   }
