@@ -177,11 +177,13 @@ def _labels(found: Sequence[tuple[Path, Format, Ports]]) -> list[str]:
     formats = [kind.key for _, kind, _ in found]
     if len(set(formats)) == len(formats) and len({path for path, *_ in found}) == 1:
         return formats
-    return [f"{kind.key} {_short(ports.path)}" for _, kind, ports in found]
-
-
-def _short(path: Path) -> str:
-    return "/".join(path.resolve().parts[-2:])
+    paths = [ports.path.resolve() for *_, ports in found]
+    for depth in range(2, max(len(p.parts) for p in paths) + 1):  # as much of the paths as tells them apart
+        labels = [f"{key} {'/'.join(path.parts[-depth:])}" for key, path in zip(formats, paths, strict=True)]
+        if len(set(labels)) == len(set(zip(formats, paths, strict=True))):
+            break
+    turns = [labels[:i].count(label) for i, label in enumerate(labels)]  # one file may be given twice
+    return [f"{label} ({n + 1})" if n else label for label, n in zip(labels, turns, strict=True)]
 
 
 def _size(path: Path) -> int:
@@ -390,7 +392,7 @@ def _participants(
                 model,
                 candidate.label,
                 candidate.drawn,
-                candidate.ports.path,
+                path,
                 candidate.fed,
             )
         unload(model)

@@ -13,10 +13,11 @@ import pytest
 from onnx import helper, numpy_helper
 
 from converters import schema
+from converters.format import Ports
 from converters.formats import WRITTEN
 from converters.frozen_graph.tensors import from_array, to_array
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
+from exporter.compare.comparison import _labels, compare_artefacts
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.findings import Finding
 from exporter.verify.report import ParityReport
@@ -131,6 +132,27 @@ def test_candidates_of_one_format_are_told_apart(bundles: Bundles, tmp_path: Pat
         "onnx discrete/discrete.onnx",
         f"onnx {tmp_path.name}/theirs.onnx",
     }
+
+
+def test_labels_tell_candidates_apart_whatever_they_are_called(tmp_path: Path) -> None:
+    found = [
+        (tmp_path / "x", WRITTEN["onnx"], Ports(tmp_path / run / "out" / "policy.onnx", (), ()))
+        for run in ("a", "b", "a")
+    ]
+    assert _labels(found) == ["onnx a/out/policy.onnx", "onnx b/out/policy.onnx", "onnx a/out/policy.onnx (2)"]
+
+
+def test_a_candidate_with_weights_beside_it_that_differs_is_a_failure_that_names_the_tensor(
+    bundles: Bundles, tmp_path: Path, pool: RuntimePool
+) -> None:
+    """What is loaded, and bisected, is the vetted copy: it has its weights inside."""
+    model = onnx.load(bundles("continuous") / "continuous.onnx")
+    weights = max(model.graph.initializer, key=lambda t: len(t.raw_data))
+    weights.raw_data = (numpy_helper.to_array(weights) * np.float32(1.5)).tobytes()
+    onnx.save(model, tmp_path / "theirs.onnx", save_as_external_data=True, location="theirs.data", size_threshold=0)
+    report = compare_artefacts(fixture("continuous"), [tmp_path / "theirs.onnx"], runtimes="onnxruntime", pool=pool)
+    failure = next(c for c in report.comparisons if not c.passed)
+    assert failure.bisection is not None
 
 
 def test_the_names_of_the_source_are_known_too(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
