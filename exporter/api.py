@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from converters.formats import DEFAULTS
 from converters.graph.options import CompileOptions, NoiseMode
 from converters.source import ReadOptions
 from exporter.export.labels import Labels
@@ -63,7 +62,7 @@ def export_model(
     session: Any = None,
     tf_function: Any = None,
     keras_model: Any = None,
-    to: str | Sequence[str] = DEFAULTS,
+    to: str | Sequence[str] | None = None,
     name: str | None = None,
     brain: str | None = None,
     names: str = "canonical",
@@ -75,7 +74,7 @@ def export_model(
     step: int | None = None,
     sensors: Sequence[Sequence[int]] = (),
     trust_source: bool = False,
-    opset: int = 15,
+    opset: int | None = None,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
     labels: Labels | None = None,
@@ -89,13 +88,14 @@ def export_model(
     or a ConcreteFunction; ``keras_model``. Nothing of a live object is changed. Its policy is called ``policy``, or as
     the function or the model is; ``name`` gives another.
 
-    ``for_`` names the consumer that the files are made for (``--for``). The other parameters are the flags of the
+    ``for_`` names the consumer that the files are made for (``--for``); ``to`` and ``opset`` are by default what it
+    loads, without it all formats but ``nn`` and opset 15. The other parameters are the flags of the
     command line. Raises ExportModelError and its subclasses; ParityError (after everything is written) when formats
     disagree and ``strict`` is set.
     """
     options = ExportOptions(
         Path(out),
-        tuple(t for t in to.split(",") if t) if isinstance(to, str) else tuple(to),
+        [t for t in to.split(",") if t] if isinstance(to, str) else to,
         name,
         _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
         ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source),

@@ -10,6 +10,7 @@
     ├── GraphError              2  a node of the graph is wrong or cannot be converted
     │   └── UnsupportedOpError  2  an op that the op table does not hold
     ├── SignatureError          2  inputs and outputs cannot be given their roles
+    ├── ProfileError            2  a consumer (--for) cannot hold the policy
     ├── BundleError             2  a bundle is missing, incomplete or has been changed
     ├── ParityError             1  two runtimes disagree
     ├── RunFailedError          1  a runtime refused a model (converters/runtimes/process.py); verification reports it

@@ -197,9 +197,7 @@ class Console:
             details += [f"also called {', '.join(profile.aliases)}"] if profile.aliases else []
             click.echo(f"{'':{width}}  {'; '.join(details)}")
 
-    def next_step(
-        self, results: Sequence[ExportResult], names: str, targets: Sequence[str], profile: str | None = None
-    ) -> None:
+    def next_step(self, results: Sequence[ExportResult], names: str, profile: str | None = None) -> None:
         """What to do next, in a line or two."""
         if not results or self._silent or self.quiet:
             return
@@ -216,6 +214,7 @@ class Console:
                 f"next: put {files} of {last.folder} into the project, for the agent's Model    (docs/tasks/unity.md)"
             )
             return
+        targets = results[-1].sizes.keys()
         if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(targets):
             click.echo("note: Unity looks up other names: export for it with --for NAME    (--for help lists them)")
         folder = results[-1].folder

@@ -19,20 +19,6 @@ if TYPE_CHECKING:
     from exporter.verify.options import VerifyOptions
 
 
-class _Lazy(click.Option):
-    """An option whose default is a function, shown in the help all the same."""
-
-    def get_default(self, ctx: click.Context, call: bool = True) -> Any:
-        """What the function gives."""
-        return super().get_default(ctx, call=True)
-
-
-def _formats() -> str:
-    from converters.formats import DEFAULTS
-
-    return ",".join(DEFAULTS)
-
-
 @click.command("export")
 @click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="SOURCE...")
 @click.option(
@@ -46,11 +32,8 @@ def _formats() -> str:
 @click.option(
     "--to",
     "targets",
-    cls=_Lazy,
-    default=_formats,
-    show_default=True,
     metavar="FORMATS",
-    help="Formats to write; nn (Unity's Barracuda) is written on request.",
+    help="Formats to write: bytes, saved_model, tfjs, onnx, nn (default: all but nn, or what --for loads).",
 )
 @click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
@@ -59,7 +42,7 @@ def _formats() -> str:
     type=click.Choice(["canonical", "source"]),
     default="canonical",
     show_default=True,
-    help="Tensor names: canonical, or the trainer's own (Unity looks those up).",
+    help="Tensor names: canonical, or the trainer's own (as compare and old scripts know them).",
 )
 @click.option(
     "--noise",
@@ -73,7 +56,7 @@ def _formats() -> str:
 @trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
 @click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
-@click.option("--opset", type=int, default=15, show_default=True, help="ONNX opset.")
+@click.option("--opset", type=int, help="ONNX opset (default: 15).")
 @click.option(
     "--verify",
     "runtimes",
@@ -88,10 +71,10 @@ def _formats() -> str:
 def export_command(
     sources: tuple[Path, ...],
     out: Path,
-    targets: str,
+    targets: str | None,
     profile: str | None,
     name: str | None,
-    opset: int,
+    opset: int | None,
     runtimes: str,
     step: int | None,
     sensors: str,
@@ -111,7 +94,7 @@ def export_command(
     console.prepare(verifies=runtimes != "none")
     job = ExportOptions(
         out,
-        [t for t in targets.split(",") if t],
+        None if targets is None else [t for t in targets.split(",") if t],
         name,
         compiling,
         ReadOptions(step, shapes(sensors), trust_source),
@@ -128,7 +111,7 @@ def export_command(
             progress.clear()
             console.result(result)
     console.json({"policies": [_result_dict(r) for r in results]})
-    console.next_step(results, compiling.names, job.targets, profile)
+    console.next_step(results, compiling.names, profile)
     console.write_reports(lambda: _entries(results, options.steps))
     if any(r.passed is False for r in results):
         sys.exit(1)

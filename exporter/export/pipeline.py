@@ -46,15 +46,17 @@ class ExportOptions:
     """What ``export-model`` may be told; see the command line for the meaning of each."""
 
     out: Path = Path("exported")
-    targets: Sequence[str] = DEFAULTS
+    #: None: the usual ones, or what the consumer of ``profile`` loads
+    targets: Sequence[str] | None = None
     name: str | None = None
     compile: CompileOptions = field(default_factory=CompileOptions)
     read: ReadOptions = field(default_factory=ReadOptions)
-    opset: int = 15
+    #: None: 15, or the consumer's
+    opset: int | None = None
     verify: str | Sequence[str] = "auto"
     parity: VerifyOptions = field(default_factory=VerifyOptions)
     labels: Labels | None = None
-    #: the consumer that the files are made for (``--for``); its own formats where ``targets`` are the usual ones
+    #: the consumer that the files are made for (``--for``)
     profile: str | None = None
 
 
@@ -168,11 +170,10 @@ def _profile(name: str) -> Profile:
 
 def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     """What to write: ``--to``, or what the consumer of ``--for`` loads. Raises UsageError."""
-    targets = tuple(dict.fromkeys(options.targets))
+    usual = DEFAULTS if wanted is None else wanted.formats[:1]
+    targets = usual if options.targets is None else tuple(dict.fromkeys(options.targets))
     if wanted is None:
         return [written(target) for target in targets]
-    if targets == DEFAULTS:
-        targets = wanted.formats[:1]
     for target in targets:
         if written(target).key not in wanted.formats:
             raise UsageError(
@@ -192,6 +193,12 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
             why="the consumer decides the names",
             fix="leave --names out",
         )
+    if options.opset is not None:
+        raise UsageError(
+            f"--opset {options.opset} does not go with --for {wanted.name}",
+            why=f"the consumer decides the opset: {wanted.opset}",
+            fix="leave --opset out",
+        )
     return [written(target) for target in targets]
 
 
@@ -209,7 +216,9 @@ def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tupl
             job.policy, job.source, job.model, options.read, None if job.profile is None else job.profile.name
         )
         if job.profile is None:
-            how = WriteOptions(contract.compact(), options.opset)
+            how = WriteOptions(contract.compact())
+            if options.opset is not None:
+                how = replace(how, opset=options.opset)
             return contract, [f.artifact(job.policy, how) for f in formats]
         how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
         artifacts = [f.artifact(job.policy, how) for f in formats]
@@ -314,6 +323,8 @@ def verify_folder(
     made_for = contract.tool.get("profile")
     # What was made for a consumer, and for it alone, has names that only it knows: it is the consumer that is asked.
     asked = made_for is not None and not {"bytes", "nn"} & artefacts.keys()
+    if asked:
+        _check_asked(folder, artefacts, str(made_for), source, runtimes, options)
     reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if asked else found.graph_file)
     if "nn" in artefacts:
         from converters.barracuda.writer import contract_text
@@ -385,6 +396,31 @@ def _vetted(
                 path if found.vetted is None else found.vetted(path, signatures if found.signatures else names, folder)
             )
     return copies
+
+
+def _check_asked(
+    folder: Path,
+    artefacts: Mapping[str, Path],
+    made_for: str,
+    source: Path | None,
+    runtimes: str | Sequence[str],
+    options: VerifyOptions | None,
+) -> None:
+    """Raise where a bundle in a consumer's names lacks the file, or is to be compared with something."""
+    if "onnx" not in artefacts:
+        raise BundleError(
+            "has no file that its consumer loads",
+            where=str(folder),
+            why=f"it was made for {made_for}",
+            fix="export the policy again",
+        )
+    if source is not None or runtimes != "auto" or (options is not None and (options.golden or options.rules)):
+        raise UsageError(
+            f"a bundle that was made for {made_for} is asked of its consumer's checkers alone",
+            where=str(folder),
+            why="its names are the consumer's; its numbers were compared when it was exported",
+            fix="leave --source, --runtimes, --golden and --tolerances out, or export the policy again",
+        )
 
 
 def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Path]) -> Graph:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from exporter import export_model, verify_bundle
 from exporter.verify.checks.consumer import consumers
+from exporter.verify.options import VerifyOptions
 from fixtures import path as fixture
+from signatures.errors import UsageError
 
 
 @pytest.mark.parametrize(("name", "releases"), [("unity6", {"R22", "R23", "R23-2.4"}), ("barracuda-3", {"R20"})])
@@ -41,3 +44,20 @@ def test_a_bundle_for_everyone_asks_nobody(tmp_path: Path) -> None:
     assert result.report is not None
     assert not [c for c in result.report.comparisons if c.kind == "accepted"]
     assert "profile" not in result.contract["tool"]
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [{"source": fixture("recurrent")}, {"runtimes": "onnxruntime"}, {"options": VerifyOptions(golden=Path("x.npz"))}],
+)
+def test_what_its_checkers_cannot_answer_is_not_promised(asked: dict[str, Any], tmp_path: Path) -> None:
+    (result,) = export_model(fixture("recurrent"), tmp_path, for_="unity6", verify="none")
+    with pytest.raises(UsageError, match="checkers alone"):
+        verify_bundle(result.folder, **asked)
+
+
+@pytest.mark.parametrize("asked", [{"to": "bytes,saved_model,tfjs,onnx"}, {"opset": 15}])
+def test_what_the_consumer_decides_is_not_asked_in_vain(asked: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="does not go with --for unity6"):
+        export_model(fixture("continuous"), tmp_path, for_="unity6", verify="none", **asked)
+    assert not any(tmp_path.iterdir())
