@@ -27,3 +27,6 @@ class Policy:
     fetches: Mapping[str, str]
     source: SourceMap = field(default_factory=SourceMap)
     constants: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"<Policy {self.name!r}: {self.signature.flow}, {len(self.graph.nodes)} nodes>"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
 from signatures.errors import ParityError, UsageError
 from signatures.roles import Role, parse_role
+
+_LOG = logging.getLogger(__name__)
 
 
 def _roles(given: Mapping[str, str | Role] | None, flag: str) -> dict[str, Role]:
@@ -81,17 +84,42 @@ def export_model(
     strict: bool = True,
     for_: str | None = None,
 ) -> list[ExportResult]:
-    """Export every policy of a source to ``out/<policy>/``.
+    """Export every policy of a source to ``out/<policy>/``, and compare what was written in the runtimes that are here.
 
-    The source is one of: ``source``, one path or several; in a training script, ``session``, the tf.compat.v1.Session
-    that the policy was trained in; ``tf_function``, a tf.function that has an ``input_signature`` (or was traced once),
-    or a ConcreteFunction; ``keras_model``. Nothing of a live object is changed. Its policy is called ``policy``, or as
-    the function or the model is; ``name`` gives another.
+    What to export, exactly one of:
 
-    ``for_`` names the consumer that the files are made for (``--for``); ``to`` and ``opset`` are by default what it
-    loads, without it all formats but ``nn`` and opset 15. The other parameters are the flags of the
-    command line. Raises ExportModelError and its subclasses; ParityError (after everything is written) when formats
-    disagree and ``strict`` is set.
+    - ``source``: a path, or several.
+    - ``session``: the tf.compat.v1.Session that the policy was trained in; ``tf_function``: a tf.function that has an
+      ``input_signature`` (or was traced once), or a ConcreteFunction; ``keras_model``. Nothing of a live object is
+      changed. Its policy is called ``policy``, or as the function or the model is.
+
+    What to write:
+
+    - ``to``: formats, as a list or as ``"onnx,tfjs"`` (default: all but ``nn``, or what ``for_`` loads); ``for_``: the
+      consumer that the files are made for (``--for``).
+    - ``name``: the policy's name (of a single one); ``brain``: only this brain of a graph that holds several.
+    - ``names``: ``"canonical"``, or ``"source"`` for the trainer's own tensor names.
+    - ``noise``: noise drawn in the graph becomes an input (``"lift"``), stays (``"keep"``) or is removed (``"zero"``);
+      ``deterministic``: ``action`` is the one without chance.
+    - ``opset``: of ONNX (default: 15, or what ``for_`` loads); ``labels``: names for observations and actions, in a file
+      or a mapping.
+
+    How to read it:
+
+    - ``inputs``, ``outputs``: name → role, where it cannot be told from the graph; ``values``: placeholder → number.
+    - ``step``: a run's checkpoint (default: the newest); ``sensors``: shapes that a ``.pt`` does not tell.
+    - ``trust_source``: load a Keras model, which can run code.
+
+    How to verify:
+
+    - ``verify``: ``"auto"``, ``"full"``, ``"browser"``, ``"none"``, or runtimes by name.
+    - ``parity``: seed, samples, tolerances; ``strict``: raise ParityError, after everything is written, when formats
+      disagree. Without it the result says so: ``passed`` is False.
+
+    Raises ExportModelError and its subclasses::
+
+        (result,) = export_model("3DBall.bytes", "out", to="onnx,tfjs")
+        print(result.passed, result.folder, result.policy.signature.inputs)
     """
     options = ExportOptions(
         Path(out),
@@ -107,7 +135,10 @@ def export_model(
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, step) as sources:
-        results = list(export(sources, options))
+        results = []
+        for result in export(sources, options, _LOG.info):
+            results.append(result)
+            _LOG.info("%r", result)
     failed = [r for r in results if r.passed is False]
     if failed and strict:
         raise ParityError(
@@ -151,10 +182,12 @@ def inspect_model(
     sensors: Sequence[Sequence[int]] = (),
     trust_source: bool = False,
 ) -> Inspection:
-    """What is in a source: its policies with their signatures. Raises ExportModelError.
+    """What is in a source: its policies with their signatures. Nothing is written.
 
-    ``step`` asks for a checkpoint of a run's folder; the default is what an export would take. ``sensors`` are the
-    shapes that a ``.pt`` does not tell.
+    The parameters are those of ``export_model``. Raises ExportModelError::
+
+        for found in inspect_model("results/first_run").policies:
+            print(found.policy.name, found.policy.signature.inputs, found.targets)
     """
     options = _compile_options("canonical", "lift", False, brain, inputs, outputs, values)
     return inspect_source(source, options, ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source))
@@ -170,9 +203,17 @@ def verify_bundle(
     options: VerifyOptions | None = None,
     allow_unverified: bool = False,
 ) -> ParityReport:
-    """Verify a bundle again. Raises BundleError, RuntimeUnavailableError; a disagreement is ``passed`` False.
+    """Verify a bundle again: first the hashes of its files, then every format in the runtimes that are here.
 
-    ``step`` says which checkpoint of ``source`` it was exported from; the default is the step of the export.
+    - ``source``: what it was exported from, to compare with that; else its own ``.bytes`` is the reference. ``step``:
+      the checkpoint of the source (default: that of the export).
+    - ``runtimes``: ``"auto"``, ``"full"``, ``"browser"``, or runtimes by name; ``options``: seed, samples, tolerances.
+    - ``allow_unverified``: no error where no independent runtime is installed.
+
+    Raises BundleError, RuntimeUnavailableError; a disagreement is not raised, ``passed`` is False::
+
+        report = verify_bundle("out/3DBall", source="3DBall.bytes", runtimes=["onnxruntime"])
+        print(report.verdict, report.failures)
     """
     return verify_folder(
         Path(bundle),
@@ -182,4 +223,5 @@ def verify_bundle(
         runtimes=runtimes,
         options=options,
         allow_unverified=allow_unverified,
+        progress=_LOG.info,
     )

@@ -80,6 +80,9 @@ class Contract:
     tool: Mapping[str, str]
     files: Mapping[str, FileEntry] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"<Contract of {self.name!r} from {self.origin.path!r}: {self.signature.flow}>"
+
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json, or as embedded where there are no files."""
         files = {path: {"sha256": entry.sha256, "bytes": entry.size} for path, entry in self.files.items()}

@@ -41,6 +41,14 @@ class TensorSpec:
             entry["distribution"] = dict(self.distribution)
         return entry
 
+    def __repr__(self) -> str:
+        return f"<{self.name!r}: {self.role.value}, {self.dtype} {self.shape_text}>"
+
+    @property
+    def shape_text(self) -> str:
+        """The shape for people: ``[B, 8]``, B for the batch, ? for another axis that is free."""
+        return f"[{', '.join('?B'[i == 0] if n is None else str(n) for i, n in enumerate(self.shape))}]"
+
     @property
     def is_continuous(self) -> bool:
         """Whether an action is of numbers, not of choices."""
@@ -105,6 +113,14 @@ class PolicySignature:
     #: Names that people gave to observations and actions (signatures/labels.py); empty where they gave none.
     labels: Mapping[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"<PolicySignature {self.flow}: {self.family}, {self.action_space} actions>"
+
+    @property
+    def flow(self) -> str:
+        """What is observed and what is done, for people: ``'state' [B, 8] → 'action' [B, 2]``."""
+        return f"{_short(self.observations)} → {_short([head.spec for head in self.heads])}"
+
     def input(self, name: str) -> TensorSpec:
         """The input called ``name``; KeyError if there is none."""
         return _named(self.inputs, name)
@@ -166,6 +182,16 @@ class PolicySignature:
             "notes": list(self.notes),
             **({"labels": dict(self.labels)} if self.labels else {}),
         }
+
+
+def _short(specs: Sequence[TensorSpec]) -> str:
+    """The first of them, and how many more there are."""
+    shown = ", ".join(f"{_cut(s.name)!r} {s.shape_text}" for s in specs[:2])
+    return shown + (f" and {len(specs) - 2} more" if len(specs) > 2 else "")
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= 30 else f"{name[:29]}…"
 
 
 def _named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:

@@ -81,6 +81,9 @@ class Graph:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", by_name(self.nodes))
 
+    def __repr__(self) -> str:
+        return f"<Graph of {len(self.nodes)} nodes>"
+
     def __contains__(self, name: str) -> bool:
         return name in self._index
 

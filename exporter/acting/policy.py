@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from exporter.acting.generator import Generator, likeliest
+from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
@@ -35,6 +36,10 @@ class Decision:
     discrete: Array | None = None
     memory: Array | None = None
     outputs: Mapping[str, Array] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        parts = (("continuous", self.continuous), ("discrete", self.discrete), ("memory", self.memory))
+        return f"<Decision: {', '.join(f'{n} {a.dtype} {list(a.shape)}' for n, a in parts if a is not None)}>"
 
     @property
     def action(self) -> Array:
@@ -67,6 +72,9 @@ class LoadedPolicy:
         # A mean beside its spread is drawn from here, unless the graph has drawn already.
         spread = next((s for s in signature.outputs if s.role in (Role.STD, Role.LOG_STD)), None)
         self._spread = None if signature.noise or draws_itself else spread
+
+    def __repr__(self) -> str:
+        return f"<LoadedPolicy {self.name!r} in {self.runtime}: {self.signature.flow}>"
 
     def seed(self, seed: int) -> None:
         """Start the draws anew: the same seed gives the same actions for the same inputs, here and in policy.mjs."""
@@ -253,6 +261,9 @@ class Agent:
         self.policy, self.deterministic = policy, deterministic
         self._last: Decision | None = None
 
+    def __repr__(self) -> str:
+        return f"<Agent of {self.policy!r}, {'at the start' if self._last is None else f'last {self._last!r}'}>"
+
     def reset(self, agents: Sequence[int] | int | None = None) -> None:
         """An episode begins: for all, or for the agents with these numbers (their rows). Raises UsageError."""
         last = self._last
@@ -295,20 +306,38 @@ def _cleared(array: Array | None, rows: Array) -> Array | None:
     return copy
 
 
-def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0) -> LoadedPolicy:
-    """The policy of a bundle, to be run in this process.
+def load_policy(
+    source: Path | str, *, runtime: str | None = None, seed: int = 0, brain: str | None = None
+) -> LoadedPolicy:
+    """A policy that acts in this process.
 
-    ``runtime`` is ``onnxruntime`` (needs the bundle's ONNX and ``pip install 'export-model[onnxruntime]'``) or
-    ``numpy`` (needs its ``.bytes`` and nothing else; slower); without it, the first that is there. The file must be the
-    one that was exported, by its hash. Raises BundleError, RuntimeUnavailableError, UsageError.
+    - ``source``: a bundle, or anything that can be exported (an ``.onnx``, a ``.bytes``, a run's folder): that is
+      converted in memory, and nothing is written. ``brain`` chooses one of several policies in it.
+    - ``runtime``: ``onnxruntime`` (``pip install 'export-model[onnxruntime]'``; of a bundle it needs the ``.onnx``) or
+      ``numpy`` (of a bundle it needs the ``.bytes``; slower). Without it, the first that is there. A
+      bundle's file must be the one that was exported, by its hash.
+    - ``seed`` starts the draws: the same seed gives the same actions.
+
+    Raises BundleError, RuntimeUnavailableError, UsageError, and for a source what an export would raise::
+
+        policy = load_policy("exported/3DBall")
+        action = policy.decide(observation, deterministic=True).action
     """
+    if runtime not in (None, *RUNTIMES):
+        raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
+    path = Path(source)
+    if path.is_dir() and (path / POLICY).exists():
+        if brain is not None:
+            raise UsageError(f"brain={brain!r}", why="a bundle holds one policy", fix="leave brain out")
+        return _of_bundle(path, runtime, seed)
+    return _of_source(path, runtime, seed, brain)
+
+
+def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     from converters.bundle.bundle import Bundle
     from converters.formats import WRITTEN
 
-    found = Bundle.open(Path(bundle))
-    folder, name = found.folder, found.name
-    if runtime not in (None, *RUNTIMES):
-        raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
+    found = Bundle.open(folder)
     files = {"onnxruntime": found.path(WRITTEN["onnx"]), "numpy": found.path(WRITTEN["bytes"])}
     here = [r for r in RUNTIMES if files[r].is_file() and (r == "numpy" or importlib.util.find_spec(r) is not None)]
     if runtime is not None and runtime not in here:
@@ -323,19 +352,44 @@ def load_policy(bundle: Path | str, *, runtime: str | None = None, seed: int = 0
             fix="export the policy with --to bytes,onnx",
         )
     chosen = runtime or here[0]
-    found.verify_hashes(WRITTEN["onnx" if chosen == "onnxruntime" else "bytes"])
+    found.verify_hashes(WRITTEN[_TAKES[chosen]])
     source = found.contract.source
     kept = source.noise_kept and bool(source.noise)
-    return LoadedPolicy(name, found.signature, _RUNS[chosen](files[chosen]), chosen, seed, draws_itself=kept)
+    run = _RUNS[chosen](files[chosen].read_bytes())
+    return LoadedPolicy(found.name, found.signature, run, chosen, seed, draws_itself=kept)
 
 
-def _in_onnxruntime(file: Path) -> Run:
+def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) -> LoadedPolicy:
+    """A source's only policy, compiled and written in memory."""
+    from converters.format import WriteOptions
+    from converters.formats import WRITTEN
+    from converters.graph.options import CompileOptions
+    from exporter.export.sources import naming, read_source
+
+    policies = read_source(path).policies(CompileOptions(brain=brain))
+    if len(policies) != 1:
+        raise UsageError(
+            f"{path} holds {len(policies)} policies",
+            fix=f"choose one: brain=…, or export it and load a bundle ({', '.join(p.name for p in policies)})",
+        )
+    (policy,) = policies
+    chosen = runtime or next(r for r in RUNTIMES if r == "numpy" or importlib.util.find_spec(r) is not None)
+    if importlib.util.find_spec(chosen) is None:
+        raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
+    with naming(path):
+        artifact = WRITTEN[_TAKES[chosen]].artifact(policy, WriteOptions("{}"))
+        run = _RUNS[chosen](artifact.files[artifact.main])
+    kept = policy.source.noise_kept and bool(policy.source.noise)
+    return LoadedPolicy(policy.name, policy.signature, run, chosen, seed, draws_itself=kept)
+
+
+def _in_onnxruntime(model: bytes) -> Run:
     import onnxruntime  # noqa: TID251  the caller asked for a policy that acts
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # a policy is small: threads cost more than they bring
     options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
     def run(feeds: Mapping[str, Array], fetch: Sequence[str]) -> dict[str, Array]:
         return dict(zip(fetch, session.run(list(fetch), dict(feeds)), strict=True))
@@ -343,12 +397,14 @@ def _in_onnxruntime(file: Path) -> Run:
     return run
 
 
-def _in_numpy(file: Path) -> Run:
+def _in_numpy(model: bytes) -> Run:
     from converters.bundle.embed import read_runnable
     from converters.graph.run import run_graph
 
-    graph = read_runnable(file.read_bytes())
+    graph = read_runnable(model)
     return lambda feeds, fetch: run_graph(graph, feeds, fetch)
 
 
-_RUNS: Mapping[str, Callable[[Path], Run]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}
+_RUNS: Mapping[str, Callable[[bytes], Run]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}
+#: Runtime → the format that it runs.
+_TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}

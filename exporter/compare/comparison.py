@@ -9,6 +9,7 @@ is a failure that says what to map.
 from __future__ import annotations
 
 import difflib
+import logging
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -41,6 +42,7 @@ from signatures.roles import Role
 from signatures.sampling import draw_cases
 from signatures.spec import TensorSpec
 
+_LOG = logging.getLogger(__name__)
 Progress = Callable[[str], None]
 
 
@@ -88,8 +90,8 @@ class _Candidate:
 
 
 def compare_artefacts(
-    reference: Path,
-    candidates: Sequence[Path],
+    reference: Path | str,
+    candidates: Path | str | Sequence[Path | str],
     *,
     names: Mapping[str, str] | None = None,
     runtimes: str | Sequence[str] = "auto",
@@ -97,16 +99,27 @@ def compare_artefacts(
     understanding: CompileOptions | None = None,
     read: ReadOptions | None = None,
     allow_unverified: bool = False,
-    progress: Progress = lambda text: None,
+    progress: Progress = _LOG.info,
     pool: RuntimePool | None = None,
 ) -> ParityReport:
-    """Hold every candidate (and every format of one that is a bundle) against the reference.
+    """Compare files that any tool made with a reference; every format of a candidate that is a bundle takes part.
 
-    ``names`` maps a name of the reference to the candidates' name for it. Raises ExportModelError where a file cannot
-    be read, UsageError where a name of ``names`` is none, RuntimeUnavailableError where no runtime could run any.
+    - ``names``: a name of the reference → what the candidates call it.
+    - ``runtimes``: as in ``verify_bundle``; ``options``: seed, samples, tolerances.
+    - ``understanding``, ``read``: how to read the reference (the flags ``--input``, ``--output``, ``--step``, …).
+    - ``allow_unverified``: no error where none of the candidates' runtimes is installed.
+    - ``progress``: called with each step; the default logs them.
+
+    Raises ExportModelError where a file cannot be read, UsageError where a name of ``names`` is none,
+    RuntimeUnavailableError where no runtime could run any::
+
+        report = compare_artefacts("3DBall.bytes", "theirs.onnx", names={"action": "Identity"})
+        assert report.passed, report.failures
     """
+    reference = Path(reference)
+    given = [candidates] if isinstance(candidates, Path | str) else candidates
     policy, source = _reference(reference, understanding, read)
-    artefacts = [(path, *found) for path in candidates for found in ports_of(path)]
+    artefacts = [(path, *found) for path in map(Path, given) for found in ports_of(path)]
     if not artefacts:
         raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
     aliases = _mapped(_aliases(policy, reference), names or {}, [p for *_, p in artefacts])

@@ -70,6 +70,15 @@ class ExportResult:
     sizes: Mapping[str, int]
     report: ParityReport | None
 
+    def __repr__(self) -> str:
+        verdict = "not verified" if self.report is None else self.report.verdict
+        return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {str(self.folder)!r}>"
+
+    def _repr_html_(self) -> str:
+        from exporter.reports.notebook import notebook
+
+        return notebook(repr(self)) if self.report is None else notebook(repr(self)) + self.report._repr_html_()
+
     @property
     def contract(self) -> Mapping[str, Any]:
         """What every artefact embeds: policy.json without the hashes of the files."""

@@ -19,7 +19,7 @@ from exporter.export.sources import naming, read_source
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError
 from signatures.roles import Role
-from signatures.spec import TensorSpec
+from signatures.spec import PolicySignature, TensorSpec
 
 _FEED = {
     Role.VECTOR: "the agent's vector observation, as the environment gives it{normalised}",
@@ -53,6 +53,10 @@ class PolicyInspection:
     #: target → None where it can be written, else why not
     targets: Mapping[str, str | None]
 
+    def __repr__(self) -> str:
+        able = [target for target, reason in self.targets.items() if reason is None]
+        return f"<{self.policy.name!r}: {self.policy.signature.flow}; can be written as {', '.join(able) or 'nothing'}>"
+
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
         return {
@@ -75,6 +79,17 @@ class Inspection:
     policies: Sequence[PolicyInspection]
     #: (name, graph) of every model in it, as it was read
     graphs: Sequence[tuple[str, Graph]] = field(default_factory=tuple, repr=False)
+
+    def __repr__(self) -> str:
+        names = ", ".join(repr(p.policy.name) for p in self.policies[:4])
+        more = f" and {len(self.policies) - 4} more" if len(self.policies) > 4 else ""
+        return f"<Inspection of {str(self.path)!r}: {self.kind}, {names}{more}>"
+
+    def _repr_html_(self) -> str:
+        from exporter.reports.notebook import notebook
+
+        tables = [t for p in self.policies for t in _tables(p.policy.signature)]
+        return notebook(f"{self.path}: {self.kind}, {size_text(self.size)}", *tables)
 
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -142,11 +157,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
         layout = f" [{'|'.join(signature.memory.layout)}]" if signature.memory.layout else ""
         facts.append(f"memory {signature.memory.size}{layout}")
     lines = [f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}", ""]
-    rows = [_row(s, _feed(s, signature.preprocess.get(s.name, {}))) for s in signature.inputs]
-    lines.append(table(("input", "dtype", "shape", "in the source", "what to feed"), rows))
-    lines.append("")
-    rows = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
-    lines.append(table(("output", "dtype", "shape", "in the source", "meaning"), rows))
+    lines.append("\n\n".join(table(head, rows) for head, rows in _tables(signature)))
     lines += _label_lines(signature.labels)
     if signature.constants:
         lines += ["", "constants: " + ", ".join(f"{k}={v}" for k, v in signature.constants.items())]
@@ -156,6 +167,14 @@ def _policy_text(inspected: PolicyInspection) -> str:
     lines.append(f"can be written as: {', '.join(able) or 'nothing'}")
     lines += [f"cannot be written as {t}: {reason}" for t, reason in inspected.targets.items() if reason is not None]
     return "\n".join(lines)
+
+
+def _tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[list[str]]]]:
+    """Inputs with what to feed, and outputs with what they mean: head and rows of each."""
+    fed = [_row(s, _feed(s, signature.preprocess.get(s.name, {}))) for s in signature.inputs]
+    meant = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
+    middle = ("dtype", "shape", "in the source")
+    return [(("input", *middle, "what to feed"), fed), (("output", *middle, "meaning"), meant)]
 
 
 def _label_lines(labels: Mapping[str, Any]) -> list[str]:
@@ -181,10 +200,5 @@ def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
 
 
 def _row(spec: TensorSpec, text: str) -> list[str]:
-    shape = (
-        "["
-        + ", ".join("B" if i == 0 and n is None else "?" if n is None else str(n) for i, n in enumerate(spec.shape))
-        + "]"
-    )
     source = ", ".join(spec.source) if isinstance(spec.source, tuple) else spec.source or "(made here)"
-    return [spec.name, spec.dtype, shape, source, text]
+    return [spec.name, spec.dtype, spec.shape_text, source, text]

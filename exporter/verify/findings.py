@@ -103,6 +103,9 @@ class Finding:
     #: Where a disagreement begins; None where it was not looked for (nothing failed, or the reason says it all).
     bisection: Bisection | None = None
 
+    def __repr__(self) -> str:
+        return f"<{self.where}: {self.output} {self.cell()}, {'ok' if self.passed else 'FAIL'} [{self.kind}]>"
+
     @property
     def where(self) -> str:
         """The format and the runtime."""

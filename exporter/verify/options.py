@@ -22,7 +22,7 @@ class VerifyOptions:
     #: Other tolerances with their reasons (``--tolerances``); the last rule that covers a comparison decides.
     rules: Sequence[ToleranceRule] = ()
     #: Recorded samples (``--golden``, see exporter/verify/golden.py).
-    golden: Path | None = None
+    golden: Path | str | None = None
     #: The most bytes of a format, or of ``total`` (``--max-size``).
     budget: Mapping[str, int] = field(default_factory=dict)
 

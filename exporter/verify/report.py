@@ -6,7 +6,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from exporter.verify.findings import Finding
+from exporter.verify.findings import Failure, Finding
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """All findings on one format (of a SavedModel: one signature) in one runtime."""
+
+    format: str
+    runtime: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all of it agrees."""
+        return all(c.passed for c in self.findings)
+
+    @property
+    def worst_text(self) -> str:
+        """The largest difference with its output, of what failed where anything did; else what there is to say."""
+        told = [c for c in self.findings if not isinstance(c, Failure)]
+        worst = max(told, key=lambda c: (not c.passed, c.measured, c.max_abs_diff), default=None)
+        return "no answer" if worst is None else f"{worst.cell()} {worst.output}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +45,31 @@ class ParityReport:
     notes: tuple[str, ...] = ()
     #: No runtime reads the source by itself (a .nn): the formats were compared with this project's own reading of it.
     self_consistent: bool = False
+
+    def __repr__(self) -> str:
+        return f"<ParityReport {self.policy!r} {self.verdict}: {len(self.comparisons)} comparisons{self._worst}>"
+
+    def _repr_html_(self) -> str:
+        from exporter.reports.notebook import notebook
+
+        rows = [(p.format, p.runtime, "✓ ok" if p.passed else "✗ FAIL", p.worst_text) for p in self.pairs]
+        return notebook(f"{self.policy}: {self.verdict}", (("format", "runtime", "verdict", "worst |Δ|"), rows))
+
+    @property
+    def _worst(self) -> str:
+        """The largest difference and where, or how many disagree."""
+        if self.failures:
+            return f", {len(self.failures)} disagree"
+        worst = max((c for c in self.comparisons if c.measured), key=lambda c: c.max_abs_diff, default=None)
+        return "" if worst is None else f", worst |Δ| {worst.cell()} ({worst.output} of {worst.where})"
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        """What was found of each format in each runtime, in the order of the comparisons."""
+        groups: dict[tuple[str, str], list[Finding]] = {}
+        for c in self.comparisons:
+            groups.setdefault((c.format, c.runtime), []).append(c)
+        return tuple(Pair(kind, runtime, tuple(found)) for (kind, runtime), found in groups.items())
 
     @property
     def verdict(self) -> str:

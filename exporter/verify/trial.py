@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -31,7 +32,7 @@ class Trial:
     def __init__(self, tested: PolicyUnderTest, pool: RuntimePool, options: VerifyOptions) -> None:
         self.tested, self.pool, self.options = tested, pool, options
         self.signature = tested.signature
-        self.golden = Golden() if options.golden is None else read_golden(options.golden, self.signature)
+        self.golden = Golden() if options.golden is None else read_golden(Path(options.golden), self.signature)
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
         self.steps = self._rollout_feeds()

@@ -383,3 +383,22 @@ def test_a_file_that_was_changed_is_not_run(bundles: Bundles, tmp_path: Path) ->
     for runtime in ("onnxruntime", "numpy"):
         with pytest.raises(BundleError, match="continuous"):
             load_policy(folder, runtime=runtime)
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "numpy"])
+def test_a_source_acts_as_its_bundle_does(runtime: str, bundles: Bundles) -> None:
+    """An .onnx, and what anybody may have: converted in memory, nothing written."""
+    folder = bundles("recurrent")
+    want = load_policy(folder, runtime=runtime, seed=4)
+    feeds = observed(want)
+    for source in (folder / "recurrent.onnx", str(fixture("recurrent"))):
+        policy = load_policy(source, runtime=runtime, seed=4)
+        decision, expected = policy.decide(feeds, seed=4), want.decide(feeds, seed=4)
+        np.testing.assert_array_equal(decision.discrete, expected.discrete)
+        np.testing.assert_allclose(decision.memory, expected.memory, atol=1e-6)  # type: ignore[arg-type]
+
+
+def test_of_several_policies_one_is_chosen() -> None:
+    with pytest.raises(UsageError, match="holds 2 policies"):
+        load_policy(fixture("twobrains"))
+    assert load_policy(fixture("twobrains"), brain="StrikerBrain").signature.action_space == "continuous"

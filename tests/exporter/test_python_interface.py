@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import exporter
-from exporter import export_model, inspect_model, verify_bundle
+from exporter import export_model, inspect_model, load_policy, verify_bundle
 from exporter.export.pipeline import ExportResult
 from exporter.inspect.inspection import Inspection
 from exporter.verify.options import VerifyOptions
@@ -35,6 +35,7 @@ def test_the_package_offers_its_functions_and_its_version() -> None:
     functions = {"compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"}
     assert set(exporter.__all__) == {"__version__", *functions}
     assert all(hasattr(exporter, name) for name in exporter.__all__)
+    assert set(exporter.__all__) <= set(dir(exporter))
 
 
 def test_an_export_gives_a_list_of_results(tmp_path: Path) -> None:
@@ -190,3 +191,46 @@ def test_verifying_again_ends_with_status_1_too(tmp_path: Path) -> None:
     assert (ran.status, ran.err) == (1, "")
     assert "FAILED: " in ran.out
     assert command("verify", folder, "--json").json["reports"][0]["passed"] is False
+
+
+# ------------------------------------------------------------------ what a person sees of it
+
+
+def test_everything_that_comes_back_is_one_line_to_look_at(tmp_path: Path) -> None:
+    found = inspect_model(fixture("visual"))
+    (result,) = export_model(fixture("visual"), tmp_path, verify=["numpy"], to="bytes")
+    assert result.report is not None
+    acting = load_policy(result.folder)
+    agent = acting.agent()
+    feeds = {s.name: np.zeros([1, *(n or 1 for n in s.shape[1:])]) for s in acting.signature.observations}
+    policy = result.policy
+    shown = [found, *found.policies, result, result.report, policy, policy.graph, policy.signature, result.agreed]
+    shown += [*policy.signature.inputs, acting, agent, agent.decide(feeds), agent]
+    for thing in shown:
+        text = repr(thing)
+        assert "\n" not in text
+        assert len(text) < 250, text
+    assert repr(result).startswith("<ExportResult 'visual' not verified: bytes in ")
+    assert repr(found).startswith("<Inspection of ")
+    assert "'observation_0' [B, " in repr(policy)
+
+
+@pytest.mark.usefixtures("disagreeing")
+def test_a_notebook_shows_tables_of_escaped_text(tmp_path: Path) -> None:
+    (result,) = export_model(BALL, tmp_path / "<b>", strict=False)
+    html = result._repr_html_()
+    assert "✗" in html
+    assert "&lt;b&gt;" in html
+    assert html.count("<tr>") > len(ALL)
+    assert "normalised inside the policy" in inspect_model(BALL)._repr_html_()
+
+
+def test_steps_are_logged_and_nothing_is_printed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level("INFO", logger="exporter")
+    export_model(BALL, tmp_path, verify="none", to="onnx")
+    said = [r.getMessage() for r in caplog.records]
+    assert said[0] == f"reading {BALL}"
+    assert said[-1].startswith("<ExportResult 'continuous'")
+    assert capfd.readouterr() == ("", "")
