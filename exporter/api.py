@@ -101,8 +101,8 @@ def export_model(
     - ``names``: ``"canonical"``, or ``"source"`` for the trainer's own tensor names.
     - ``noise``: noise drawn in the graph becomes an input (``"lift"``), stays (``"keep"``) or is removed (``"zero"``);
       ``deterministic``: ``action`` is the one without chance.
-    - ``opset``: of ONNX (default: 15, or what ``for_`` loads); ``labels``: names for observations and actions, in a file
-      or a mapping.
+    - ``opset``: of ONNX (default: 15, or what ``for_`` loads); ``labels``: names of observations and actions, a file or
+      a mapping.
 
     How to read it:
 

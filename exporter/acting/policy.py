@@ -228,6 +228,7 @@ class LoadedPolicy:
                 discrete = self._discrete(head, outputs, deterministic)
                 if head.spec.role is Role.SAMPLED:
                     taken[head.name] = discrete
+                discrete = discrete.reshape(len(discrete), -1)  # other trainers give no axis for the one branch
         memory = self.signature.memory
         kept = None if memory is None or memory.output is None else outputs[memory.output]
         return Decision(continuous, discrete, kept, {**outputs, **taken})

@@ -402,3 +402,9 @@ def test_of_several_policies_one_is_chosen() -> None:
     with pytest.raises(UsageError, match="holds 2 policies"):
         load_policy(fixture("twobrains"))
     assert load_policy(fixture("twobrains"), brain="StrikerBrain").signature.action_space == "continuous"
+
+
+def test_a_trainer_that_gives_no_axis_of_branches_gets_one() -> None:
+    policy = load_policy(Path(fixture("continuous")).parent / "sb3" / "sb3_discrete.onnx", runtime="numpy")
+    decision = policy.decide(np.zeros((3, 4)))
+    assert decision.action.shape == (3, 1)

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("exporter", "converters", "signatures")
 #: Suffixes of what is in the packages beside modules: pages, scripts, schemas, templates of snippets.
-DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl"}
+DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl", ".typed"}
 #: What the packages of a base install may take together, in 10^6 bytes.
 LARGEST = 150
 #: Python's own, in every environment that has pip.
@@ -200,3 +200,42 @@ def test_what_can_be_verified_alone_is_called_not_verified(installed: Installed)
 def test_a_module_starts_it_too(installed: Installed) -> None:
     done = installed.run("python", "-m", "exporter", "--version")
     assert (done.returncode, done.stdout.splitlines()[0].split()[-1]) == (0, __version__)
+
+
+# ------------------------------------------------------------------ types
+
+PROGRAM = """
+from pathlib import Path
+import numpy as np
+from exporter import export_model, inspect_model, load_policy, verify_bundle
+
+names: list[str] = [p.policy.name for p in inspect_model("3DBall.bytes").policies]
+(result,) = export_model(Path("3DBall.bytes"), "out", to="onnx,bytes", strict=False)
+passed: bool | None = verify_bundle(result.folder, runtimes=["onnxruntime"]).passed
+shape: tuple[int, ...] = load_policy("out/3DBall").decide(np.zeros(8)).action.shape
+reveal_type(result.sizes)
+export_model("3DBall.bytes", opset="15")
+"""
+
+
+def test_a_program_that_uses_it_is_checked_by_mypy(installed: Installed) -> None:
+    """The wheel's own types: what is right passes strictly, what is wrong is found."""
+    (installed.scratch / "program.py").write_text(PROGRAM)
+    python = str(installed.scripts / "python")
+    mypy = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--python-executable",
+        python,
+        "--cache-dir",
+        "mypy",
+        "program.py",
+    ]
+    hidden = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "MYPYPATH")}
+    done = subprocess.run(mypy, cwd=installed.scratch, env=hidden, capture_output=True, encoding="utf-8", check=False)
+    errors = [line for line in done.stdout.splitlines() if "error:" in line]
+    assert len(errors) == 1, done.stdout
+    assert "program.py:11" in errors[0] and "opset" in errors[0]
+    assert "Mapping[str, int]" in done.stdout
