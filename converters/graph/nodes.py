@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.types import TensorType
 from signatures.errors import GraphError
 
 #: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
@@ -55,15 +56,17 @@ def ref(name: str, index: int = 0) -> str:
 
 def split_ref(reference: str) -> tuple[str, int]:
     """(node name, output index) of a reference; ``"a:0"`` and ``"a"`` are the same tensor."""
-    name, colon, index = reference.rpartition(":")
-    if colon and index.isascii() and index.isdigit() and len(index) < 10:
+    if ":" not in reference:  # nearly all
+        return reference, 0
+    name, _, index = reference.rpartition(":")
+    if index.isascii() and index.isdigit() and len(index) < 10:
         return name, int(index)
     return reference, 0
 
 
 def node_of(reference: str) -> str:
     """The name of the node that a reference points to."""
-    return split_ref(reference)[0]
+    return split_ref(reference)[0] if ":" in reference else reference
 
 
 def normal_ref(reference: str) -> str:
@@ -77,6 +80,8 @@ class Graph:
 
     nodes: tuple[Node, ...]
     _index: dict[str, Node] = field(init=False, repr=False, compare=False)
+    #: what ``shapes.infer_types`` found, by its ``partial``: half of the passes ask for it
+    inferred: dict[bool, dict[str, TensorType]] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", by_name(self.nodes))
@@ -166,6 +171,9 @@ def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
     dangling inputs and on a name that stands twice.
     """
     checked_inputs(nodes)
+    if _is_ordered(nodes):
+        by_name(nodes)
+        return tuple(nodes)
     index = by_name(nodes)
     state: dict[str, int] = {}  # 1 = being visited, 2 = done
     ordered: list[Node] = []
@@ -196,6 +204,17 @@ def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
                 state[name] = 2
                 ordered.append(node)
     return tuple(ordered)
+
+
+def _is_ordered(nodes: Sequence[Node]) -> bool:
+    """Whether every node stands behind those that it reads; a Merge may make it say no."""
+    seen: set[str] = set()
+    for node in nodes:
+        for reference in node.inputs:
+            if node_of(reference) not in seen:
+                return False
+        seen.add(node.name)
+    return True
 
 
 class NameScope:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -30,6 +29,12 @@ def infer_types(graph: Graph, *, partial: bool = False) -> Types:
     unrolling. Otherwise they raise UnsupportedOpError, as unknown ops always do. Raises GraphError where shapes
     contradict each other.
     """
+    if partial not in graph.inferred:
+        graph.inferred[partial] = _inferred(graph, partial)
+    return dict(graph.inferred[partial])
+
+
+def _inferred(graph: Graph, partial: bool) -> Types:
     types: Types = {}
     symbols = Symbols()
     for node in graph.nodes:
@@ -88,13 +93,19 @@ def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols
 
 def _elements(kind: TensorType) -> int:
     """Elements of a tensor; an axis that is free counts as one."""
-    return math.prod(abs(d) for d in kind.shape or () if isinstance(d, int))
+    count = 1
+    for length in kind.shape or ():
+        if isinstance(length, int):
+            count *= abs(length)
+    return count
 
 
 def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> None:
     """Raise GraphError where a result is larger than any policy's, before anything of that size is allocated."""
     largest = max(map(_elements, results), default=0)
-    if largest > max(MAX_ELEMENTS, max(map(_elements, args), default=0) if node.op != "Placeholder" else 0):
+    if largest <= MAX_ELEMENTS:
+        return
+    if node.op == "Placeholder" or largest > max(map(_elements, args), default=0):
         raise GraphError(
             f"node {node.name!r} ({node.op}) makes a tensor of {largest} elements",
             why=f"no policy has one of more than {MAX_ELEMENTS} per row",

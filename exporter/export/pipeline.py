@@ -122,7 +122,7 @@ def export(
         wanted = None
     if not formats:
         raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
-    runtimes, known = chosen_runtimes(options.verify, formats)
+    runtimes, known = ((), []) if options.verify == "none" else chosen_runtimes(options.verify, formats)
     if runtimes:
         check_budget(options.parity.budget, {f.key: 0 for f in formats})
     labels = read_labels(options.labels)
