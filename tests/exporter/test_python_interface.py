@@ -184,7 +184,7 @@ def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("disagreeing")
 def test_verifying_again_ends_with_status_1_too(tmp_path: Path) -> None:
-    command(BALL, "-o", tmp_path, "--verify", "none")
+    command(BALL, "-o", tmp_path)
     folder = tmp_path / "continuous.failed"
     assert folder.is_dir()
     ran = command("verify", folder, "--source", BALL)
