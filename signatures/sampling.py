@@ -34,6 +34,14 @@ class Case:
     feeds: dict[str, np.ndarray]
     batch: int
 
+    def flushed(self) -> dict[str, np.ndarray] | None:
+        """The feeds as a processor sees them that takes denormals for zero, None where there are none."""
+        tiny = np.finfo(np.float32).tiny
+        denormal = {n: (a != 0) & (np.abs(a) < tiny) for n, a in self.feeds.items() if a.dtype == np.float32}
+        if not any(d.any() for d in denormal.values()):
+            return None
+        return {n: np.where(denormal[n], 0, a).astype(a.dtype) if n in denormal else a for n, a in self.feeds.items()}
+
 
 #: A memory far from zero, in its standard deviations: what an LSTM's cell may reach.
 _FAR_MEMORY = 5.0

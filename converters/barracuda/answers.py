@@ -14,6 +14,7 @@ from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
 from converters.barracuda.lower import HEADS, INPUT_NAMES, base_name
 from converters.barracuda.writer import CONTRACT_KEY
+from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node
 from converters.graph.passes.noise import samplers
 from converters.graph.passes.normalise import normalise
@@ -58,7 +59,7 @@ class NnPolicy:
         self._places = {n.name: n for n in self.graph.nodes if n.op == "Placeholder"}
         self._samplers = [n.name for n in samplers(self.graph)]
 
-    def run(self, feeds: Arrays, fetch: Sequence[str], jitter: np.random.Generator | None = None) -> dict[str, Array]:
+    def run(self, feeds: Arrays, fetch: Sequence[str], jitter: Jitter | None = None) -> dict[str, Array]:
         """Outputs by their names in the contract."""
         placed = self._placed(feeds)
         specs = [self.signature.output(name) for name in fetch]

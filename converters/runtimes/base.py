@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from converters.graph.jitter import Arithmetic
 
 Progress = Callable[[str], None]
 
@@ -35,6 +39,8 @@ class Runtime:
     install: Callable[[Progress], object] | None = None
     #: It computes by itself; numpy is this project's own.
     independent: bool = True
+    #: How it approximates functions (converters/graph/jitter.py).
+    arithmetic: Arithmetic = "processor"
     #: ``auto`` takes it where it is installed; a browser is started only when it is asked for (``full`` or by name).
     automatic: bool = True
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.

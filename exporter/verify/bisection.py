@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,16 +32,21 @@ from signatures.errors import ExportModelError
 #: Bytes of expected values that one fetch may ask for: what a runtime holds and sends at a time.
 FETCH_BYTES = 64 << 20
 
+#: What rounding explains of a tensor of a graph, for inputs.
 Rounding = Callable[[Graph, Feeds, str], np.ndarray]
 
 
 class Bisector:
     """Bisects the failures of one policy. ``agrees`` says whether a graph, run by the numpy kernels, is right;
-    ``rounding`` what rounding explains of a tensor of it.
+    ``rounding`` what it explains, in a runtime, of a tensor of a graph for inputs.
     """
 
     def __init__(
-        self, tested: PolicyUnderTest, pool: RuntimePool, agrees: Callable[[Graph], bool], rounding: Rounding
+        self,
+        tested: PolicyUnderTest,
+        pool: RuntimePool,
+        agrees: Callable[[Graph], bool],
+        rounding: Callable[[str, Graph, Feeds, str], np.ndarray],
     ) -> None:
         self.tested, self.pool = tested, pool
         self._agrees, self._rounding = agrees, rounding
@@ -64,7 +70,8 @@ class Bisector:
         if graph is None:
             return Bisection(None, reason="no graph at hand computes what the reference does")
         try:
-            search = _Search(graph, self._within(participant), feeds, tolerance, self._rounding, self._source)
+            rounding = partial(self._rounding, participant.runtime)
+            search = _Search(graph, self._within(participant), feeds, tolerance, rounding, self._source)
             return search.first(output, branch)
         except (ExportModelError, OSError) as error:
             why = getattr(error, "why", None)

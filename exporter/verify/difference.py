@@ -66,13 +66,14 @@ def compare(
     difference = np.abs(a - b)
     if free is not None:
         difference = np.where(free, 0.0, difference)
-    with np.errstate(over="ignore"):  # beside a reference of zero; it is bounded below
-        relative = difference / np.maximum(np.abs(b), np.finfo(np.float64).tiny)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        # Beside a reference of nearly zero the tolerance is what a difference is relative to.
+        relative = difference / np.maximum(np.abs(b), tolerance.atol)
     bound = tolerance.atol + tolerance.rtol * np.abs(b) if reference.dtype.kind == "f" else np.zeros_like(b)
     if rounding is not None:
         bound = np.maximum(bound, rounding)
     passed = bool((difference <= bound).all())
-    worst_relative = float(np.where(difference > 0, np.minimum(relative, 1e30), 0.0).max())
+    worst_relative = float(np.where(difference > 0, relative, 0.0).max())
     explained = 0.0 if rounding is None else float(rounding.reshape(-1)[int(difference.argmax())])
     needed = difference / (1 + np.abs(b))
     if rounding is not None:
@@ -111,18 +112,24 @@ def floored(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
-def ties(scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance) -> np.ndarray:
-    """[B, branches]: where the two best scores of a branch are too close for the argmax to be decided."""
+def ties(
+    scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | None = None
+) -> np.ndarray:
+    """[B, branches]: where the two best scores of a branch are too close for the argmax to be decided.
+
+    Each of the two may be off by the tolerance, or by what ``rounding`` explains of it.
+    """
     columns = []
     start = 0
     for size in branches:
         part = scores[:, start : start + size].astype(np.float64)
+        moved = np.zeros(part.shape) if rounding is None else rounding[:, start : start + size]
         start += size
         if size < 2:
             columns.append(np.zeros(part.shape[0], bool))
             continue
         top = np.sort(part, axis=1)[:, -2:]
-        margin = 2 * (tolerance.atol + tolerance.rtol * np.abs(top[:, 1]))
+        margin = 2 * np.maximum(tolerance.atol + tolerance.rtol * np.abs(top[:, 1]), moved.max(axis=1))
         with np.errstate(invalid="ignore"):
             columns.append(~(top[:, 1] - top[:, 0] > margin))
     return np.stack(columns, axis=1)

@@ -1,56 +1,94 @@
 """What rounding explains of a difference: Monte Carlo arithmetic in the numpy kernels.
 
-A difference is rounding if it is at most ``FACTOR`` times what moving every intermediate result by one unit in its last
-place makes, the largest of ``RUNS``. It matters for inputs of 1e3, for long sums and where a formula cancels; elsewhere
-the default tolerance is larger.
+A difference is rounding if it is at most ``FACTOR`` times what moving every intermediate result as far as rounding, or
+the runtime's approximation of a function, may move it makes (converters/graph/jitter.py), the largest of ``RUNS``. It
+matters for inputs of 1e3, for long sums, where a formula cancels, and where a memory carries it from step to step;
+elsewhere the default tolerance is larger.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
 from converters.runtimes.process import LoadedModel, RunFailedError
+from converters.runtimes.registry import RUNTIMES
 from exporter.verify.difference import row_steps
 from exporter.verify.participants import Feeds
 from signatures.sampling import Case
 
 FACTOR = 4
 RUNS = 6
+_ARITHMETIC = {r.name: r.arithmetic for r in RUNTIMES}
 
-Settled = Callable[[Feeds], dict[str, np.ndarray]]
+Arrays = dict[str, np.ndarray]
+Run = Callable[[Feeds], Arrays]
+#: One run after the other, each fed what the one before answered (``Trial.rolled``).
+Rolled = Callable[[Run], list[Arrays]]
 
 
 class Rounding:
-    """What rounding explains of a policy's outputs and inner tensors; ``settled`` gives values as they are compared."""
+    """What rounding explains of a policy's outputs and inner tensors; ``settled`` gives values as they are compared.
 
-    def __init__(self, seed: int, names: Sequence[str], settled: Settled) -> None:
+    Everything is per output, element by element (the largest of a row counts for all of it), for the runtime that is
+    asked about. Where the model itself does not run nothing is explained: that it does not is reported as its own
+    failure.
+    """
+
+    def __init__(self, seed: int, names: Sequence[str], settled: Callable[[Feeds], Arrays]) -> None:
         self._jitters = [seed * RUNS + run for run in range(RUNS)]
         self._names, self._settled = list(names), settled
-        self._known: dict[str, dict[str, np.ndarray]] = {}
+        self._known: dict[tuple[str, str], list[Arrays]] = {}
 
-    def outputs(self, model: LoadedModel, case: Case) -> dict[str, np.ndarray]:
-        """Per output, element by element (the largest of a row counts for all of it), by the numpy child's ``model``.
+    def outputs(self, model: LoadedModel, case: Case, runtime: str) -> Mapping[str, np.ndarray]:
+        """Of the numpy child's ``model`` for one input."""
+        found = self._measured(model, lambda run: [run(case.feeds)], case.name, runtime, self._names)
+        return found[0] if found else {}
 
-        Nothing is explained where the model itself does not run: that it does not is reported as its own failure.
-        """
-        if case.name not in self._known:
-            try:
-                exact = self._settled(model.run(case.feeds, self._names))
-                moved = [self._settled(model.run(case.feeds, self._names, jitter=j)) for j in self._jitters]
-            except RunFailedError:
-                exact, moved = {}, []
-            self._known[case.name] = {n: _largest(exact[n], [m[n] for m in moved]) for n in exact}
-        return self._known[case.name]
+    def steps(
+        self, model: LoadedModel, rolled: Rolled, memory: str, number: int, runtime: str
+    ) -> Mapping[str, np.ndarray]:
+        """Of step ``number`` with ``memory`` fed back: what every step before it made is carried along."""
+        found = self._measured(model, rolled, "", runtime, list(dict.fromkeys([*self._names, memory])))
+        return found[number] if found else {}
 
-    def inner(self, graph: Graph, feeds: Feeds, tensor: str) -> np.ndarray:
-        """The same for a tensor inside ``graph``, in this process."""
+    def inner(self, runtime: str, graph: Graph, feeds: Feeds, tensor: str) -> np.ndarray:
+        """Of a tensor inside ``graph``, in this process."""
         exact = run_graph(graph, feeds, [tensor])[tensor]
-        moved = [run_graph(graph, feeds, [tensor], np.random.default_rng(j))[tensor] for j in self._jitters]
+        arithmetic = _ARITHMETIC.get(runtime, "processor")
+        moved = [run_graph(graph, feeds, [tensor], Jitter(j, arithmetic))[tensor] for j in self._jitters]
         return _largest(exact, moved)
+
+    def _measured(
+        self, model: LoadedModel, rolled: Rolled, name: str, runtime: str, names: Sequence[str]
+    ) -> list[Arrays]:
+        arithmetic = _ARITHMETIC.get(runtime, "processor")
+        if (name, arithmetic) not in self._known:
+            try:
+                exact = [self._settled(each) for each in rolled(lambda feeds: model.run(feeds, names))]
+                moved = [self._moved(model, rolled, jitter, arithmetic, names) for jitter in self._jitters]
+            except RunFailedError:
+                exact, moved = [], []
+            self._known[name, arithmetic] = [
+                {n: _largest(step[n], [m[i][n] for m in moved]) for n in step} for i, step in enumerate(exact)
+            ]
+        return self._known[name, arithmetic]
+
+    def _moved(
+        self, model: LoadedModel, rolled: Rolled, jitter: int, arithmetic: str, names: Sequence[str]
+    ) -> list[Arrays]:
+        count = 0
+
+        def run(feeds: Feeds) -> Arrays:
+            nonlocal count
+            count += 1  # no step's chance is another's
+            return model.run(feeds, names, jitter=[jitter, count], arithmetic=arithmetic)
+
+        return [self._settled(each) for each in rolled(run)]
 
 
 def _largest(exact: np.ndarray, moved: Sequence[np.ndarray]) -> np.ndarray:

@@ -47,6 +47,7 @@ class Trial:
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
         self.rounding = Rounding(self.options.seed, numbers, self._settled)
         self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
+        self._flushed: dict[str, Arrays] = {}
 
     def drawn(self, name: str, participant: Participant) -> bool:
         """Whether the reference or the participant draws an output: there is no number to compare then."""
@@ -58,26 +59,39 @@ class Trial:
         return found or tolerance_for(self.signature, output, self.options.tolerance)
 
     def difference(
-        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, case: Case | None = None
+        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, at: Case | int | None = None
     ) -> Difference:
-        """``got`` beside the reference's answer; what rounding explains for ``case`` is looked at where it matters."""
-        found = self._compared(name, expected, got, participant, None)
-        if case is None or found.passed or found.reason or got.dtype.kind != "f":
+        """``got`` beside the reference's answer. What rounding explains is looked at where it matters, for an input or
+        a step of the rollout.
+        """
+        found = self._compared(name, expected, got, participant)
+        if at is None or found.passed or found.reason:
             return found
-        return self._compared(
-            name, expected, got, participant, self.rounding.outputs(self.reference.model, case).get(name)
-        )
+        if isinstance(at, Case) and (flushed := at.flushed()) is not None:
+            if at.name not in self._flushed:
+                self._flushed[at.name] = self.reference.answers(flushed)
+            if (other := self._compared(name, self._flushed[at.name], got, participant)).passed:
+                return other
+        return self._compared(name, expected, got, participant, self._explained(at, participant))
+
+    def _explained(self, at: Case | int, participant: Participant) -> Feeds:
+        """Per output, what rounding explains of it."""
+        if isinstance(at, Case):
+            return self.rounding.outputs(self.reference.model, at, participant.runtime)
+        memory = self.signature.memory
+        assert memory is not None and memory.output is not None
+        return self.rounding.steps(self.reference.model, self.rolled, memory.output, at, participant.runtime)
 
     def _compared(
-        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: np.ndarray | None
+        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: Feeds | None = None
     ) -> Difference:
         return compare(
             self._settled(expected)[name],
             self._settled({name: got})[name],
             self.tolerance(name, participant),
-            free=self._ties(name, expected, participant),
+            free=self._ties(name, expected, participant, rounding or {}),
             narrowed=narrows(participant.format),
-            rounding=rounding,
+            rounding=None if rounding is None or got.dtype.kind != "f" else rounding.get(name),
         )
 
     def bisected(
@@ -145,7 +159,7 @@ class Trial:
             for n, a in values.items()
         }
 
-    def _ties(self, name: str, expected: Feeds, participant: Participant) -> np.ndarray | None:
+    def _ties(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
         """Where an argmax is not decided, because the scores of the reference are too close."""
         spec = self.signature.output(name)
         if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
@@ -153,7 +167,9 @@ class Trial:
         scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
         if scores is None or scores not in expected:
             return None
-        found = ties(expected[scores], self.signature.branches, self.tolerance(scores, participant))
+        found = ties(
+            expected[scores], self.signature.branches, self.tolerance(scores, participant), rounding.get(scores)
+        )
         return found if found.shape == expected[name].shape else None
 
     def _rollout_feeds(self) -> list[Arrays]:

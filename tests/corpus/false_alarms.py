@@ -37,10 +37,10 @@ def genuine_files(folder: Path = GENUINE) -> list[Path]:
     return [*frozen, *sorted(folder.glob("*/*.nn")), *sorted(folder.glob("*/*.onnx"))]
 
 
-def verified(source: Path, seed: int, pool: RuntimePool) -> list[ParityReport]:
+def verified(source: Path, seed: int, pool: RuntimePool, runtimes: str = "auto") -> list[ParityReport]:
     """The reports on the policies of one file."""
     with tempfile.TemporaryDirectory() as scratch:
-        options = ExportOptions(Path(scratch), parity=VerifyOptions(seed=seed))
+        options = ExportOptions(Path(scratch), verify=runtimes, parity=VerifyOptions(seed=seed))
         return [r.report for r in export([source], options, pool=pool) if r.report is not None]
 
 
@@ -49,7 +49,7 @@ def alarms(report: ParityReport) -> list[str]:
     return failure_lines(report) if report.passed is not None else ["  not verified"]
 
 
-def measured(sources: Sequence[Path], seeds: Sequence[int]) -> Iterator[dict[str, object]]:
+def measured(sources: Sequence[Path], seeds: Sequence[int], runtimes: str = "auto") -> Iterator[dict[str, object]]:
     """One record per file and seed, seed by seed."""
     with RuntimePool() as pool:
         for seed in seeds:
@@ -57,7 +57,7 @@ def measured(sources: Sequence[Path], seeds: Sequence[int]) -> Iterator[dict[str
                 start = time.monotonic()
                 where = "/".join(source.parts[-2:])
                 try:
-                    reports = verified(source, seed, pool)
+                    reports = verified(source, seed, pool, runtimes)
                     found, refused = [line for report in reports for line in alarms(report)], None
                     count = sum(len(r.comparisons) for r in reports)
                 except SourceError as error:
@@ -71,6 +71,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.corpus.false_alarms", description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="how many seeds, from 0 on")
     parser.add_argument("--only", default="", help="only files whose path holds this")
+    parser.add_argument("--runtimes", default="auto", help="as --verify: only these, comma-separated")
     parser.add_argument("--records", type=Path, metavar="FILE", help="write a JSON record per file and seed here")
     options = parser.parse_args()
     sources = [s for s in genuine_files() if options.only in str(s)]
@@ -80,7 +81,7 @@ def main() -> int:
     runs = comparisons = wrong = 0
     refused: set[str] = set()
     seconds = 0.0
-    for record in measured(sources, range(options.seeds)):
+    for record in measured(sources, range(options.seeds), options.runtimes):
         runs += 1
         comparisons += int(str(record["comparisons"]))
         seconds += float(str(record["seconds"]))

@@ -8,11 +8,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 import pytest
 
 from converters.frozen_graph.reader import read_graph
+from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
@@ -52,7 +52,7 @@ class Actor:
     def run(self, feeds: Mapping[str, Array], fetch: Sequence[str], **request: Any) -> Tensors:
         self.process.must_live()
         jitter = request.get("jitter")
-        generator = None if jitter is None else np.random.default_rng(jitter)
+        generator = None if jitter is None else Jitter(jitter)
         try:
             answer = run_graph(self.graph, feeds, list(fetch), generator)
         except KeyError as error:

@@ -36,6 +36,11 @@ def test_the_bound_is_absolute_plus_relative(reference: float) -> None:
     assert far.reason == ""
 
 
+def test_beside_nothing_a_difference_is_relative_to_the_tolerance() -> None:
+    assert compare(floats(0.0), floats(2e-5), PLAIN).max_rel == pytest.approx(2)
+    assert compare(floats(4.0), floats(5.0), PLAIN).max_rel == pytest.approx(0.25)
+
+
 def test_the_relative_part_is_of_the_reference() -> None:
     assert compare(floats(1000.0), floats(1000.005), PLAIN).passed
     assert not compare(np.array([0.0]), np.array([0.005]), PLAIN).passed
@@ -45,10 +50,6 @@ def test_the_relative_part_is_of_the_reference() -> None:
 def test_the_worst_element_counts() -> None:
     difference = compare(floats(1, 2, 3), floats(1, 2.5, 3), PLAIN)
     assert (difference.max_abs, difference.max_rel, difference.passed) == (0.5, 0.25, False)
-
-
-def test_a_relative_difference_from_zero_is_finite() -> None:
-    assert compare(floats(0), floats(1), PLAIN).max_rel == 1e30
 
 
 def test_nothing_is_equal_to_nothing() -> None:
@@ -97,6 +98,12 @@ def test_integers_are_equal_or_not() -> None:
     assert not compare(a, b, Tolerance(5, 5)).passed
     assert compare(a, b, PLAIN, free=np.array([[False, True]])).passed
     assert not compare(a, b, PLAIN, free=np.array([[True, False]])).passed
+
+
+def test_a_choice_is_free_where_rounding_may_turn_it() -> None:
+    scores = floats(1.0, 1.001)[None]
+    assert ties(scores, (2,), PLAIN).tolist() == [[False]]
+    assert ties(scores, (2,), PLAIN, np.full((1, 2), 6e-4)).tolist() == [[True]]
 
 
 def test_rounding_takes_the_place_of_a_smaller_tolerance() -> None:

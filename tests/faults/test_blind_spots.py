@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,11 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.report import ParityReport
 from exporter.verify.statistics import FALSE_ALARM
+from exporter.verify.tolerances import Tolerance
 from exporter.verify.verification import verify
 from fixtures import path as fixture
 from tests.faults.artefacts import FORMATS, opened
+from tests.handmade import constant, graph_bytes, node, placeholder
 
 Arrays = dict[str, npt.NDArray[Any]]
 #: What it was fed and what it answers → what it says instead.
@@ -32,22 +35,29 @@ KNOWN = tuple(RuntimeInfo(name, True, "1.0", "") for name in ("numpy", "onnxrunt
 
 
 def verified(
-    name: str, tmp_path: Path, pool: RuntimePool, spoil: Spoil, feeding: Callable[[Feeds], Feeds] = lambda feeds: feeds
+    source: str | Path,
+    tmp_path: Path,
+    pool: RuntimePool,
+    spoil: Spoil,
+    feeding: Callable[[Feeds], Feeds] = lambda feeds: feeds,
+    options: VerifyOptions | None = None,
+    running: Callable[[LoadedModel, Feeds, Any], Arrays] = LoadedModel.run,
 ) -> ParityReport:
-    """The report on a fixture in the numpy kernels, and in a runtime of which ``spoil`` is what is wrong with it."""
-    (result,) = export([fixture(name)], ExportOptions(tmp_path / "out", verify="none"))
+    """The report on a policy in the numpy kernels, and in a runtime of which ``spoil`` is what is wrong with it."""
+    source = fixture(source) if isinstance(source, str) else source
+    (result,) = export([source], ExportOptions(tmp_path / "out", verify="none"))
     policy = result.policy
-    file = result.folder / f"{name}.bytes"
+    file = result.folder / f"{policy.name}.bytes"
     tested = PolicyUnderTest(policy.name, policy.signature, policy.graph, {}, {}, file)
 
     def participants(numpy: LoadedModel, failed: object) -> Iterator[Participant]:
         def run(feeds: Feeds, fetch: Any) -> Arrays:
-            return spoil(feeds, dict(numpy.run(feeding(feeds), fetch)))
+            return spoil(feeds, dict(running(numpy, feeding(feeds), fetch)))
 
         outputs = [s.name for s in policy.signature.outputs]
         yield Participant("onnx", "onnxruntime", run, outputs, numpy)
 
-    return verify(tested, ("numpy", "onnxruntime"), KNOWN, pool, VerifyOptions(), participants=participants)
+    return verify(tested, ("numpy", "onnxruntime"), KNOWN, pool, options or VerifyOptions(), participants=participants)
 
 
 def honest(feeds: Feeds, answers: Arrays) -> Arrays:
@@ -69,6 +79,39 @@ def where(rows: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]) -> Spoil:
 def test_without_a_fault_all_is_well(name: str, tmp_path: Path, processes: RuntimePool) -> None:
     report = verified(name, tmp_path, processes, honest)
     assert report.passed is True, [f.explanation() for f in report.failures]
+
+
+@pytest.mark.parametrize("name", ["recurrent", "sampled"])
+def test_what_rounding_makes_of_every_step_is_no_fault(name: str, tmp_path: Path, processes: RuntimePool) -> None:
+    """A runtime that rounds all it computes otherwise, held to 30 times less than it can be expected to reach."""
+    strict = VerifyOptions(tolerance=Tolerance(1e-9, 1e-9))
+    run, count = LoadedModel.run, itertools.count()
+
+    def rounded(model: LoadedModel, feeds: Feeds, fetch: Any) -> Arrays:
+        return run(model, feeds, fetch, jitter=[77, next(count)])
+
+    report = verified(name, tmp_path, processes, honest, options=strict, running=rounded)
+    assert report.passed is True, [f.explanation() for f in report.failures]
+    assert any(f.rounding for f in report.comparisons)
+
+
+def test_a_denormal_that_is_taken_for_zero_is_no_fault(tmp_path: Path, processes: RuntimePool) -> None:
+    nodes = [
+        *(placeholder("vector_observation"), constant("zero", 0.0)),
+        node("seen", "NotEqual", "vector_observation", "zero", T=np.float32),
+        node("action", "Cast", "seen", SrcT=np.bool_, DstT=np.float32),
+    ]
+    source = tmp_path / "seen.bytes"
+    source.write_bytes(graph_bytes(nodes))
+
+    def flushed(feeds: Feeds) -> Feeds:
+        return {n: np.where(np.abs(a) < np.finfo(np.float32).tiny, 0, a).astype(a.dtype) for n, a in feeds.items()}
+
+    def ones(feeds: Feeds) -> Feeds:
+        return {n: np.where(np.abs(a) < np.finfo(np.float32).tiny, 1, a).astype(a.dtype) for n, a in feeds.items()}
+
+    assert verified(source, tmp_path, processes, honest, flushed).passed is True
+    assert verified(source, tmp_path, processes, honest, ones).passed is False  # zeros are zeros
 
 
 REGIONS = {
@@ -157,9 +200,9 @@ def test_weights_that_were_rounded_are_met_where_outputs_hardly_vary(
     from exporter.export.pipeline import verify_folder
 
     graph = schema.parse(schema.GraphDef, fixture("continuous").read_bytes(), "GraphDef")
-    for node in graph.node:
-        value = node.attr["value"].tensor
-        if node.op == "Const" and len(value.tensor_shape.dim) == 2:
+    for each in graph.node:
+        value = each.attr["value"].tensor
+        if each.op == "Const" and len(value.tensor_shape.dim) == 2:
             value.CopyFrom(from_array((to_array(value) * np.float32(1e-3)).astype(np.float32)))
     source = tmp_path / "small.bytes"
     source.write_bytes(schema.serialise(graph))

@@ -12,6 +12,7 @@ import shutil
 import sys
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from converters.runtimes.base import Runtime, RuntimeInfo
 from converters.runtimes.javascript.node import (
@@ -24,6 +25,9 @@ from converters.runtimes.javascript.node import (
     package_version,
 )
 from signatures.errors import RuntimeUnavailableError
+
+if TYPE_CHECKING:
+    from converters.graph.jitter import Arithmetic
 
 CHROMIUM_VARIABLE = "EXPORT_MODEL_CHROMIUM"
 """The environment variable that names Chromium's program; it goes before every other place."""
@@ -93,13 +97,15 @@ def _command(name: str) -> list[str]:
     return [node, script, "--runtime", name, "--modules", str(js_home()), "--chromium", chromium]
 
 
-def _runtime(name: str, kind: str, *packages: str) -> Runtime:
+def _runtime(name: str, kind: str, *packages: str, arithmetic: Arithmetic = "processor") -> Runtime:
     find, command = partial(_find, name, packages), partial(_command, name)
-    return Runtime(name, (kind,), find, command, install_packages, automatic=False, confined=False)
+    return Runtime(
+        name, (kind,), find, command, install_packages, automatic=False, confined=False, arithmetic=arithmetic
+    )
 
 
 RUNTIMES = (
-    _runtime("tfjs-webgl", "tfjs", _TFJS),
+    _runtime("tfjs-webgl", "tfjs", _TFJS, arithmetic="graphics"),
     _runtime("tfjs-cpu@chromium", "tfjs", _TFJS),
     _runtime("tfjs-wasm@chromium", "tfjs", _TFJS, _TFJS_WASM),
     _runtime("onnxruntime-web@chromium", "onnx", _ORT),

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from converters.bundle.embed import read_runnable, runnable
+from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
@@ -27,8 +28,7 @@ class _Model:
         self.graph = graph
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        jitter = request.get("jitter")
-        return run_graph(self.graph, feeds, fetch, None if jitter is None else np.random.default_rng(jitter))
+        return run_graph(self.graph, feeds, fetch, _jitter(request))
 
 
 class _NnModel:
@@ -38,8 +38,12 @@ class _NnModel:
         self.policy = NnPolicy(data)
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        jitter = request.get("jitter")
-        return self.policy.run(feeds, fetch, None if jitter is None else np.random.default_rng(jitter))
+        return self.policy.run(feeds, fetch, _jitter(request))
+
+
+def _jitter(request: Mapping[str, Any]) -> Jitter | None:
+    seed = request.get("jitter")
+    return None if seed is None else Jitter(seed, request.get("arithmetic", "processor"))
 
 
 def _load(header: Mapping[str, Any]) -> _Model | _NnModel:

@@ -28,7 +28,10 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
     got = trial.rolled(step)
     names = [n for n in participant.outputs if n in trial.expected_steps[0] and not trial.drawn(n, participant)]
     steps = {
-        n: [trial.difference(n, e, g[n], participant) for e, g in zip(trial.expected_steps, got, strict=True)]
+        n: [
+            trial.difference(n, e, g[n], participant, i)
+            for i, (e, g) in enumerate(zip(trial.expected_steps, got, strict=True))
+        ]
         for n in names
     }
     where = [f"step {i + 1} of {len(fed)}" for i in range(len(fed))]
