@@ -7,6 +7,7 @@
     ├── SourceError             2  the source cannot be read
     │   ├── NotAPolicyError     2  it is readable, but it is not a policy (or not what the reader was asked for)
     │   └── DamagedFileError    2  it is cut off, empty, or breaks its own format
+    ├── RefusedError            2  of several sources, some could not be exported
     ├── GraphError              2  a node of the graph is wrong or cannot be converted
     │   └── UnsupportedOpError  2  an op that the op table does not hold
     ├── SignatureError          2  inputs and outputs cannot be given their roles
@@ -80,6 +81,21 @@ class NotAPolicyError(SourceError):
 
 class DamagedFileError(SourceError):
     """The source is empty, cut off, or breaks the rules of its own format."""
+
+
+class RefusedError(ExportModelError):
+    """Of several sources, some could not be exported; the others were. ``errors`` has one for each."""
+
+    def __init__(self, errors: Sequence[ExportModelError], count: int) -> None:
+        self.errors = tuple(errors)
+        super().__init__(
+            f"{len(errors)} of {count} sources could not be exported; the others were",
+            why="\n".join(e.message for e in errors),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the base, with the errors."""
+        return {**super().to_dict(), "errors": [e.to_dict() for e in self.errors]}
 
 
 class GraphError(ExportModelError):

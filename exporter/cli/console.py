@@ -140,7 +140,7 @@ class Console:
             return
         signature = result.policy.signature
         click.echo(f"{result.policy.name}: {signature.family}, {signature.action_space} actions -> {result.folder}")
-        self._notes(signature.notes)
+        self._notes(result.notes)
         if result.report is not None:
             self._report(result.report)
             return

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from exporter.export.pipeline import ExportResult
     from exporter.reports.entry import Entry
     from exporter.verify.options import VerifyOptions
+    from signatures.errors import ExportModelError
 
 
 @click.command("export")
@@ -104,15 +105,25 @@ def export_command(
         labels,
         profile,
     )
-    results = []
+    results: list[ExportResult] = []
+    refused: list[ExportModelError] = []
     with console.progress() as progress:
-        for result in export(list(sources), job, progress):
+
+        def refuse(error: ExportModelError) -> None:
+            refused.append(error)
+            progress.clear()
+            click.echo(f"error: {error.message}", err=True)
+
+        for result in export(list(sources), job, progress, refused=refuse):
             results.append(result)
             progress.clear()
             console.result(result)
-    console.json({"policies": [_result_dict(r) for r in results]})
+    told = {"refused": [e.to_dict() for e in refused]} if refused else {}
+    console.json({"policies": [_result_dict(r) for r in results], **told})
     console.next_step(results, compiling.names, profile)
     console.write_reports(lambda: _entries(results, options.steps))
+    if refused:
+        sys.exit(2)
     if any(r.passed is False for r in results):
         sys.exit(1)
 

@@ -37,24 +37,24 @@ def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
     return content
 
 
-def labelled(policies: Sequence[Policy], labels: Mapping[str, Any] | None) -> list[Policy]:
-    """The policies with ``labels`` in their contracts; without any, as they are.
+def labelled(policy: Policy, labels: Mapping[str, Any] | None) -> Policy:
+    """The policy with ``labels`` in its contract; without any, as it is.
 
     Labels of several policies stand under ``policies``, by name; else they must fit every one. Raises UsageError.
     """
+    if labels is not None and "policies" in labels:
+        named = labels["policies"]
+        if not isinstance(named, Mapping) or len(labels) > 1:
+            raise UsageError("labels: 'policies' stands alone and holds the labels by policy", fix="see docs/acting.md")
+        labels = named.get(policy.name)
     if labels is None:
-        return list(policies)
-    if "policies" not in labels:
-        return [_with(policy, labels) for policy in policies]
-    named = labels["policies"]
-    if not isinstance(named, Mapping) or len(labels) > 1:
-        raise UsageError("labels: 'policies' stands alone and holds the labels by policy", fix="see docs/acting.md")
-    known = [p.name for p in policies]
-    for name in named:
-        if name not in known:
-            raise UsageError(f"labels: there is no policy {name!r}", fix=f"there are {', '.join(known)}")
-    return [_with(p, named[p.name]) if p.name in named else p for p in policies]
-
-
-def _with(policy: Policy, labels: Any) -> Policy:
+        return policy
     return replace(policy, signature=replace(policy.signature, labels=checked(labels, policy.signature)))
+
+
+def check_labels(labels: Mapping[str, Any] | None, policies: Sequence[str]) -> None:
+    """Raise UsageError where there are labels for a policy that is none of these."""
+    named = (labels or {}).get("policies")
+    for name in named if isinstance(named, Mapping) else ():
+        if name not in policies:
+            raise UsageError(f"labels: there is no policy {name!r}", fix=f"there are {', '.join(policies)}")

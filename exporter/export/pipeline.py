@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -20,7 +21,8 @@ from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
-from exporter.export.labels import Labels, labelled, read_labels
+from exporter.export.labels import Labels, check_labels, labelled, read_labels
+from exporter.export.names import Names
 from exporter.export.sources import Source, naming, read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.inner_tensors import saved_graph
@@ -32,7 +34,14 @@ from exporter.verify.tolerances import check_rules
 from exporter.verify.verification import verify
 from exporter.version import __version__
 from signatures.contract import PARITY, POLICY, Contract, Origin, parse, safe_name
-from signatures.errors import BundleError, RuntimeUnavailableError, SignatureError, UsageError
+from signatures.errors import (
+    BundleError,
+    ExportModelError,
+    RefusedError,
+    RuntimeUnavailableError,
+    SignatureError,
+    UsageError,
+)
 from signatures.fields import FieldError, printable
 
 if TYPE_CHECKING:
@@ -69,6 +78,8 @@ class ExportResult:
     agreed: Contract
     sizes: Mapping[str, int]
     report: ParityReport | None
+    #: why it has another name than its source's, where it has
+    renamed: str | None = None
 
     def __repr__(self) -> str:
         verdict = "not verified" if self.report is None else self.report.verdict
@@ -83,6 +94,11 @@ class ExportResult:
     def contract(self) -> Mapping[str, Any]:
         """What every artefact embeds: policy.json without the hashes of the files."""
         return self.agreed.to_dict()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the policy."""
+        return (*self.policy.signature.notes, *([] if self.renamed is None else [self.renamed]))
 
     @property
     def passed(self) -> bool | None:
@@ -100,6 +116,98 @@ class _Job:
     profile: Profile | None = None
     #: the policy under its own names, where ``policy`` has those of a consumer
     own: Policy | None = None
+    #: why it has another name than its source's
+    note: str | None = None
+
+
+class Exporter:
+    """Exports sources, one at a time, with options that were checked when it was made: what they choose is kept.
+
+    Raises UsageError and RuntimeUnavailableError where the options cannot be had.
+    """
+
+    def __init__(self, options: ExportOptions) -> None:
+        self.options = options
+        wanted = None if options.profile is None else _profile(options.profile)
+        self._formats = _formats(options, wanted)
+        undressed = wanted is not None and all(f.key in wanted.undressed for f in self._formats)
+        self._profile = None if undressed else wanted
+        if not self._formats:
+            raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
+        self.runtimes, self._known = (
+            ((), []) if options.verify == "none" else chosen_runtimes(options.verify, self._formats)
+        )
+        if self.runtimes:
+            check_budget(options.parity.budget, {f.key: 0 for f in self._formats})
+        self._labels = read_labels(options.labels)
+
+    def check(self, paths: Sequence[Path | str | Source], progress: Progress) -> None:
+        """Raise UsageError where names in ``--labels`` or ``--tolerances`` are nobody's: all sources are compiled ahead
+        for it, where there are such names. What cannot be compiled is left to ``export``.
+        """
+        rules = self.options.parity.rules if self.runtimes else ()
+        if not rules and "policies" not in (self._labels or {}):
+            return
+        names, outputs = Names(), dict[str, list[str]]()
+        for path in paths:
+            with contextlib.suppress(ExportModelError):
+                for job in self.compiled(path, names, progress):
+                    outputs[job.policy.name] = [s.name for s in job.policy.signature.outputs]
+        check_rules(rules, outputs, {f.key: f.runtimes for f in self._formats}, self.runtimes)
+        check_labels(self._labels, list(outputs))
+
+    def compiled(self, path: Path | str | Source, names: Names, progress: Progress) -> list[_Job]:
+        """The policies of a source, under the names that they will have. Raises ExportModelError."""
+        options, wanted = self.options, self._profile
+        progress(f"reading {path.path if isinstance(path, Source) else path}")
+        source = path if isinstance(path, Source) else read_source(path, options.read)
+        found = list(source.compiled(options.compile))
+        if options.name is not None:
+            if len(found) > 1:
+                raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
+            found = [(model, replace(policy, name=options.name)) for model, policy in found]
+        jobs = []
+        for model, policy in found:
+            name, note = names.claim(source.path, safe_name(policy.name))
+            own = replace(policy, name=name)
+            dressed = labelled(own if wanted is None else wanted.dress(own), self._labels)
+            jobs.append(_Job(source, model, dressed, wanted, None if wanted is None else own, note))
+        return jobs
+
+    def export(
+        self, path: Path | str | Source, names: Names, pool: RuntimePool, progress: Progress
+    ) -> Iterator[ExportResult]:
+        """Export every policy of a source; all of them are compiled before the first is written."""
+        jobs = self.compiled(path, names, progress)
+        for job in jobs:
+            bundle.check_replaceable(self.options.out / job.policy.name)
+        for job, contract, artifacts in [(j, *_write(j, self._formats, self.options)) for j in jobs]:
+            yield self._verified(job, contract, artifacts, pool, progress)
+
+    def _verified(
+        self, job: _Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool, progress: Progress
+    ) -> ExportResult:
+        """The bundle of a policy, verified and put in its place."""
+        options, policy = self.options, job.policy
+        with (
+            bundle.staged(options.out / policy.name, contract, artifacts) as stage,
+            tempfile.TemporaryDirectory() as scratch,
+        ):
+            report = None
+            if self.runtimes:
+                tested = _tested(job, stage, artifacts, Path(scratch))
+                report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
+                if job.own is not None:
+                    plain = replace(job, policy=job.own, profile=None)
+                    under = _tested_in(plain, self._formats, Path(scratch) / "own")
+                    rules = replace(options.parity, rules=(), golden=None, budget={})
+                    report = _joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
+                with bundle.writing(options.out):
+                    (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
+            failed = report is not None and report.passed is False
+            place = options.out / (f"{policy.name}.failed" if failed else policy.name)
+            bundle.put_in_place(stage, place)
+        return ExportResult(policy, place, contract, {a.format.key: a.size for a in artifacts}, report, job.note)
 
 
 def export(
@@ -107,68 +215,35 @@ def export(
     options: ExportOptions,
     progress: Progress = lambda text: None,
     pool: RuntimePool | None = None,
+    refused: Callable[[ExportModelError], None] | None = None,
 ) -> Iterator[ExportResult]:
-    """Export every policy of every source, one after the other; a path is read, a Source was read already.
+    """Export every policy of every source, one after the other; a path is read (once, if it is given twice), a Source
+    was read already.
 
-    All sources are read and compiled before the first is written, so a bad one leaves nothing behind. Raises
-    ExportModelError; a disagreement is in the result, not an exception. A ``pool`` that is given stays open, for
-    callers that export many times.
+    A source that is refused does not stop the others: ``refused`` is told, by default the errors of all are raised in
+    the end (``RefusedError`` where there are several sources). A disagreement is in the result, not an exception. A
+    ``pool`` that is given stays open, for callers that export many times.
     """
     if not paths:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
-    wanted = None if options.profile is None else _profile(options.profile)
-    formats = _formats(options, wanted)
-    if wanted is not None and all(f.key in wanted.undressed for f in formats):
-        wanted = None
-    if not formats:
-        raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
-    runtimes, known = ((), []) if options.verify == "none" else chosen_runtimes(options.verify, formats)
-    if runtimes:
-        check_budget(options.parity.budget, {f.key: 0 for f in formats})
-    labels = read_labels(options.labels)
-    jobs: list[_Job] = []
-    origins: list[tuple[str, str]] = []
-    for path in paths:
-        progress(f"reading {path.path if isinstance(path, Source) else path}")
-        source = path if isinstance(path, Source) else read_source(path, options.read)
-        compiled = list(source.compiled(options.compile))
-        named = _named([policy for _, policy in compiled], options, len(paths))
-        dressed = [p if wanted is None else wanted.dress(p) for p in named]
-        jobs.extend(
-            _Job(source, model, p, wanted, None if wanted is None else own)
-            for (model, _), p, own in zip(compiled, dressed, named, strict=True)
-        )
-        origins.extend((p.name, f"{source.path} ({own.name})") for p, (_, own) in zip(named, compiled, strict=True))
-    bundle.distinct_names(origins)
-    jobs = [replace(j, policy=p) for j, p in zip(jobs, labelled([j.policy for j in jobs], labels), strict=True)]
-    if runtimes:
-        outputs = {j.policy.name: [s.name for s in j.policy.signature.outputs] for j in jobs}
-        check_rules(options.parity.rules, outputs, {f.key: f.runtimes for f in formats}, runtimes)
-    for job in jobs:
-        bundle.check_replaceable(options.out / job.policy.name)
-    made = [(j, *_write(j, formats, options)) for j in jobs]
+    if options.name is not None and len(paths) > 1:
+        raise UsageError("--name goes with a single policy", fix="export one source, or leave --name out")
+    paths = list({id(p) if isinstance(p, Source) else Path(p): p for p in paths}.values())
+    exporter, names = Exporter(options), Names()
+    exporter.check(paths, progress)
+    errors: list[ExportModelError] = []
     with nullcontext(pool) if pool is not None else RuntimePool() as pool:
-        for job, contract, artifacts in made:
-            policy = job.policy
-            with (
-                bundle.staged(options.out / policy.name, contract, artifacts) as stage,
-                tempfile.TemporaryDirectory() as scratch,
-            ):
-                report = None
-                if runtimes:
-                    tested = _tested(job, stage, artifacts, Path(scratch))
-                    report = verify(tested, runtimes, known, pool, options.parity, progress)
-                    if job.own is not None:
-                        plain = replace(job, policy=job.own, profile=None)
-                        under = _tested_in(plain, formats, Path(scratch) / "own")
-                        rules = replace(options.parity, rules=(), golden=None, budget={})
-                        report = _joined(report, verify(under, runtimes, known, pool, rules, progress))
-                    with bundle.writing(options.out):
-                        (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
-                failed = report is not None and report.passed is False
-                place = options.out / (f"{policy.name}.failed" if failed else policy.name)
-                bundle.put_in_place(stage, place)
-            yield ExportResult(policy, place, contract, {a.format.key: a.size for a in artifacts}, report)
+        for path in paths:
+            try:
+                yield from exporter.export(path, names, pool, progress)
+            except ExportModelError as error:
+                if len(paths) == 1:
+                    raise
+                errors.append(error)
+                if refused is not None:
+                    refused(error)
+    if errors and refused is None:
+        raise RefusedError(errors, len(paths))
 
 
 def _profile(name: str) -> Profile:
@@ -209,14 +284,6 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
             fix="leave --opset out",
         )
     return [written(target) for target in targets]
-
-
-def _named(policies: list[Policy], options: ExportOptions, sources: int) -> list[Policy]:
-    if options.name is not None:
-        if len(policies) > 1 or sources > 1:
-            raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
-        policies = [replace(policies[0], name=options.name)]
-    return [replace(p, name=safe_name(p.name)) for p in policies]
 
 
 def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tuple[Contract, list[Artifact]]:

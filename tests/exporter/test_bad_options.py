@@ -14,7 +14,7 @@ from exporter import export_model as export_by_python
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import Tolerance
 from fixtures import path as fixture
-from signatures.errors import UsageError
+from signatures.errors import RefusedError, UsageError
 from tests.commands import export_model, files_in, is_refused, python
 from tests.handmade import continuous_policy, graph_bytes
 
@@ -221,14 +221,30 @@ def test_an_output_folder_that_is_a_file_is_refused(ball: Path, tmp_path: Path) 
     assert (tmp_path / "out").read_text() == "mine"
 
 
-def test_two_sources_whose_names_fall_together_are_refused(ball: Path, tmp_path: Path) -> None:
-    for name in ("BALL.bytes", "ball!.bytes", "ball-.bytes"):
-        shutil.copyfile(ball, tmp_path / "source" / name)
-    before = files_in(tmp_path)
-    upper, shout, dash = (tmp_path / "source" / n for n in ("BALL.bytes", "ball!.bytes", "ball-.bytes"))
-    is_refused(export_model(ball, upper, "-o", tmp_path / "out", "--verify", "none"), ball, upper, "--name")
-    is_refused(export_model(shout, dash, "-o", tmp_path / "out", "--verify", "none"), shout, dash)
-    assert files_in(tmp_path) == before
+def test_two_policies_of_one_name_are_both_written_and_it_is_said(ball: Path, tmp_path: Path) -> None:
+    for place in ("BALL.bytes", "runs/ball.bytes"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        shutil.copyfile(ball, tmp_path / place)
+    upper, other = tmp_path / "BALL.bytes", tmp_path / "runs" / "ball.bytes"
+    ran = export_model(ball, upper, other, "-o", tmp_path / "out", "--verify", "none")
+    assert ran.status == 0, ran.err
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["Ball", "runs-ball", f"{tmp_path.name}-BALL"]
+    assert f"note: called runs-ball: ball is the policy of {ball}" in ran.out
+
+
+def test_a_source_that_is_refused_does_not_stop_the_others(ball: Path, tmp_path: Path) -> None:
+    bad, gone = tmp_path / "bad.bytes", tmp_path / "gone.bytes"
+    bad.write_bytes(b"\x89PNG")
+    ran = export_model(bad, ball, gone, "-o", tmp_path / "out", "--verify", "none")
+    assert ran.status == 2
+    assert (str(bad) in ran.err, str(gone) in ran.err) == (True, True)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == [ball.stem]
+    answer = export_model(bad, ball, gone, "-o", tmp_path / "out", "--verify", "none", "--json").json
+    assert [e["where"] for e in answer["refused"]] == [str(bad), str(gone)]
+    assert [p["name"] for p in answer["policies"]] == [ball.stem]
+    with pytest.raises(RefusedError, match="2 of 3 sources") as caught:
+        export_by_python([bad, ball, gone], tmp_path / "out", verify="none")
+    assert len(caught.value.errors) == 2
 
 
 AS_NOBODY = """

@@ -427,7 +427,7 @@ def test_a_terminal_is_cleared_of_progress_before_a_result(
     assert capsys.readouterr().out.startswith("continuous: ")
 
 
-def test_the_same_source_twice_is_written_once_more_and_not_refused(tmp_path: Path) -> None:
+def test_the_same_source_twice_is_written_once(tmp_path: Path) -> None:
     ran = export_model(BALL, BALL, "-o", tmp_path, *UNVERIFIED)
     assert ran.status == 0
     assert {p.name for p in tmp_path.iterdir()} == {"continuous"}
