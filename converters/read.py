@@ -16,7 +16,7 @@ from signatures.contract import POLICY
 from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
 #: What only some sources have a use for: option, flag, and what to give to have one.
-_TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"))
+_TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"), ("activation", "a state dictionary"))
 
 
 def fetched(path: Path) -> tuple[Fetched, Format]:

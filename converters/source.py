@@ -68,9 +68,12 @@ class SourceModel:
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
     """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
-    order, images C, H, W (empty: as far as the source tells); whether a source may be loaded that runs what it says.
+    order, lists of entities [most, numbers], images C, H, W (empty: as far as the source tells); whether a source may
+    be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers.
     """
 
     step: int | None = None
     sensors: tuple[tuple[int, ...], ...] = ()
     trust_source: bool = False
+    goals: tuple[int, ...] = ()
+    activation: str | None = None

@@ -77,6 +77,8 @@ def export_model(
     step: int | None = None,
     sensors: Sequence[Sequence[int]] = (),
     trust_source: bool = False,
+    goals: Sequence[int] = (),
+    activation: str | None = None,
     opset: int | None = None,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
@@ -126,7 +128,7 @@ def export_model(
         [t for t in to.split(",") if t] if isinstance(to, str) else to,
         name,
         _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
-        ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source),
+        ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation),
         opset,
         verify,
         parity or VerifyOptions(),
@@ -181,6 +183,8 @@ def inspect_model(
     step: int | None = None,
     sensors: Sequence[Sequence[int]] = (),
     trust_source: bool = False,
+    goals: Sequence[int] = (),
+    activation: str | None = None,
 ) -> Inspection:
     """What is in a source: its policies with their signatures. Nothing is written.
 
@@ -190,7 +194,9 @@ def inspect_model(
             print(found.policy.name, found.policy.signature.inputs, found.targets)
     """
     options = _compile_options("canonical", "lift", False, brain, inputs, outputs, values)
-    return inspect_source(source, options, ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source))
+    return inspect_source(
+        source, options, ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation)
+    )
 
 
 def verify_bundle(

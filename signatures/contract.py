@@ -56,6 +56,8 @@ class Origin:
     model: str | None = None
     step: int | None = None
     sensors: tuple[tuple[int, ...], ...] = ()
+    goals: tuple[int, ...] = ()
+    activation: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json."""
@@ -66,6 +68,10 @@ class Origin:
             content["step"] = self.step
         if self.sensors:
             content["sensors"] = [list(shape) for shape in self.sensors]
+        if self.goals:
+            content["goals"] = list(self.goals)
+        if self.activation is not None:
+            content["activation"] = self.activation
         return content
 
 
@@ -130,6 +136,8 @@ def parse(content: Any) -> Contract:
         None if source["model"].missing else source["model"].text(blank=True),
         None if source["step"].missing else source["step"].integer(-(2**63)),
         tuple(tuple(n.integer(1) for n in shape.items(8)) for shape in source["sensors"].items(1000)),
+        tuple(n.integer(0) for n in source["goals"].items(1000)),
+        None if source["activation"].missing else source["activation"].text(),
     )
     files = {_key(path, entry): _file(entry) for path, entry in whole["files"].members().items()}
     made = {key: tool[key].text() for key in ("name", "version")}

@@ -10,6 +10,7 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nn.activations import clip
+from converters.graph.nn.linear import matmul
 from converters.graph.nn.recurrent import lstm
 from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32
@@ -54,11 +55,11 @@ class Network(Builder):
     # ------------------------------------------------------------------ layers
 
     def linear(self, x: str, module: str, out: int | None = None) -> str:
-        """``nn.Linear``: x·Wᵀ + b."""
+        """``nn.Linear``: x·Wᵀ + b over the last axis."""
         self.at(module)
         weight = self.state.array(f"{module}.weight", out, self.width(x))
         bias = self.state.array(f"{module}.bias", len(weight))
-        product = self.add("MatMul", [x, self.const(weight.T.copy(), "kernel")])
+        product = matmul(self, x, self.const(weight.T.copy(), "kernel"))
         return self.add("BiasAdd", [product, self.const(bias, "bias")])
 
     def normalised(self, x: str, module: str) -> str:
@@ -134,14 +135,18 @@ class Network(Builder):
         spread = self.add("Mul", [noise, self.add("Exp", [log_sigma])])
         return mean, self.add("Add", [mean, spread]), conditional
 
-    def branch(self, x: str, module: str, masks: str, start: int, *, twice: bool) -> str:
+    def branch(self, x: str, module: str, masks: str, start: int, *, twice: bool, preview: bool = False) -> str:
         """The probabilities of one branch of ``MultiCategoricalDistribution``, [B, actions].
 
-        Masked logits become −1e8 (masks: 1 = allowed). ``twice``: 0.22 took the softmax of the logarithm of the
-        softmax again.
+        Masked logits become −1e8 (masks: 1 = allowed); 0.20 and 0.21 (``preview``) masked the probabilities. ``twice``:
+        up to 0.22 the softmax of the logarithm of the probabilities was taken again.
         """
         logits = self.linear(x, module)
         mask = self.slice(masks, 1, start, start + self.width(logits))
+        if preview:
+            allowed = self.add("Mul", [self.add("Softmax", [logits]), mask])
+            total = self.reduce("Sum", allowed, [1], keep=True)
+            return self.add("Softmax", [self.log(self.add("RealDiv", [allowed, total]))])
         blocked = self.add("Add", [self.add("Mul", [mask, self.floats(-1)]), self.floats(1)])
         logits = self.add("Sub", [self.add("Mul", [logits, mask]), self.add("Mul", [blocked, self.floats(1e8)])])
         probs = self.add("Softmax", [logits])

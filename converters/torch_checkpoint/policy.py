@@ -4,15 +4,17 @@ Source: mlagents/trainers/torch_entities/{networks,action_model,model_serializat
 before 0.30. What the weights say of a generation:
 
 ======== ============================================================================================
+0.20     ``distribution.*`` and a step counter of floats (0.20, 0.21); the same lists as 0.22
 0.22     ``distribution.*``; vectors joined before images (``vector_processors``, ``visual_processors``)
 0.23     ``action_model.*``, the same lists
-0.24     ``processors``, one list in the order of the sensors
+0.24     ``processors``, one list in the order of the sensors; attention over lists of entities
 0.25     the list in an ``observation_encoder``, and again beside it
 0.26     ``version_number`` 3, ``_body_endoder`` in place of ``linear_encoder``; the same up to 1.1
 ======== ============================================================================================
 
 What they do not say is fixed: the activation (Swish), the clip of a continuous action (±3, divided by 3) for PPO and
-POCA, tanh for SAC, which alone has a deviation that depends on the observation (``log_sigma.weight``).
+POCA (none at all in 0.20 and 0.21), tanh for SAC, which alone has a deviation that depends on the observation
+(``log_sigma.weight``).
 """
 
 from __future__ import annotations
@@ -25,9 +27,10 @@ import numpy as np
 from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
 from converters.graph.types import INT64
+from converters.torch_checkpoint.body import attended, body_width, goal_width, hidden_layers
 from converters.torch_checkpoint.network import Network
-from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, find_sensors
-from converters.torch_checkpoint.state import LET_IT_EXPORT, State, unknown_part
+from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
+from converters.torch_checkpoint.state import LET_IT_EXPORT, State
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import TORCH_VERSION_3
 from signatures.errors import DamagedFileError, SourceError
@@ -54,8 +57,12 @@ class _Generation:
     #: module lists of the sensors, in the order in which the first layer reads them
     lists: tuple[str, ...]
     body: str
+    #: what holds the attention over entities
+    encoder: str
     continuous: str
     discrete: str
+    #: 0.20 and 0.21: no clip, other masks
+    preview: bool = False
 
     @property
     def by_sensor(self) -> bool:
@@ -71,22 +78,10 @@ class _Generation:
 def _generation(state: State) -> _Generation:
     """What wrote the checkpoint. Raises SourceError for what is not read, by its name."""
     version = int(np.clip(np.nan_to_num(state.number("version_number")), 0, 99))
-    for part, why in (
-        ("rsa.", "it is the attention over sensors of variable length"),
-        ("observation_encoder.rsa.", "it is the attention over sensors of variable length"),
-        ("_body_endoder._hidden", "it is conditioned on a goal (a hypernetwork)"),
-        ("_body_endoder.layers.", "it is conditioned on a goal (a hypernetwork)"),
-    ):
-        if state.under(f"{_BODY}.{part}"):
-            raise unknown_part(f"{_BODY}.{part.rstrip('.')}", why)
     body = f"{_BODY}._body_endoder" if state.under(f"{_BODY}._body_endoder.") else f"{_BODY}.linear_encoder"
+    encoder = f"{_BODY}.observation_encoder" if state.under(f"{_BODY}.observation_encoder.rsa.") else _BODY
+    preview = state.step_is_float
     if state.under("distribution."):
-        if state.step_is_float:
-            raise SourceError(
-                "the checkpoint is of ML-Agents 0.20 or 0.21",
-                why="their PyTorch trainers, a preview, acted by other rules (no clip, other masks)",
-                fix="give the .onnx beside it",
-            )
         heads = ("distribution", "distribution")
     else:
         heads = ("action_model._continuous_distribution", "action_model._discrete_distribution")
@@ -95,7 +90,7 @@ def _generation(state: State) -> _Generation:
     if version >= TORCH_VERSION_3:
         span, lists = "0.26-1.1", one
     elif heads[0] == "distribution":
-        span, lists = "0.22", two
+        span, lists = "0.20-0.21" if preview else "0.22", two
     elif state.indices(two[0]) or state.indices(two[1]):
         span, lists = "0.23", two
     elif state.indices(f"{_BODY}.observation_encoder.processors."):
@@ -104,29 +99,27 @@ def _generation(state: State) -> _Generation:
         span, lists = "0.24", one
     else:
         span, lists = "0.23-0.25", one
-    return _Generation(span, version, lists, body, *heads)
+    return _Generation(span, version, lists, body, encoder, *heads, preview=preview and heads[0] == "distribution")
 
 
-def to_graph(state: State, told: Sequence[tuple[int, ...]]) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it. ``told`` are the shapes of the sensors, where the user gives them.
+def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int] = ()) -> tuple[Graph, SourceFacts]:
+    """The policy and what is known of it. ``told`` are the shapes of the sensors, where the user gives them, ``goals``
+    the places of those that are goals.
 
     Raises SourceError and its kinds, UsageError.
     """
     generation = _generation(state)
     state.forget(f"{_BODY}.observation_encoder.processors.")  # the same modules as processors
     state.forget(*_FACTS)
-    layers = [f"{generation.body}.seq_layers.{i}" for i in state.indices(f"{generation.body}.seq_layers.")]
-    if not layers:
-        raise DamagedFileError("its Policy has no hidden layer", why=f"{generation.body} is empty", fix=LET_IT_EXPORT)
-    width = state.shape(f"{layers[0]}.weight")[-1]
-    sensors, joined = find_sensors(state, generation.lists, width, told)
+    width, condition = body_width(state, generation.body), goal_width(state, generation.body)
+    sensors, joined = find_sensors(state, generation.lists, generation.encoder, width, told)
+    goals = find_goals(state, sensors, condition, goals, joined=joined)
     net = Network(state)
-    x = _observed(net, generation, sensors)
-    for layer in layers:
-        x = swish(net, net.linear(x, layer))
+    x, goal = _observed(net, generation, sensors, goals)
+    x = hidden_layers(net, x, goal, generation.body)
     memory = None
     if f"{_BODY}.lstm.lstm.weight_hh_l0" in state:
-        size = 2 * state.shape(f"{_BODY}.lstm.lstm.weight_hh_l0")[-1]
+        size = 2 * state.length(f"{_BODY}.lstm.lstm.weight_hh_l0", -1)
         x, memory = net.lstm(x, net.input("recurrent_in", 1, size), f"{_BODY}.lstm.lstm")
     net.fact("version_number", np.array([generation.version]))
     net.fact("memory_size", np.array([0 if memory is None else net.width(memory)]))
@@ -186,15 +179,23 @@ def _notes(generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, 
 # ------------------------------------------------------------------ observations
 
 
-def _observed(net: Network, generation: _Generation, sensors: Sequence[Sensor]) -> str:
-    """All sensors, encoded and joined: what the first layer reads."""
+def _observed(
+    net: Network, generation: _Generation, sensors: Sequence[Sensor], goals: Sequence[int]
+) -> tuple[str, str | None]:
+    """All sensors, encoded and joined: what the first layer reads; and the goals alone, where there are some."""
     vectors = [s for s in sensors if len(s.shape) == 1]
     shared = None
     if vectors and not generation.by_sensor:
         shared = net.input("vector_observation", sum(s.shape[0] for s in vectors))
-    parts, start, images = [], 0, 0
+    parts: dict[int, str] = {}
+    entities: list[tuple[str, str]] = []
+    start = images = 0
     for index, sensor in enumerate(sensors):
         image = len(sensor.shape) == 3
+        if len(sensor.shape) == 2:
+            assert sensor.module is not None
+            entities.append((sensor.module, net.input(f"obs_{index}", *sensor.shape)))
+            continue
         if generation.by_sensor:
             x = net.input(f"obs_{index}", *sensor.shape)
         elif image:
@@ -210,9 +211,13 @@ def _observed(net: Network, generation: _Generation, sensors: Sequence[Sensor]) 
             x = _image(net, x, sensor.module)
         elif sensor.module is not None:
             x = net.normalised(x, f"{sensor.module}.normalizer")
-        parts.append(x)
+        parts[index] = x
     net.at(_BODY)
-    return net.concat(parts, 1)
+    columns = [net.concat(list(parts.values()), 1)] if parts else []
+    if entities:
+        columns.append(attended(net, columns[0] if columns else None, entities, generation.encoder))
+    net.at(_BODY)
+    return net.concat(columns, 1), net.concat([parts[i] for i in goals], 1) if goals else None
 
 
 def _image(net: Network, x: str, module: str) -> str:
@@ -260,7 +265,10 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
     made: dict[str, str] = {}
     if f"{generation.continuous}.mu.weight" in net.state:
         mean, draw, squashed = net.gaussian(x, generation.continuous)
-        value = net.add("Tanh", [draw]) if squashed else net.add("RealDiv", [clip(net, draw, -3, 3), net.floats(3)])
+        if squashed:
+            value = net.add("Tanh", [draw])
+        else:
+            value = draw if generation.preview else net.add("RealDiv", [clip(net, draw, -3, 3), net.floats(3)])
         made["continuous"] = value
         size = net.width(mean)
         if not generation.first:
@@ -291,15 +299,15 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
 
 def _discrete(net: Network, generation: _Generation, x: str, branches: Sequence[str]) -> tuple[str, list[int]]:
     """Up to 0.25 log-probabilities [B, ΣB], from 0.26 on drawn actions [B, branches] (int64); and the branch sizes."""
-    sizes = [net.state.shape(f"{b}.weight")[0] for b in branches]
+    sizes = [net.state.length(f"{b}.weight", 0) for b in branches]
     masks = net.input("action_masks", sum(sizes))
     parts, start = [], 0
     for branch, size in zip(branches, sizes, strict=True):
-        probs = net.branch(x, branch, masks, start, twice=generation.first)
+        probs = net.branch(x, branch, masks, start, twice=generation.first, preview=generation.preview)
         start += size
         if generation.by_sensor:
             logs = net.add("Log", [probs])
             parts.append(net.add("Multinomial", [logs, net.ints(1, "count")], output_dtype=INT64))
         else:
-            parts.append(net.log(probs))
+            parts.append(net.add("Log", [probs]) if generation.preview else net.log(probs))
     return net.concat(parts, 1), sizes

@@ -1,13 +1,14 @@
 """What an agent observes, as far as its network's weights tell: sensors in the order in which the network joins them.
 
 A normaliser's length is its sensor's; a vector without normaliser has no weights of its own, only its share of the
-first layer's width. An image's size is lost in the encoder's last layer, where height times width is one number.
+first layer's width. An image's size is lost in the encoder's last layer, where height times width is one number. Lists
+of entities (BufferSensor) do not tell how many there are at most, and which sensor is a goal only its width tells.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from converters.torch_checkpoint.state import LET_IT_EXPORT, State, unknown_part
@@ -15,12 +16,16 @@ from signatures.errors import DamagedFileError, SourceError, UsageError
 
 #: Larger sides are not looked for.
 _LONGEST = 1024
+#: Among more sensors goals are not looked for.
+_MOST_SENSORS = 16
 _SAY = "say what the agent observes, sensor by sensor in the order of their names: --sensors SHAPE,... with shapes like"
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One input of the network: its shape (images C, H, W), and its module (None: the numbers go in as they are)."""
+    """One input of the network: its shape (lists of entities [most, numbers], images C, H, W), and its module (None:
+    the numbers go in as they are).
+    """
 
     shape: tuple[int, ...]
     module: str | None
@@ -72,10 +77,11 @@ def dense_name(state: State, module: str) -> str:
 
 
 def find_sensors(
-    state: State, lists: Sequence[str], width: int, told: Sequence[tuple[int, ...]]
+    state: State, lists: Sequence[str], encoder: str, width: int, told: Sequence[tuple[int, ...]]
 ) -> tuple[list[Sensor], bool]:
     """The sensors in the order of the first layer's columns (``width`` of them), and whether vectors stand joined.
 
+    ``encoder`` is what holds the attention over lists of entities, whose result is the last columns.
     ``lists`` are the module lists (0.22, 0.23: vectors, then images; later one list), ``told`` the shapes that the
     user gives, one per sensor. Raises SourceError where they do not follow from the weights, UsageError where what
     the user says contradicts them.
@@ -92,13 +98,25 @@ def find_sensors(
             module is not None
             and encoder_of(state, module) is None
             and f"{module}.normalizer.running_mean" not in state
+            and not _is_list(state, module)
         ):
             raise unknown_part(
                 f"{module} ({', '.join(state.under(module + '.')[:3])})",
-                "it encodes a sensor of variable length (attention), or comes from a plugin",
+                "it encodes a sensor as no ML-Agents does; a plugin may have made it",
             )
+    lengths = {m: _entity_length(state, m, encoder) for m in modules if m is not None and _is_list(state, m)}
+    if lengths:
+        width -= state.length(f"{encoder}.rsa.fc_q.weight", 0)
     if told:
-        return _as_told(state, lists, modules, width, told), False
+        return _as_told(state, lists, modules, lengths, width, told), False
+    if lengths:
+        sizes = ", ".join(str(n) for n in lengths.values())
+        raise SourceError(
+            "the checkpoint does not tell how many entities the agent's lists have at most",
+            why=f"it attends to entities of {sizes} numbers (BufferSensor), any number of them",
+            fix=f"{_SAY} 8 for a vector, 3x84x84 for an image, 20x{next(iter(lengths.values()))} for a list of at "
+            "most 20 entities",
+        )
     known = [(m, _known_width(state, m)) for m in modules if m is not None]
     rest = width - sum(n for _, n in known)
     if rest < 0:
@@ -124,10 +142,71 @@ def find_sensors(
     )
 
 
-def _known_width(state: State, module: str) -> int:
+def find_goals(
+    state: State, sensors: Sequence[Sensor], width: int, told: Sequence[int], *, joined: bool
+) -> tuple[int, ...]:
+    """The places of the sensors that the last hidden layer's weights are made from, ``width`` numbers in all.
+
+    Raises SourceError where the widths do not tell them, UsageError where what the user says contradicts them.
+    """
+    widths = {
+        i: s.shape[0] if len(s.shape) == 1 else _known_width(state, s.module)
+        for i, s in enumerate(sensors)
+        if len(s.shape) != 2
+    }
+    given = ",".join(f"{'goal:' if i in told else ''}{'x'.join(map(str, s.shape))}" for i, s in enumerate(sensors))
+    if told:
+        if any(i not in widths for i in told) or sum(widths[i] for i in told) != width:
+            raise UsageError(
+                f"--sensors {given} does not fit the checkpoint",
+                why=f"its goals have {width} numbers" if width else "its network is not conditioned on a goal",
+                fix="mark the sensors that are goals: goal:8" if width else "leave goal: out",
+            )
+        return tuple(sorted(told))
+    if not width:
+        return ()
+    fitting = [] if joined or len(widths) > _MOST_SENSORS else _summing(tuple(widths.items()), width)
+    if len(fitting) == 1:
+        return fitting[0]
+    raise SourceError(
+        "the checkpoint does not tell which of the agent's sensors is its goal",
+        why=f"the goals have {width} of the numbers that it observes"
+        + (f", and several sensors may have them ({given})" if fitting else ""),
+        fix=f"{_SAY} 8 for a vector and 3x84x84 for an image, goal: before a goal (8,goal:{width})",
+    )
+
+
+def _summing(widths: Sequence[tuple[int, int]], total: int) -> list[tuple[int, ...]]:
+    """The ways (two at most) in which some of the sensors have ``total`` numbers together."""
+    found: list[tuple[int, ...]] = []
+
+    def search(start: int, left: int, taken: tuple[int, ...]) -> None:
+        if left == 0:
+            found.append(taken)
+        for at in range(start, len(widths)):
+            if len(found) < 2 and widths[at][1] <= left:
+                search(at + 1, left - widths[at][1], (*taken, widths[at][0]))
+
+    search(0, total, ())
+    return found
+
+
+def _is_list(state: State, module: str) -> bool:
+    return f"{module}.self_ent_encoder.seq_layers.0.weight" in state
+
+
+def _entity_length(state: State, module: str, encoder: str) -> int:
+    """The numbers of one entity: what its encoder reads, without what the agent observes of itself."""
+    read = state.length(f"{module}.self_ent_encoder.seq_layers.0.weight", -1)
+    own = f"{encoder}.x_self_encoder.seq_layers.0.weight"
+    return read - (state.length(own, 0) if own in state else 0)
+
+
+def _known_width(state: State, module: str | None) -> int:
+    assert module is not None
     if encoder_of(state, module) is not None:
-        return state.shape(f"{dense_name(state, module)}.weight")[0]
-    return state.shape(f"{module}.normalizer.running_mean")[0]
+        return state.length(f"{dense_name(state, module)}.weight", 0)
+    return state.length(f"{module}.normalizer.running_mean", 0)
 
 
 def _told_by_weights(state: State, module: str) -> Sensor:
@@ -135,7 +214,7 @@ def _told_by_weights(state: State, module: str) -> Sensor:
     encoder = encoder_of(state, module)
     if encoder is None:
         return Sensor(state.shape(f"{module}.normalizer.running_mean"), module)
-    columns = state.shape(f"{dense_name(state, module)}.weight")[1]
+    columns = state.length(f"{dense_name(state, module)}.weight", 1)
     sizes = _sizes(state, module, encoder, columns)
     if len(sizes) == 1:
         return Sensor(sizes[0], module)
@@ -187,6 +266,7 @@ def _as_told(
     state: State,
     lists: Sequence[str],
     modules: Sequence[str | None],
+    lengths: Mapping[str, int],
     width: int,
     told: Sequence[tuple[int, ...]],
 ) -> list[Sensor]:
@@ -202,6 +282,13 @@ def _as_told(
     sensors: list[Sensor] = []
     columns = 0
     for shape, module in zip(told, given, strict=True):
+        length = None if module is None else lengths.get(module)
+        if length is not None or len(shape) == 2:
+            if len(shape) != 2 or length != shape[1]:
+                known = "no list of entities" if length is None else f"a list of entities of {length} numbers"
+                raise _contradiction(told, f"its sensor {len(sensors)} is {known}")
+            sensors.append(Sensor(tuple(shape), module))
+            continue
         encoder = None if module is None else encoder_of(state, module)
         if (len(shape) == 3) != (encoder is not None):
             place = "without weights" if module is None else module
@@ -212,7 +299,7 @@ def _as_told(
             columns += shape[0]
             if module is not None and state.shape(f"{module}.normalizer.running_mean") != shape:
                 raise _contradiction(
-                    told, f"{module} has {state.shape(f'{module}.normalizer.running_mean')[0]} numbers"
+                    told, f"{module} has {state.length(f'{module}.normalizer.running_mean', 0)} numbers"
                 )
         else:
             _check_image(state, module, encoder, shape, told)
@@ -226,7 +313,7 @@ def _as_told(
 def _check_image(
     state: State, module: str, encoder: Encoder, shape: tuple[int, ...], told: Sequence[tuple[int, ...]]
 ) -> None:
-    columns = state.shape(f"{dense_name(state, module)}.weight")[1]
+    columns = state.length(f"{dense_name(state, module)}.weight", 1)
     if encoder is _DENSE:
         fits = math.prod(shape) == columns
     else:
@@ -242,5 +329,6 @@ def _contradiction(told: Sequence[tuple[int, ...]], why: str) -> UsageError:
     return UsageError(
         f"--sensors {text} does not fit the checkpoint",
         why=why,
-        fix="give one shape per sensor, in the order of the sensors' names: 8 for a vector, 3x84x84 for an image",
+        fix="give one shape per sensor, in the order of the sensors' names: 8 for a vector, 20x4 for a list of "
+        "entities, 3x84x84 for an image",
     )

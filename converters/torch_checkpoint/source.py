@@ -15,5 +15,5 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     Raises NotAPolicyError for another file of PyTorch's, SourceError for a network that is not built or whose sensors
     the weights do not tell, DamagedFileError, UsageError for sensors that do not fit.
     """
-    graph, facts = to_graph(State(Archive(given.data)), options.sensors)
+    graph, facts = to_graph(State(Archive(given.data)), options.sensors, options.goals)
     return [SourceModel(graph, (given.path,), facts)]

@@ -57,6 +57,15 @@ class State:
             )
         return self._tensors[name].shape
 
+    def length(self, name: str, axis: int) -> int:
+        """The length of an axis of a tensor; raises DamagedFileError where it has none."""
+        shape = self.shape(name)
+        if not -len(shape) <= axis < len(shape):
+            raise DamagedFileError(
+                f"{name} has the shape {list(shape)}", why="it lacks an axis that such a weight has", fix=LET_IT_EXPORT
+            )
+        return shape[axis]
+
     def array(self, name: str, *shape: int | None) -> np.ndarray:
         """A tensor as float32, its shape checked (None: any length). Raises DamagedFileError."""
         found = self.shape(name)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.options import comparing, shapes, trusting, understanding
+from exporter.cli.options import activating, comparing, read_options, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
@@ -55,7 +55,8 @@ if TYPE_CHECKING:
 @click.option("--deterministic", is_flag=True, help="Make 'action' the one without chance.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @trusting
-@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,3x84x84.")
+@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
+@activating
 @click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, help="ONNX opset (default: 15).")
 @click.option(
@@ -79,6 +80,7 @@ def export_command(
     runtimes: str,
     step: int | None,
     sensors: str,
+    activation: str | None,
     trust_source: bool,
     labels: Path | None,
     compiling: CompileOptions,
@@ -86,7 +88,6 @@ def export_command(
     options: VerifyOptions,
 ) -> None:
     """Export policies (the command that is meant where none is named)."""
-    from converters.source import ReadOptions
     from exporter.export.pipeline import ExportOptions, export
 
     if profile == "help":
@@ -98,7 +99,7 @@ def export_command(
         None if targets is None else [t for t in targets.split(",") if t],
         name,
         compiling,
-        ReadOptions(step, shapes(sensors), trust_source),
+        read_options(step, sensors, trust_source, activation),
         opset,
         runtimes,
         options,

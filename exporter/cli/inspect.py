@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from exporter.cli.options import shapes, trusting, understanding
+from exporter.cli.options import activating, read_options, trusting, understanding
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     help="Write a picture of the policy (with --unity: of Behavior Parameters).",
 )
 @trusting
-@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,3x84x84.")
+@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
+@activating
 @click.option(
     "--unity", "releases", multiple=True, metavar="RELEASE", help="What Unity says to it: R20, R22, R23, R23-2.4, all."
 )
@@ -44,6 +45,7 @@ def inspect_command(
     source: Path,
     step: int | None,
     sensors: str,
+    activation: str | None,
     releases: tuple[str, ...],
     actions: str,
     brain_parameters: Path | None,
@@ -61,10 +63,9 @@ def inspect_command(
         sys.exit(_unity(source, releases, sensors, actions, brain_parameters, as_json, svg))
     if actions or brain_parameters is not None:
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
-    from converters.source import ReadOptions
     from exporter.inspect.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, compiling, ReadOptions(step, shapes(sensors), trust_source))
+    found = inspect_source(source, compiling, read_options(step, sensors, trust_source, activation))
     written: list[Path] = []
     if logdir is not None or svg is not None:
         from exporter.inspect.pictures import write_pictures

@@ -6,12 +6,15 @@ import functools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from exporter.cli.console import Console
 from signatures.errors import UsageError
+
+if TYPE_CHECKING:
+    from converters.source import ReadOptions
 
 
 def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
@@ -25,16 +28,34 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     return found
 
 
-def shapes(text: str) -> tuple[tuple[int, ...], ...]:
-    """``"8,3x84x84"`` as the shapes of a vector of 8 and an image C, H, W."""
+def sensors_of(text: str) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
+    """``"8,goal:3,20x4,3x84x84"``: the shapes of a vector, another, a list of entities and an image C, H, W; and the
+    places of those that are goals.
+    """
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
-        if not re.fullmatch("[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}x[1-9][0-9]{0,6})?", part):
+        if not re.fullmatch("(goal:)?[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}){0,2}", part):
             raise UsageError(
                 f"--sensors {text}: {part} is no shape of a sensor",
-                fix="give one shape per sensor: 8 for a vector, 3x84x84 (channels, height, width) for an image",
+                fix="give one shape per sensor: 8 for a vector, 20x4 for a list of at most 20 entities of 4 numbers, "
+                "3x84x84 (channels, height, width) for an image, goal:8 for a goal",
             )
-    return tuple(tuple(int(n) for n in part.split("x")) for part in parts)
+    shapes = tuple(tuple(int(n) for n in part.removeprefix("goal:").split("x")) for part in parts)
+    return shapes, tuple(i for i, part in enumerate(parts) if part.startswith("goal:"))
+
+
+def read_options(step: int | None, sensors: str, trust_source: bool, activation: str | None) -> ReadOptions:
+    """What a reader is told, of the command line's words. Raises UsageError."""
+    from converters.source import ReadOptions
+
+    shapes, goals = sensors_of(sensors)
+    return ReadOptions(step, shapes, trust_source, goals, activation)
+
+
+def activating(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The option for files that have the weights of layers and not what stands between them."""
+    said = "What stands between the layers of a state dictionary: elu, tanh, relu ..."
+    return click.option("--activation", metavar="NAME", help=said)(command)
 
 
 def _numbers(values: Sequence[str]) -> dict[str, float]:

@@ -314,6 +314,8 @@ def contract_of(
         None if model.name is None else printable(model.name),
         read.step,
         read.sensors,
+        read.goals,
+        read.activation,
     )
     tool = {"name": "export-model", "version": __version__, **({} if profile is None else {"profile": profile})}
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
@@ -525,7 +527,8 @@ def _original_of(source: Path, contract: Contract, step: int | None, trust_sourc
     A run's folder is read at ``step``, by default at the one that the export asked for.
     """
     origin = contract.origin
-    read = ReadOptions(origin.step if step is None else step, origin.sensors, trust_source)
+    asked = origin.step if step is None else step
+    read = ReadOptions(asked, origin.sensors, trust_source, origin.goals, origin.activation)
     found = read_source(source, read)
     if found.sha256 != origin.sha256:
         raise BundleError(
