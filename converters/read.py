@@ -62,7 +62,9 @@ def _artefact(folder: Path) -> Member:
             fix="export the policy again",
         )
     bundle.verify_hashes(found)
-    return Member(bundle.path(found), bundle.name, files=(folder / POLICY,))
+    made_for = bundle.contract.tool.get("profile")
+    notes = () if made_for is None else (f"the source is a bundle made with --for {made_for}",)
+    return Member(bundle.path(found), bundle.name, notes=notes, files=(folder / POLICY,))
 
 
 def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[SourceModel]:

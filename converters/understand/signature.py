@@ -74,7 +74,7 @@ def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, s
         notes.append(f"not exported: {', '.join(compiled.brain.left_out)}; name an output with --output NAME=ROLE")
     feeds, inputs = _inputs(compiled, types, notes)
     # A bundle that is read back says what its first source drew, which may be gone by now (--deterministic).
-    told = (n for n in compiled.facts.notes if (lifted := _LIFTED.fullmatch(n)) is None or lifted[1] in feeds)
+    told = (n for n in compiled.facts.notes if (lifted := LIFTED.fullmatch(n)) is None or lifted[1] in feeds)
     notes = [*told, *notes]
     outputs, named = _outputs(compiled, types)
     meanings = compiled.meanings.values()
@@ -118,7 +118,8 @@ def _preprocessing(layout: str, highest: int) -> dict[str, object]:
 # ------------------------------------------------------------------ notes that follow from the signature
 
 
-_LIFTED = re.compile(r"the noise drawn inside the graph \(.*\) is now the input (.+); feed N\(0, 1\)")
+#: Said of noise that was drawn in the graph; its group is the input's name.
+LIFTED = re.compile(r"the noise drawn inside the graph \(.*\) is now the input (.+); feed N\(0, 1\)")
 
 
 def _lifted(origin: object, name: str) -> str:

@@ -64,8 +64,9 @@ class LoadedPolicy:
         *,
         draws_itself: bool = False,
     ) -> None:
-        """``draws_itself``: the noise of the source is still inside (``--noise keep``)."""
+        """``draws_itself``: the noise is inside of the file (``--noise keep``, ``--for``)."""
         self.name, self.signature, self.runtime = name, signature, runtime
+        self._draws_itself = draws_itself
         self._run = run
         self._generator = Generator(seed)
         self._scores = signature.log_probs
@@ -105,8 +106,11 @@ class LoadedPolicy:
         for them. ``parameters`` are the source's own placeholders. ``deterministic`` takes the likeliest action and the
         mean; without it, a policy that gives its mean and σ (``action_std``, ``action_log_std``) is drawn from.
         ``seed`` starts the draws anew before this decision. Raises UsageError where something is missing, is of the
-        wrong shape or is not taken, where masks forbid all actions of a branch, and where nothing can be drawn.
+        wrong shape or is not taken, where masks forbid all actions of a branch, where nothing can be drawn, and where
+        ``deterministic`` asks for what the file does not have.
         """
+        if deterministic:
+            self._check_plain()
         if seed is not None:
             self.seed(seed)
         given = self._named(observations)
@@ -136,6 +140,18 @@ class LoadedPolicy:
             shape = tuple(count if n is None else n for n in spec.shape)
             feeds[spec.name] = np.zeros(shape, np.float32) if deterministic else self._generator.normals(shape)
         return self._decision(self._run(feeds, [s.name for s in self.signature.outputs]), deterministic)
+
+    def _check_plain(self) -> None:
+        """Raise UsageError where an action is drawn inside of the graph, and there is none without chance."""
+        for head in self.signature.heads:
+            sampled = head.spec.role is Role.SAMPLED and self._scores is None
+            drawn = head.spec.role is Role.CONTINUOUS and self._draws_itself
+            if head.plain is None and (sampled or drawn):
+                raise UsageError(
+                    f"{head.name!r} cannot be had without chance",
+                    why="it is drawn inside of the file, which gives neither its mean nor its log-probabilities",
+                    fix="export the policy without --for, or leave deterministic= out",
+                )
 
     def _named(self, observations: npt.ArrayLike | Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         names = [s.name for s in self.signature.observations]

@@ -210,13 +210,15 @@ class Console:
         if profile is not None:
             last = results[-1]
             files = ", ".join(sorted(p.name for p in last.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
-            click.echo(
-                f"next: put {files} of {last.folder} into the project, for the agent's Model    (docs/tasks/unity.md)"
-            )
+            from converters.targets.profiles import profile as known
+
+            wanted = known(profile)
+            click.echo(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
+            click.echo(f"next: export-model snippets {last.folder} --for {wanted.name}    (what to set there)")
             return
         targets = results[-1].sizes.keys()
         if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(targets):
-            click.echo("note: Unity looks up other names: export for it with --for NAME    (--for help lists them)")
+            click.echo("note: Unity looks up other names: export with --for unity6    (--for help lists older Unitys)")
         folder = results[-1].folder
         if results[-1].report is None:
             click.echo(f"next: export-model verify {folder}    (nothing was compared yet)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from exporter.cli.tables import size_text, table
-from exporter.verify.findings import Failure, Finding, Size
+from exporter.verify.findings import Accepted, Failure, Finding, Size
 from exporter.verify.report import ParityReport
 
 
@@ -69,6 +69,9 @@ def failure_lines(report: ParityReport) -> list[str]:
 def verdict(report: ParityReport) -> str:
     """One line."""
     if report.passed is None:
+        said = [c.runtime for c in report.comparisons if isinstance(c, Accepted)]
+        if said:
+            return f"ACCEPTED by the checks of {', '.join(said)}; no numbers were compared"
         return "NOT VERIFIED: no independent runtime ran"
     pairs = {
         (c.format, c.runtime)

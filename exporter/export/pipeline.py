@@ -43,6 +43,7 @@ from signatures.errors import (
     UsageError,
 )
 from signatures.fields import FieldError, printable
+from signatures.spec import PolicySignature
 
 if TYPE_CHECKING:
     from converters.targets.profile import Profile
@@ -369,7 +370,8 @@ def _joined(report: ParityReport, own: ParityReport) -> ParityReport:
     """The report of a policy in a consumer's names, with what came of the policy that it was made from."""
     note = f"the policy under its own names, from which this was made: {own.verdict}, against {own.reference}"
     passed = False if own.passed is False else report.passed
-    return replace(report, passed=passed, comparisons=(*report.comparisons, *own.failures), notes=(*report.notes, note))
+    comparisons, notes = (*report.comparisons, *own.failures), (*report.notes, note)
+    return replace(report, passed=passed, comparisons=comparisons, notes=notes, self_consistent=own.self_consistent)
 
 
 def verify_folder(
@@ -394,16 +396,19 @@ def verify_folder(
     found = Bundle.open(folder)
     found.verify_hashes()
     contract = found.contract
-    original = None if source is None else _original_of(source, contract, step, trust_source)
+    read = None if source is None else _source_of(source, contract, step, trust_source)
     signature = contract.signature
     formats = [f for f in WRITTEN.values() if found.has(f)]
     artefacts = {f.key: found.path(f) for f in formats}
     made_for = contract.tool.get("profile")
-    # What was made for a consumer, and for it alone, has names that only it knows: it is the consumer that is asked.
-    asked = made_for is not None and not {"bytes", "nn"} & artefacts.keys()
+    # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
+    again = None if read is None or made_for is None else _made_again(read, contract, _profile(made_for))
+    original = None if read is None or again is not None else _original_of(read, contract)
+    # Without the source, it is the consumer alone that is asked.
+    asked = again is None and made_for is not None and not {"bytes", "nn"} & artefacts.keys()
     if asked:
-        _check_asked(folder, artefacts, str(made_for), source, runtimes, options)
-    reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if asked else found.graph_file)
+        _check_asked(folder, artefacts, str(made_for), runtimes, options)
+    reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if made_for else found.graph_file)
     if "nn" in artefacts:
         from converters.barracuda.writer import contract_text
 
@@ -416,6 +421,7 @@ def verify_folder(
         graph = _whole_graph(embedding, names, artefacts)
     else:
         graph = outline(signature, noise_kept=contract.source.noise_kept)
+    graph = graph if again is None else again.policy.graph
     policy = Policy(
         found.name,
         graph,
@@ -429,15 +435,21 @@ def verify_folder(
     sizes = {f.key: found.size(f) for f in formats}
     with tempfile.TemporaryDirectory(prefix="export-model-") as scratch, RuntimePool() as pool:
         copies = _vetted(artefacts, names, list(keys), Path(scratch))
+        if again is not None:
+            reference = Path(scratch) / "reference.bytes"
+            reference.write_bytes(frozen(again.policy))
         tested = PolicyUnderTest(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
             made_for, artefacts,
         )  # fmt: skip
         report = verify(tested, () if asked else used or ("numpy",), known, pool, options, progress)
+        if again is not None and again.own is not None:
+            under = _tested_in(replace(again, policy=again.own, profile=None), formats, Path(scratch) / "own")
+            report = _joined(report, verify(under, used or ("numpy",), known, pool, None, progress))
     if asked:
         note = (
             f"made for {made_for}: its bytes and what the consumer's checkers say were verified; its numbers were "
-            "compared when it was exported"
+            "compared when it was exported, and are again with --source FILE"
         )
         return replace(report, notes=(*report.notes, note))
     if source is None:
@@ -480,11 +492,10 @@ def _check_asked(
     folder: Path,
     artefacts: Mapping[str, Path],
     made_for: str,
-    source: Path | None,
     runtimes: str | Sequence[str],
     options: VerifyOptions | None,
 ) -> None:
-    """Raise where a bundle in a consumer's names lacks the file, or is to be compared with something."""
+    """Raise where a bundle in a consumer's names lacks the file, or is to be compared without its source."""
     if "onnx" not in artefacts:
         raise BundleError(
             "has no file that its consumer loads",
@@ -492,12 +503,12 @@ def _check_asked(
             why=f"it was made for {made_for}",
             fix="export the policy again",
         )
-    if source is not None or runtimes != "auto" or (options is not None and (options.golden or options.rules)):
+    if runtimes != "auto" or (options is not None and (options.golden or options.rules)):
         raise UsageError(
-            f"a bundle that was made for {made_for} is asked of its consumer's checkers alone",
+            f"without its source, a bundle that was made for {made_for} is asked of its consumer's checkers alone",
             where=str(folder),
             why="its names are the consumer's; its numbers were compared when it was exported",
-            fix="leave --source, --runtimes, --golden and --tolerances out, or export the policy again",
+            fix="give the source too: --source FILE",
         )
 
 
@@ -521,8 +532,8 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
     return graph
 
 
-def _original_of(source: Path, contract: Contract, step: int | None, trust_source: bool) -> OriginalRun | None:
-    """How to run the source of a bundle; raises BundleError where ``source`` is another file.
+def _source_of(source: Path, contract: Contract, step: int | None, trust_source: bool) -> Source:
+    """What a bundle was exported from; raises BundleError where ``source`` is another file.
 
     A run's folder is read at ``step``, by default at the one that the export asked for.
     """
@@ -537,7 +548,32 @@ def _original_of(source: Path, contract: Contract, step: int | None, trust_sourc
             why=f"its sha256 differs from that of {origin.path} in {POLICY}",
             fix="give the file it was exported from (a checkpoint of a run's folder: its --step), or export it again",
         )
-    named = [m for m in found.models if m.name is not None and printable(m.name) == origin.model]
+    return found
+
+
+def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
+    """How to run the source of a bundle."""
+    named = [m for m in found.models if m.name is not None and printable(m.name) == contract.origin.model]
     original = (named or list(found.models))[0].original
-    with naming(source):
+    with naming(found.path):
         return None if original is None else original.narrowed(contract.source)
+
+
+def _made_again(found: Source, contract: Contract, wanted: Profile) -> _Job:
+    """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
+    compiled = list(found.compiled())
+    named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
+    for model, own in named or compiled[: len(compiled) == 1]:
+        dressed = wanted.dress(own)
+        if _tensors(dressed.signature) == _tensors(contract.signature):
+            return _Job(found, model, replace(dressed, name=contract.name), wanted, own)
+    raise BundleError(
+        "cannot be held against its source",
+        where=str(found.path),
+        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
+        fix="leave --source out, or export it again",
+    )
+
+
+def _tensors(signature: PolicySignature) -> list[tuple[object, ...]]:
+    return [(s.name, s.role, s.dtype, s.shape) for s in (*signature.inputs, *signature.outputs)]

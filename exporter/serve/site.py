@@ -135,7 +135,12 @@ def _checked(folder: Path) -> Bundle:
     ):
         if not found.has(WRITTEN[key]):
             file = WRITTEN[key].first_file_of(found.name)
-            raise BundleError(f"has no {file}", where=str(folder), why=why, fix="export it again with --to bytes,tfjs")
+            raise BundleError(
+                f"has no {file}",
+                where=str(folder),
+                why=why,
+                fix="export it again with --to bytes,tfjs and without --for",
+            )
     return found
 
 

@@ -56,7 +56,7 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
         f"  Vector Observation: Space Size {size}, Stacked Vectors 1",
         f"  Actions: Continuous Actions {_continuous(bundle)}, Discrete Branches {len(signature.branches)}"
         + (f" of the sizes {sizes}" if sizes else ""),
-        f"  Model: {bundle.name}.onnx of a bundle made with --for; Behavior Type: Inference Only",
+        f"  Model: {_model(bundle)}; Behavior Type: Inference Only",
     ]
     others = [s for s in sensors if s is not vector]
     if others:
@@ -67,6 +67,18 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
             f"Its memory ({signature.memory.size} numbers) is kept by ML-Agents, and is empty at an episode's start."
         )
     return [f"// {line}" for line in lines]
+
+
+def _model(bundle: Bundle) -> str:
+    """The file, and which ML-Agents reads it."""
+    if bundle.made_for is not None:
+        from converters.targets.profiles import profile
+
+        wanted = profile(bundle.made_for)
+        return f"{bundle.name}.{wanted.formats[0]}, made for {wanted.purpose} (--for {wanted.name})"
+    if f"{bundle.name}.nn" in bundle.files:
+        return f"{bundle.name}.nn (ML-Agents 0.7 to release 16)"
+    return f"{bundle.name}.onnx of a bundle made with --for unity6 (export-model --for help: for older ones)"
 
 
 def _component(bundle: Bundle, spec: TensorSpec) -> str:

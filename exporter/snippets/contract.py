@@ -39,6 +39,8 @@ class Bundle:
     files: frozenset[str]
     #: nodes of its .bytes: an old Unity asks for some that are neither inputs nor outputs
     nodes: frozenset[str] = frozenset()
+    #: the consumer that it was made for (``--for``)
+    made_for: str | None = None
 
     def path(self, relative: str) -> str:
         """A file of the bundle, with slashes."""
@@ -86,7 +88,8 @@ def read_bundle(folder: Path) -> Bundle:
     if found.has(frozen):
         found.verify_hashes(frozen)
         nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
-    return Bundle(folder, found.name, found.signature, frozenset(found.contract.files), nodes)
+    made_for = found.contract.tool.get("profile")
+    return Bundle(folder, found.name, found.signature, frozenset(found.contract.files), nodes, made_for)
 
 
 def example_shape(spec: TensorSpec) -> tuple[int, ...]:

@@ -76,10 +76,12 @@ class Snippet:
 
 
 def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], dict[str, str]]:
-    """(snippets, target → the format it lacks). ``name`` chooses one, or all that begin so (``serving``).
+    """(snippets, target → the format it lacks). ``name`` chooses one, all that begin so (``serving``), or the consumer.
 
-    Raises UsageError where there is no such target, BundleError where the bundle lacks the format of all chosen.
+    Raises UsageError where there is no such target, BundleError where the bundle lacks the format of all chosen, or was
+    made for another consumer.
     """
+    name = _for_consumer(bundle, name)
     chosen = [t for t in TARGETS if name in (None, t.name)] or [t for t in TARGETS if t.name.startswith(f"{name}-")]
     if not chosen:
         raise UsageError(f"--for {name}: there is no such target", fix=f"one of: {', '.join(t.name for t in TARGETS)}")
@@ -92,6 +94,26 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
             fix="export the policy again with all formats (the default of --to)",
         )
     return [Snippet(t, t.render(bundle)) for t in chosen if t.name not in lacking], lacking
+
+
+def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
+    """The target of a word of ``--for``, a profile's too; raises BundleError where the bundle is not for that one."""
+    from converters.targets.profiles import PROFILES
+
+    wanted = next((p for p in PROFILES if name in (p.name, *p.aliases) and name not in {t.name for t in TARGETS}), None)
+    if wanted is None:
+        return name
+    if bundle.made_for != wanted.name and not any(
+        WRITTEN[f].first_file_of(bundle.name) in bundle.files for f in wanted.undressed
+    ):
+        made = "its names are this tool's own" if bundle.made_for is None else f"it was made for {bundle.made_for}"
+        raise BundleError(
+            f"was not made for {wanted.name}",
+            where=str(bundle.folder),
+            why=made,
+            fix=f"export-model SOURCE --for {wanted.name}",
+        )
+    return "internal-brain" if "bytes" in wanted.formats else "agent"
 
 
 def _has(bundle: Bundle, target: Target) -> bool:

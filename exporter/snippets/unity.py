@@ -56,8 +56,11 @@ def internal_brain(bundle: Bundle) -> str:
         if faults := _faults(bundle, generation):
             lines.append(f"ML-Agents {generation.name}: not this policy: {'; '.join(faults)}")
     lines.append(_learning_brain(bundle))
-    lines.append("ML-Agents 0.7 to release 20: their Barracuda reads .nn and .onnx of fixed names, not this graph")
-    lines.append("newer: Unity Inference Engine, see export-model snippets --for inference-engine")
+    lines.append(
+        "ML-Agents 0.7 to release 20: their Barracuda reads .nn (--to nn), and .onnx of fixed names "
+        "(--for barracuda-1.0, barracuda-1.4, barracuda-3)"
+    )
+    lines.append("newer: .onnx of --for unity6; without ML-Agents, export-model snippets --for inference-engine")
     return "\n".join([*lines, ""])
 
 

@@ -260,12 +260,19 @@ def test_a_hybrid_with_one_companion_missing_pairs_the_other_rightly(missing: st
     values = {s.name: np.full((1, 1), i, s.dtype) for i, s in enumerate(outputs)}
     kept = [s for s in outputs if s.name != missing]
     made = stub([STATE], kept, values, action_space="hybrid", branches=(4,))
+    pairs = {h.name: None if h.plain is None else h.plain.name for h in made.policy.signature.heads}
+    names = ("continuous_actions", "discrete_actions")
+    assert pairs == {n: None if n in missing else f"deterministic_{n}" for n in names}
+    if "discrete" in missing:
+        with pytest.raises(UsageError, match="'discrete_actions' cannot be had without chance"):
+            made.policy.decide(np.zeros((1, 2)), deterministic=True)
+        return
     decision = made.policy.decide(np.zeros((1, 2)), deterministic=True)
     assert decision.continuous is not None
     assert decision.discrete is not None
     assert decision.continuous.dtype == np.float32
-    assert decision.continuous.item() == (0 if "continuous" in missing else 2)
-    assert decision.discrete.item() == (1 if "discrete" in missing else 3)
+    assert decision.continuous.item() == 0
+    assert decision.discrete.item() == 3
 
 
 def test_masks_that_forbid_everything_and_arguments_for_nothing_are_refused(bundles: Bundles) -> None:

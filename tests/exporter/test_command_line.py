@@ -115,7 +115,7 @@ def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) 
 def test_an_export_that_unity_does_not_take_says_how_to_make_one(tmp_path: Path) -> None:
     def says_so(*flags: str) -> bool:
         return (
-            "note: Unity looks up other names: export for it with --for NAME"
+            "note: Unity looks up other names: export with --for unity6"
             in export_model(BALL, "-o", tmp_path, *UNVERIFIED, *flags).out
         )
 

@@ -185,6 +185,8 @@ class Pair:
                 continue
             name = self._own_name(spec)
             want, got = expected[name], actual[spec.name]
+            if [d for d in spec.shape if d is not None] != list(got.shape[1:]):
+                return f"{spec.name} has the shape {got.shape}, not {spec.shape}"
             if got.size != want.size or not np.allclose(
                 got.reshape(want.shape).astype(np.float64),
                 want.astype(np.float64),

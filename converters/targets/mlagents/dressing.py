@@ -21,6 +21,7 @@ from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.types import FLOAT32, INT32, static_shape
 from converters.policy import Policy
 from converters.targets.profile import refused
+from converters.understand.signature import LIFTED
 from signatures.roles import Role
 from signatures.spec import Memory, SourceMap, TensorSpec
 
@@ -82,6 +83,7 @@ class Dressing:
         """
         graph = self.policy.graph
         noise = {self.policy.feeds[s.name]: s for s in self.policy.signature.noise}
+        self.notes.extend(f"{spec.name} is drawn inside the model, at every step anew" for spec in noise.values())
         behind: set[str] = set(noise)
         later = []
         for node in graph.nodes:
@@ -136,7 +138,7 @@ class Dressing:
                 **{n.name: _plain(n.value) for n in beside if n.value is not None},
                 **{k: _plain(v) for k, v in self.constants.items()},
             },
-            notes=(*self.policy.signature.notes, *self.notes),
+            notes=(*(n for n in self.policy.signature.notes if not LIFTED.fullmatch(n)), *self.notes),
             labels={},
         )
         names = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
@@ -146,7 +148,10 @@ class Dressing:
             signature,
             {n: n for n in names[0]},
             {n: n for n in names[1]},
-            SourceMap(),
+            SourceMap(
+                noise={s.name: s.shape for s in self.policy.signature.noise},
+                noise_kept=bool(self.policy.signature.noise),
+            ),
             dict(self.constants),
         )
 

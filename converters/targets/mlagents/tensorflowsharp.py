@@ -17,7 +17,7 @@ from converters.graph.types import FLOAT32, INT32
 from converters.policy import Policy
 from converters.targets.mlagents import feeding
 from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities, samples
-from converters.targets.mlagents.dressing import Dressing
+from converters.targets.mlagents.dressing import Dressing, row
 from signatures.roles import Role
 from signatures.spec import Memory, TensorSpec
 
@@ -58,7 +58,7 @@ def dress(policy: Policy, generation: Generation) -> Policy:
     if size:
         own = policy.signature.memory
         assert own is not None and own.output is not None
-        dressing.give("recurrent_out", dressing.own(own.output), Role.MEMORY_OUT)
+        dressing.give("recurrent_out", row(dressing.builder, dressing.own(own.output), size), Role.MEMORY_OUT)
         memory = Memory(size, "recurrent_in", "recurrent_out", own.layout)
     return dressing.finished(memory, images, _beside(generation, found, width, size))
 

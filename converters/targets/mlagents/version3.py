@@ -37,18 +37,21 @@ def dress(policy: Policy, profile: str) -> Policy:
     found = heads(dressing)
     dressing.constants["version_number"] = np.array([_VERSION], np.float32)
     dressing.constants["memory_size"] = np.array([size], np.float32)
+    plain: list[tuple[str, str]] = []
     if found.continuous is not None:
         drawn, without, width = continuous_rows(dressing, found.continuous)
         dressing.constants["continuous_action_output_shape"] = np.array([width], np.float32)
         dressing.give("continuous_actions", drawn, Role.CONTINUOUS, found.continuous.source)
-        dressing.give(f"{_DETERMINISTIC}continuous_actions", without, Role.DETERMINISTIC)
+        plain.append(("continuous_actions", without))
     if found.discrete is not None:
         scores = branches(dressing, found.discrete, masks)
         drawn, best = samples(dressing, scores)
         role = Role.DETERMINISTIC if found.discrete.role is Role.DETERMINISTIC else Role.SAMPLED
         dressing.constants["discrete_action_output_shape"] = np.array([scores.sizes], np.float32)
         dressing.give("discrete_actions", drawn, role, found.discrete.source)
-        dressing.give(f"{_DETERMINISTIC}discrete_actions", best, Role.DETERMINISTIC)
+        plain.append(("discrete_actions", best))
+    for name, without in plain:  # behind the actions, which a signature has first
+        dressing.give(f"{_DETERMINISTIC}{name}", without, Role.DETERMINISTIC)
     memory = None
     if size:
         own = policy.signature.memory
