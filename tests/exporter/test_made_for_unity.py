@@ -48,7 +48,7 @@ def test_a_bundle_for_everyone_asks_nobody(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "asked",
-    [{"source": fixture("recurrent")}, {"runtimes": "onnxruntime"}, {"options": VerifyOptions(golden=Path("x.npz"))}],
+    [{"runtimes": "onnxruntime"}, {"options": VerifyOptions(golden=Path("x.npz"))}],
 )
 def test_what_its_checkers_cannot_answer_is_not_promised(asked: dict[str, Any], tmp_path: Path) -> None:
     (result,) = export_model(fixture("recurrent"), tmp_path, for_="unity6", verify="none")
