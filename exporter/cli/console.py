@@ -160,24 +160,37 @@ class Console:
 
     def _notes(self, notes: Sequence[str]) -> None:
         if not self.quiet:
+            from exporter.cli.tables import paragraph
+
             for note in notes:
-                click.echo(f"  note: {note}")
+                click.echo(paragraph(note, "  note: ", "    "))
 
     def _report(self, report: ParityReport) -> None:
-        from exporter.cli.summary import comparison_table, failure_lines, not_run_lines, parity_table, verdict
+        from exporter.cli.summary import comparison_table, failure_lines, not_run_line, parity_table, verdict
+        from exporter.cli.tables import paragraph
 
-        if not self.quiet:
-            shown = comparison_table(report) if self.verbose else parity_table(report)
-            for line in shown.splitlines():
-                words, gap, last = line.rpartition(" ")
-                styled = click.style(last, fg="red") if last == "FAIL" else last
-                _say(f"{words}{gap}{styled}")
+        if not self.quiet and report.comparisons:
+            for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
+                failed = line.startswith("FAIL ")
+                _say(f"{click.style('FAIL', fg='red')}{line[4:]}" if failed else line)
         for line in failure_lines(report):
-            click.echo(line)
-        if not self.quiet:
-            for line in not_run_lines(report):
-                click.echo(line)
-        _say(click.style(verdict(report), fg=_COLOURS[report.passed]))
+            indent = line[: len(line) - len(line.lstrip())]
+            click.echo(paragraph(line.lstrip(), indent, f"{indent}    "))
+        missing = not_run_line(report)
+        if not self.quiet and report.passed is not None and missing is not None:
+            click.echo(paragraph(missing, rest="  "))
+        _say(click.style(paragraph(verdict(report), rest="  "), fg=_COLOURS[report.passed]))
+
+    def whole(self, reports: Sequence[ParityReport]) -> None:
+        """What came of several policies, in one line."""
+        if len(reports) < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
+            return
+        from exporter.cli.summary import whole_summary
+        from exporter.cli.tables import paragraph
+
+        verdicts = {r.passed for r in reports}
+        colour = _COLOURS[False if False in verdicts else None if None in verdicts else True]
+        _say(click.style(paragraph(whole_summary(reports), rest="  "), fg=colour))
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""
@@ -216,21 +229,30 @@ class Console:
             click.echo(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
             click.echo(f"next: export-model snippets {last.folder} --for {wanted.name}    (what to set there)")
             return
-        targets = results[-1].sizes.keys()
-        if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(targets):
-            click.echo("note: Unity looks up other names: export with --for unity6    (--for help lists older Unitys)")
-        folder = results[-1].folder
-        if results[-1].report is None:
-            click.echo(f"next: export-model verify {folder}    (nothing was compared yet)")
-            return
-        if "tfjs" in targets:
-            click.echo(f"next: export-model serve {folder}    (see it act, in a browser)")
-        click.echo(f"next: export-model snippets {folder}    (code for Python, TF Serving, JavaScript, C#, Unity)")
+        if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
+            click.echo("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
+        click.echo(f"next: {_next(results)}")
 
     def json(self, content: Mapping[str, Any]) -> None:
         """The answer for a program, where it was asked for."""
         if self.as_json:
             click.echo(json.dumps(content, indent=1))
+
+
+def _next(results: Sequence[ExportResult]) -> str:
+    """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
+    from exporter.cli.summary import to_verify
+    from exporter.cli.tables import hint
+    from exporter.serve.scenes import scene_of
+
+    last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), results[-1])
+    if last.report is None:
+        return hint(f"export-model verify {last.folder}", "nothing was compared yet")
+    if last.report.passed is None and (install := to_verify(last.report)) is not None:
+        return hint(install, f"then: export-model verify {last.folder}")
+    if {"tfjs", "bytes"} <= {*last.sizes}:
+        return hint(f"export-model serve {last.folder}", "see it act, in a browser")
+    return hint(f"export-model snippets {last.folder}", "code for Python, JavaScript, C#, Unity, TF Serving")
 
 
 def _say(text: str) -> None:

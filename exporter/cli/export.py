@@ -119,6 +119,7 @@ def export_command(
             results.append(result)
             progress.clear()
             console.result(result)
+    console.whole([r.report for r in results if r.report is not None])
     told = {"refused": [e.to_dict() for e in refused]} if refused else {}
     console.json({"policies": [_result_dict(r) for r in results], **told})
     console.next_step(results, compiling.names, profile)

@@ -2,58 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Sequence
 
 from exporter.cli.tables import size_text, table
-from exporter.verify.findings import Accepted, Failure, Finding, Size
+from exporter.verify.findings import Accepted, Size
 from exporter.verify.report import ParityReport
 
 
 def parity_table(report: ParityReport) -> str:
-    """Format, runtime, size, worst difference of each output, verdict."""
+    """Verdict, format, runtime, size, and the worst difference with its output."""
     rows = []
-    for (kind, runtime), group in _groups(report.comparisons).items():
-        failed = [c for c in group if not c.passed]
-        base = kind.split(":")[0]
-        size = report.sizes.get(base)
-        rows.append(
-            [
-                kind,
-                runtime,
-                size_text(size) if size is not None and ":" not in kind else "",
-                ", ".join(_worst_by_output(group)) or "-",
-                "FAIL" if failed else "ok",
-            ]
-        )
-    return table(("format", "runtime", "size", "max |Δ| per output", "verdict"), rows)
+    for pair in report.pairs:
+        size = report.sizes.get(pair.format)
+        shown = "" if size is None else size_text(size)
+        rows.append([_word(pair.passed), pair.format, pair.runtime, shown, pair.worst_text])
+    return table(("verdict", "format", "runtime", "size", "worst |Δ|"), rows)
 
 
 def comparison_table(report: ParityReport) -> str:
-    """Every comparison on a line of its own."""
-    rows = [
-        [c.format, c.runtime, c.output, c.kind, *c.columns(), c.worst_input or "", "ok" if c.passed else "FAIL"]
-        for c in report.comparisons
-    ]
-    head = ("format", "runtime", "output", "kind", "max |Δ|", "max |Δ| / |b|", "allowed", "worst input", "verdict")
-    return table(head, rows)
+    """Every comparison on a line of its own, by format and runtime."""
+    head = ("verdict", "output", "kind", "|Δ|", "|Δ| / |b|", "allowed", "worst input")
+    parts = []
+    for pair in report.pairs:
+        rows = [[_word(c.passed), c.output, c.kind, *c.columns(), c.worst_input or ""] for c in pair.findings]
+        parts.append(f"{pair.format} in {pair.runtime}\n{table(head, rows)}")
+    return "\n\n".join(parts)
 
 
-def _groups(comparisons: Iterable[Finding]) -> dict[tuple[str, str], list[Finding]]:
-    groups: dict[tuple[str, str], list[Finding]] = {}
-    for comparison in comparisons:
-        groups.setdefault((comparison.format, comparison.runtime), []).append(comparison)
-    return groups
-
-
-def _worst_by_output(group: Iterable[Finding]) -> list[str]:
-    worst: dict[str, tuple[float, str]] = {}
-    for c in group:
-        if isinstance(c, Failure):
-            continue
-        value = c.max_abs_diff if c.measured else -1.0
-        if c.output not in worst or value > worst[c.output][0]:
-            worst[c.output] = (value, c.cell())
-    return [f"{name} {text}" for name, (_, text) in worst.items()]
+def _word(passed: bool) -> str:
+    return "ok" if passed else "FAIL"
 
 
 def failure_lines(report: ParityReport) -> list[str]:
@@ -89,10 +67,37 @@ def verdict(report: ParityReport) -> str:
     return f"FAILED: {len(report.failures)} of {len(report.comparisons)} comparisons disagree with {report.reference}"
 
 
-def not_run_lines(report: ParityReport) -> list[str]:
-    """Runtimes that could have run but are not installed, with the command that installs them."""
-    return [
-        f"  not run: {name} ({entry['reason']})"
-        for name, entry in report.runtimes.items()
-        if entry["status"] == "not run" and (entry["reason"] or "").startswith("not installed;")
-    ]
+def not_run_line(report: ParityReport) -> str | None:
+    """Runtimes that could have run but are not installed, in one line; None where there are none."""
+    missing = _missing(report)
+    if not missing:
+        return None
+    more = f" and {len(missing) - 3} more" if len(missing) > 4 else ""
+    shown = ", ".join(list(missing)[: 3 if more else 4])
+    return f"not run here: {shown}{more}    (export-model runtimes says how to install them)"
+
+
+def _missing(report: ParityReport) -> dict[str, str]:
+    """Runtime that is not installed → how to install it."""
+    found = {n: e["reason"] or "" for n, e in report.runtimes.items() if e["status"] == "not run"}
+    return {n: r.removeprefix("not installed; ") for n, r in found.items() if r.startswith("not installed; ")}
+
+
+def to_verify(report: ParityReport) -> str | None:
+    """The one command that gets a runtime to compare in, the lightest there is; None where all are here."""
+    missing = _missing(report)
+    return missing.get("onnxruntime") or next(iter(missing.values()), None)
+
+
+def whole_summary(reports: Sequence[ParityReport]) -> str:
+    """Many policies in one line."""
+    counts = Counter(r.verdict for r in reports)
+    said = ", ".join(f"{counts[v]} {v}" for v in ("passed", "self-consistent", "failed", "not verified") if counts[v])
+    failed = [r.policy for r in reports if r.passed is False]
+    named = f" ({', '.join(failed[:5])}{', …' if len(failed) > 5 else ''})" if failed else ""
+    measured = [(c, r.policy) for r in reports for c in r.comparisons if c.measured and c.passed]
+    worst = max(measured, key=lambda found: found[0].max_abs_diff, default=None)
+    most = ""
+    if worst is not None and not failed:
+        most = f"; worst |Δ| {worst[0].cell()}: {worst[0].output} of {worst[1]}, {worst[0].where}"
+    return f"{len(reports)} policies: {said}{named}{most}"

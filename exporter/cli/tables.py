@@ -1,15 +1,80 @@
-"""Plain text tables for the terminal."""
+"""Plain text for the terminal: tables and paragraphs that fit its width."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
+import textwrap
 from collections.abc import Sequence
+from itertools import zip_longest
+
+#: No column is made narrower.
+_LEAST = 8
+_GAP = 2
+#: A column of sentences has this much before names are broken.
+_SENTENCE = 26
+
+
+def room() -> int | None:
+    """Columns of the terminal; None where nobody looks (a pipe, a file): what a program reads stays on its line.
+
+    ``COLUMNS`` goes before, as everywhere.
+    """
+    if os.environ.get("COLUMNS", "").isdecimal() or sys.stdout.isatty():
+        return max(shutil.get_terminal_size().columns, 40)
+    return None
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns two spaces apart, as wide as their longest cell; numbers are the caller's to align."""
-    widths = [max(len(str(r[i])) for r in (head, *rows)) for i in range(len(head))]
-    lines = [head, ["-" * w for w in widths], *rows]
-    return "\n".join("  ".join(str(c).ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines)
+    """Columns two spaces apart, as wide as their longest cell; where the terminal is narrower, long cells wrap."""
+    columns = [[str(r[i]) for r in (head, *rows)] for i in range(len(head))]
+    widths = _fitting(columns, room())
+    lines = []
+    for row in (head, ["-" * w for w in widths], *rows):
+        cells = [_wrap(str(c), w) for c, w in zip(row, widths, strict=True)]
+        for parts in zip_longest(*cells, fillvalue=""):
+            line = "  ".join(part.ljust(w) for part, w in zip(parts, widths, strict=True))
+            lines.append(line.rstrip())
+    return "\n".join(lines)
+
+
+def _fitting(columns: Sequence[Sequence[str]], total: int | None) -> list[int]:
+    """The widths: where together they are wider than ``total``, the widest are cut to one measure, words last."""
+    widths = [max(map(len, cells)) for cells in columns]
+    if total is None:
+        return widths
+    free = total - _GAP * (len(widths) - 1)
+    words = [max(len(word) for cell in cells for word in (*cell.split(), "")) for cells in columns]
+    words = [max(n, min(w, _SENTENCE)) if w > 2 * _SENTENCE else n for n, w in zip(words, widths, strict=True)]
+    for least in (words, [_LEAST] * len(widths)):
+        limit, natural = max(widths, default=0), widths
+        while limit > _LEAST and sum(widths) > free:
+            limit -= 1
+            widths = [min(w, max(limit, n)) for w, n in zip(natural, least, strict=True)]
+    return widths
+
+
+def _wrap(cell: str, width: int) -> list[str]:
+    if len(cell) <= width:
+        return [cell]
+    return textwrap.wrap(cell, width, break_on_hyphens=False) or [""]
+
+
+def paragraph(text: str, first: str = "", rest: str = "") -> str:
+    """``text`` after ``first``, wrapped to the terminal with ``rest`` before the lines that follow."""
+    width = room()
+    if width is None or len(first) + len(text) <= width:
+        return first + text
+    return textwrap.fill(
+        text, width, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
+    )
+
+
+def hint(command: str, why: str) -> str:
+    """A command, and what it is for where there is room for both on a line that begins with a word."""
+    width = room()
+    return command if width is not None and len(command) + len(why) + 12 > width else f"{command}    ({why})"
 
 
 def size_text(count: int) -> str:

@@ -59,6 +59,7 @@ def verify_command(
             reports.append(report)
             progress.clear()
             console.verified(report, folder)
+    console.whole(reports)
     console.check_rules(reports)
     console.json({"reports": [r.to_dict() for r in reports]})
     console.write_reports(lambda: _bundle_entries(reports, bundles, options.steps))

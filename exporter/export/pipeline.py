@@ -182,8 +182,9 @@ class Exporter:
         jobs = self.compiled(path, names, progress)
         for job in jobs:
             bundle.check_replaceable(self.options.out / job.policy.name)
-        for job, contract, artifacts in [(j, *_write(j, self._formats, self.options)) for j in jobs]:
-            yield self._verified(job, contract, artifacts, pool, progress)
+        made = [(j, *_write(j, self._formats, self.options)) for j in jobs]
+        for number, (job, contract, artifacts) in enumerate(made, 1):
+            yield self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
 
     def _verified(
         self, job: _Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool, progress: Progress
@@ -234,9 +235,9 @@ def export(
     exporter.check(paths, progress)
     errors: list[ExportModelError] = []
     with nullcontext(pool) if pool is not None else RuntimePool() as pool:
-        for path in paths:
+        for number, path in enumerate(paths, 1):
             try:
-                yield from exporter.export(path, names, pool, progress)
+                yield from exporter.export(path, names, pool, counted(progress, number, len(paths)))
             except ExportModelError as error:
                 if len(paths) == 1:
                     raise
@@ -245,6 +246,11 @@ def export(
                     refused(error)
     if errors and refused is None:
         raise RefusedError(errors, len(paths))
+
+
+def counted(progress: Progress, number: int, total: int) -> Progress:
+    """Steps on one of several, with its number."""
+    return progress if total == 1 else lambda text: progress(f"[{number}/{total}] {text}")
 
 
 def _profile(name: str) -> Profile:

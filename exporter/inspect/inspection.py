@@ -14,7 +14,7 @@ from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
 from converters.source import ReadOptions
-from exporter.cli.tables import size_text, table
+from exporter.cli.tables import paragraph, size_text, table
 from exporter.export.sources import naming, read_source
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError
@@ -160,12 +160,13 @@ def _policy_text(inspected: PolicyInspection) -> str:
     lines.append("\n\n".join(table(head, rows) for head, rows in _tables(signature)))
     lines += _label_lines(signature.labels)
     if signature.constants:
-        lines += ["", "constants: " + ", ".join(f"{k}={v}" for k, v in signature.constants.items())]
-    lines += [f"note: {note}" for note in signature.notes]
-    lines.append("ops: " + ", ".join(f"{op} {n}" for op, n in inspected.ops.items()))
+        lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
+    lines += [paragraph(note, "note: ", "  ") for note in signature.notes]
+    lines.append(paragraph(", ".join(f"{op} {n}" for op, n in inspected.ops.items()), "ops: ", "  "))
     able = [t for t, reason in inspected.targets.items() if reason is None]
     lines.append(f"can be written as: {', '.join(able) or 'nothing'}")
-    lines += [f"cannot be written as {t}: {reason}" for t, reason in inspected.targets.items() if reason is not None]
+    refused = {t: reason for t, reason in inspected.targets.items() if reason is not None}
+    lines += [paragraph(reason, f"cannot be written as {t}: ", "  ") for t, reason in refused.items()]
     return "\n".join(lines)
 
 

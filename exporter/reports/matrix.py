@@ -44,18 +44,15 @@ class Matrix:
 
 def matrix(report: ParityReport) -> Matrix:
     """The table of ``report``."""
-    groups: dict[tuple[str, str], list[Finding]] = {}
-    for c in report.comparisons:
-        groups.setdefault((c.format, c.runtime), []).append(c)
     rows = []
-    for (kind, runtime), group in groups.items():
+    for pair in report.pairs:
         by_output: dict[str, list[Finding]] = {}
-        for c in group:
+        for c in pair.findings:
             if not isinstance(c, Failure):
                 by_output.setdefault(c.output, []).append(c)
-        reasons = [c.reason for c in group if isinstance(c, Failure)]
+        reasons = [c.reason for c in pair.findings if isinstance(c, Failure)]
         cells = {output: _cell(found) for output, found in by_output.items()}
-        rows.append(Row(kind, runtime, report.sizes.get(kind), cells, reasons[0] if reasons else None))
+        rows.append(Row(pair.format, pair.runtime, report.sizes.get(pair.format), cells, next(iter(reasons), None)))
     outputs = tuple(dict.fromkeys(c.output for c in report.comparisons if not isinstance(c, Failure)))
     return Matrix(outputs, tuple(rows))
 

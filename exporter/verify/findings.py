@@ -183,7 +183,8 @@ class Numbers(Finding):
 
     def columns(self) -> tuple[str, str, str]:
         """As they are."""
-        return f"{self.max_abs_diff:.2e}", f"{self.max_rel_diff:.2e}", self.bound
+        bound = f"{self.tolerance.atol:g} + {self.tolerance.rtol:g}·|b|"
+        return f"{self.max_abs_diff:.2e}", f"{self.max_rel_diff:.2e}", bound
 
 
 class Rollout(Numbers):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from exporter.verify.findings import Failure, Finding
+from exporter.verify.findings import Failure, Finding, Shape
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,10 @@ class Pair:
         """The largest difference with its output, of what failed where anything did; else what there is to say."""
         told = [c for c in self.findings if not isinstance(c, Failure)]
         worst = max(told, key=lambda c: (not c.passed, c.measured, c.max_abs_diff), default=None)
-        return "no answer" if worst is None else f"{worst.cell()} {worst.output}"
+        if worst is None:
+            return "no answer"
+        drawn = dict.fromkeys(c.output for c in told if isinstance(c, Shape) and c.output != worst.output)
+        return f"{worst.cell()} {worst.output}" + (f"; drawn: {', '.join(drawn)}" if drawn else "")
 
 
 @dataclass(frozen=True, slots=True)

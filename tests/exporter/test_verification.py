@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from converters.graph.options import CompileOptions
-from exporter.cli.summary import failure_lines, not_run_lines, parity_table, verdict
+from exporter.cli.summary import (
+    comparison_table,
+    failure_lines,
+    not_run_line,
+    parity_table,
+    to_verify,
+    verdict,
+    whole_summary,
+)
 from exporter.export.pipeline import ExportResult
 from exporter.verify.checks.numbers import plausible
 from exporter.verify.findings import Failure, Finding, Numbers
@@ -181,8 +189,8 @@ def test_a_fault_is_found_and_named(
     assert f"{kind} in {runtime}: " in text
     assert words in text
     assert verdict(report).startswith(f"FAILED: {len(report.failures)} of {len(report.comparisons)}")
-    line = next(row for row in parity_table(report).splitlines() if row.startswith(f"{kind} ") and runtime in row)
-    assert line.endswith("FAIL")
+    line = next(row for row in parity_table(report).splitlines() if f" {kind} " in row and runtime in row)
+    assert line.startswith("FAIL ")
 
 
 def test_a_difference_that_rounding_explains_is_no_fault(exporting: Exporting) -> None:
@@ -240,7 +248,7 @@ def test_draws_have_the_right_distribution(exporting: Exporting) -> None:
         *(("tfjs", "tfjs-cpu"), ("tfjs", "tfjs-wasm"), ("onnx", "onnxruntime")),
     }
     assert all(c.passed and 0 <= c.max_abs_diff <= 1 for c in draws)
-    assert "action drawn" in parity_table(report)
+    assert "drawn: action" in parity_table(report)
 
 
 def _always(choice: int) -> Callable[[Tensors], None]:
@@ -425,14 +433,41 @@ def test_a_failure_says_by_how_much_and_what_would_be_allowed() -> None:
         "onnx in onnxruntime: action differs by 0.5 (relative 0.25), allowed 1e-05 + 1e-05·|reference| [numbers, zeros]"
     )
     assert second.strip() == "onnx in onnxruntime: died"
-    assert "action 5.0e-01" in parity_table(report)
+    assert "5.0e-01 action" in parity_table(report)
 
 
 def test_a_report_without_an_independent_runtime_is_not_verified() -> None:
     entry = {"version": None, "status": "not run", "reason": "not installed; pip install x"}
     report = ParityReport("p", None, 0, 2, "numpy", {"x": entry}, ())
     assert verdict(report) == "NOT VERIFIED: no independent runtime ran"
-    assert not_run_lines(report) == ["  not run: x (not installed; pip install x)"]
+    assert (to_verify(report), not_run_line(report)) == (
+        "pip install x",
+        "not run here: x    (export-model runtimes says how to install them)",
+    )
+
+
+def test_many_policies_are_one_line() -> None:
+    good = ParityReport("p", True, 0, 2, "numpy", {}, (comparison(passed=True), comparison(max_abs_diff=0.1)))
+    bad = ParityReport("q", False, 0, 2, "numpy", {}, (comparison(),))
+    assert whole_summary([good, good]) == "2 policies: 2 passed; worst |Δ| 5.0e-01: action of p, onnx in onnxruntime"
+    assert whole_summary([good, bad]) == "2 policies: 1 passed, 1 failed (q)"
+
+
+@pytest.mark.parametrize("columns", [80, 120, 160])
+def test_what_the_terminal_shows_fits_it(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "saved_model:serving_default"
+    long = comparison(format=name, runtime="onnxruntime-web@chromium", output="a_rather_long_name_of_an_output")
+    report = ParityReport("p", False, 0, 2, "numpy", {}, (comparison(), long), {"onnx": 17_000})
+    free = parity_table(report)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    for text in (parity_table(report), comparison_table(report)):
+        assert max(map(len, text.splitlines())) <= columns
+        assert all(
+            line.startswith(("FAIL ", "verdict", "-------", "   ")) or " in " in line
+            for line in text.split("\n")
+            if line
+        )
+    assert columns < 120 or parity_table(report) == free
 
 
 def test_honest_actors_change_nothing() -> None:
