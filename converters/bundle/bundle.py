@@ -25,6 +25,15 @@ _AGAIN = "export the policy again"
 _MOST_BYTES = 64 << 20
 
 
+def bundles_in(place: Path) -> list[Path]:
+    """The bundle at ``place``, or those in that folder, by name."""
+    if (place / POLICY).is_file():
+        return [place]
+    if not place.is_dir():
+        return []
+    return sorted(p for p in place.iterdir() if not p.name.startswith(".") and (p / POLICY).is_file())
+
+
 @dataclass(frozen=True)
 class Bundle:
     """A folder that this tool wrote, with what its policy.json says."""

@@ -20,6 +20,8 @@ class RuntimeInfo:
     installed: bool
     version: str | None
     how: str
+    #: whether this system can have it at all; where it cannot, ``how`` says why
+    supported: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,7 @@ class Runtime:
     independent: bool = True
     #: How it approximates functions (converters/graph/jitter.py).
     arithmetic: Arithmetic = "processor"
-    #: ``auto`` takes it where it is installed; a browser is started only when it is asked for (``full`` or by name).
+    #: ``auto`` takes it where it is installed; a browser is started only on request.
     automatic: bool = True
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.
     confined: bool = True

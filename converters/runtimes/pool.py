@@ -25,18 +25,26 @@ _COMMANDS = MappingProxyType({r.name: r.command for r in RUNTIMES})
 def chosen_runtimes(
     wanted: str | Sequence[str], formats: Iterable[Format]
 ) -> tuple[tuple[str, ...], list[RuntimeInfo]]:
-    """(runtimes to use, what is known of all of them) for ``auto``, ``none``, ``full`` or a list of names.
+    """(runtimes to use, what is known of all of them) for ``none``, or names, or words that stand for several.
 
-    Raises UsageError on a name that is none, RuntimeUnavailableError when one that was asked for is not installed.
+    ``auto`` are those that are installed and fit the formats, without a browser's; ``browser`` those in a browser;
+    ``full`` all that this system can have. Raises UsageError on a name that is none, RuntimeUnavailableError when one
+    that was asked for is not installed.
     """
     infos = list(available_runtimes())
     known = {info.name: info for info in infos}
     useful = {*_ORIGINALS, *(r for f in formats for r in f.runtimes)}
     if wanted == "none":
         return (), infos
+    automatic = tuple(i.name for i in infos if i.installed and i.name in useful and i.name not in _ON_REQUEST)
     if wanted == "auto":
-        return tuple(i.name for i in infos if i.installed and i.name in useful and i.name not in _ON_REQUEST), infos
-    names = [n for n in known if n in INDEPENDENT or n == "numpy"] if wanted == "full" else _names(wanted)
+        return automatic, infos
+    several = {
+        "auto": automatic,
+        "browser": [n for n in known if n in _ON_REQUEST],
+        "full": [n for n in known if known[n].supported and (n in INDEPENDENT or n == "numpy")],
+    }
+    names = [n for word in _names(wanted) for n in several.get(word, (word,))]
     for name in names:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
+from exporter.cli.group import Command
 from exporter.cli.options import comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
@@ -16,13 +17,21 @@ if TYPE_CHECKING:
     from exporter.verify.options import VerifyOptions
 
 
-@click.command("compare")
+@click.command(
+    "compare",
+    cls=Command,
+    short_help="Compare files that any tool made with a reference.",
+    examples=(
+        ("export-model compare 3DBall.bytes theirs.onnx", ""),
+        ("export-model compare 3DBall.bytes tfjs --map action=Identity", ""),
+    ),
+)
 @click.argument("reference", type=click.Path(path_type=Path))
 @click.argument("candidates", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CANDIDATE...")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call a name.")
 @trusting
 @click.option(
-    "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
+    "--runtimes", default="auto", show_default=True, metavar="WHERE", help="auto, full, browser, or runtimes by name."
 )
 @click.option("--allow-unverified", is_flag=True, help="Succeed although no runtime of theirs is installed.")
 @reporting
@@ -39,7 +48,7 @@ def compare_command(
     console: Console,
     options: VerifyOptions,
 ) -> None:
-    """Hold artefacts that any tool made against a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    """Compare files that any tool made with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
     from converters.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
     from exporter.reports.entry import Entry

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
-from exporter.cli.group import PROGRAM
+from exporter.cli.group import PROGRAM, Command
 
 _SHELLS = {
     "bash": 'add this to ~/.bashrc:  eval "$(export-model completion bash)"',
@@ -14,7 +14,12 @@ _SHELLS = {
 }
 
 
-@click.command("completion")
+@click.command(
+    "completion",
+    cls=Command,
+    short_help="Print the script for completion in a shell.",
+    examples=(("export-model completion bash >> ~/.bashrc", "bash"),),
+)
 @click.argument("shell", type=click.Choice(tuple(_SHELLS)))
 def completion_command(shell: str) -> None:
     """Print the script that completes commands, options and files; its last line says where it goes."""

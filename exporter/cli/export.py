@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from exporter.cli.console import Console, reporting
+from exporter.cli.group import Command
 from exporter.cli.options import activating, comparing, read_options, trusting, understanding
 
 if TYPE_CHECKING:
@@ -20,7 +21,18 @@ if TYPE_CHECKING:
     from signatures.errors import ExportModelError
 
 
-@click.command("export")
+@click.command(
+    "export",
+    cls=Command,
+    short_help="Export policies to every format, and compare them.",
+    examples=(
+        ("export-model 3DBall.bytes -o out", "four formats, compared"),
+        ("export-model results/first_run", "each behavior of a run"),
+        ("export-model 3DBall.nn --to onnx", "one format"),
+        ("export-model 3DBall.onnx --for unity6", "for the Model field"),
+        ("export-model 3DBall.bytes --verify full", "in every runtime"),
+    ),
+)
 @click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="SOURCE...")
 @click.option(
     "-o",
@@ -34,7 +46,7 @@ if TYPE_CHECKING:
     "--to",
     "targets",
     metavar="FORMATS",
-    help="Formats to write: bytes, saved_model, tfjs, onnx, nn (default: all but nn, or what --for loads).",
+    help="bytes, saved_model, tfjs, onnx, nn (default: all but nn).",
 )
 @click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
@@ -43,7 +55,7 @@ if TYPE_CHECKING:
     type=click.Choice(["canonical", "source"]),
     default="canonical",
     show_default=True,
-    help="Tensor names: canonical, or the trainer's own (as compare and old scripts know them).",
+    help="Tensor names: canonical, or the trainer's own.",
 )
 @click.option(
     "--noise",
@@ -58,14 +70,14 @@ if TYPE_CHECKING:
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
 @activating
 @click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
-@click.option("--opset", type=int, help="ONNX opset (default: 15).")
+@click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @click.option(
     "--verify",
     "runtimes",
     default="auto",
     show_default=True,
-    metavar="auto|none|full|RUNTIME,...",
-    help="Runtimes to compare in.",
+    metavar="WHERE",
+    help="auto, full, browser, none, or runtimes by name.",
 )
 @reporting
 @understanding
@@ -87,7 +99,10 @@ def export_command(
     console: Console,
     options: VerifyOptions,
 ) -> None:
-    """Export policies (the command that is meant where none is named)."""
+    """Export policies, and compare what was written in the runtimes that are here.
+
+    This is the command that is meant where none is named.
+    """
     from exporter.export.pipeline import ExportOptions, export
 
     if profile == "help":

@@ -6,7 +6,9 @@ Imports click only.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
@@ -16,6 +18,51 @@ from signatures.errors import UsageError
 
 PROGRAM = "export-model"
 _OWN = frozenset(("--help", "-h", "--version"))
+
+
+#: Title of a group of options → their parameters, in the order of the help.
+GROUPS = {
+    "What to write": (
+        *("out", "targets", "profile", "name", "names", "noise", "deterministic", "labels", "opset", "logdir", "svg"),
+        *("scene", "target"),
+    ),
+    "How to read the source": (
+        *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "trust_source"),
+    ),
+    "What Unity would say": ("releases", "actions", "brain_parameters"),
+    "How to verify": (
+        *("runtimes", "allow_unverified", "samples", "seed", "steps", "atol", "rtol", "tolerances", "golden", "sizes"),
+    ),
+    "The server": ("host", "port", "opens"),
+    "Output": ("verbose", "quiet", "as_json", "html", "markdown", "junit", "help"),
+}
+
+
+class Command(click.Command):
+    """A command whose help has its options in groups, and examples: (what is typed, what it does)."""
+
+    def __init__(self, *args: Any, examples: Sequence[tuple[str, str]] = (), **rest: Any) -> None:
+        super().__init__(*args, **rest)
+        self.examples = tuple(examples)
+        width = max((len(typed) for typed, _ in examples), default=0)
+        lines = [f"  {typed:{width}}  {what}" for typed, what in examples]
+        self.epilog = "\n".join(["\b", "Examples:", *lines]) if lines else None
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The options by group; an option that is in none stands under Output."""
+        options = (p for p in self.get_params(ctx) if isinstance(p, click.Option))
+        found = {p.name: r for p in options if (r := p.get_help_record(ctx)) is not None}
+        grouped = {name: title for title, names in GROUPS.items() for name in names}
+        for title in GROUPS:
+            names = [n for n in found if grouped.get(n or "", "Output") == title]
+            if names:
+                with formatter.section(title):
+                    formatter.write_dl([found[n] for n in sorted(names, key=_place)])
+
+
+def _place(name: str | None) -> int:
+    order = [n for names in GROUPS.values() for n in names]
+    return order.index(name) if name in order else len(order)
 
 
 class SourceGroup(click.Group):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from exporter.cli.group import Command
 from exporter.cli.options import activating, read_options, trusting, understanding
 from signatures.errors import UsageError
 
@@ -16,7 +17,16 @@ if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
 
 
-@click.command("inspect")
+@click.command(
+    "inspect",
+    cls=Command,
+    short_help="Show what is in a file, or what Unity would say to it.",
+    examples=(
+        ("export-model inspect 3DBall.nn", "inputs, outputs, layers"),
+        ("export-model inspect 3DBall.onnx --unity all", "what ML-Agents says to it"),
+        ("export-model inspect 3DBall.nn --svg 3DBall.svg", "a picture"),
+    ),
+)
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
@@ -25,7 +35,7 @@ if TYPE_CHECKING:
     "--svg",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write a picture of the policy (with --unity: of Behavior Parameters).",
+    help="Draw the policy (with --unity: Behavior Parameters).",
 )
 @trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")

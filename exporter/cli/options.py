@@ -28,6 +28,19 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     return found
 
 
+def one_bundle(place: Path, command: str) -> Path | None:
+    """The bundle at ``place``, or the only one in that folder; None where there is none. Raises UsageError."""
+    from converters.bundle.bundle import bundles_in
+
+    found = bundles_in(place)
+    if len(found) > 1:
+        names = ", ".join(p.name for p in found)
+        raise UsageError(
+            f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: export-model {command} {found[0]}"
+        )
+    return found[0] if found else None
+
+
 def sensors_of(text: str) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
     """``"8,goal:3,20x4,3x84x84"``: the shapes of a vector, another, a list of entities and an image C, H, W; and the
     places of those that are goals.
@@ -54,7 +67,7 @@ def read_options(step: int | None, sensors: str, trust_source: bool, activation:
 
 def activating(command: Callable[..., Any]) -> Callable[..., Any]:
     """The option for files that have the weights of layers and not what stands between them."""
-    said = "What stands between the layers of a state dictionary: elu, tanh, relu ..."
+    said = "What stands between the layers of a bare .pt: elu, tanh, …"
     return click.option("--activation", metavar="NAME", help=said)(command)
 
 
@@ -71,7 +84,7 @@ def _numbers(values: Sequence[str]) -> dict[str, float]:
 
 def trusting(command: Callable[..., Any]) -> Callable[..., Any]:
     """The option for sources that only a loader of their own can read, which runs what they say."""
-    said = "Load a Keras model, which can run code: you know where it comes from."
+    said = "Load a Keras model, which can run code: you trust it."
     return click.option("--trust-source", is_flag=True, help=said)(command)
 
 
@@ -134,11 +147,21 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
 
     for option in (
         click.option(
-            "--samples", type=click.IntRange(1), default=2, show_default=True, help="Typical inputs per batch size."
+            "--samples",
+            type=click.IntRange(1),
+            metavar="N",
+            default=2,
+            show_default=True,
+            help="Typical inputs per batch size.",
         ),
-        click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inputs."),
+        click.option("--seed", type=int, metavar="N", default=0, show_default=True, help="Seed of the inputs."),
         click.option(
-            "--steps", type=click.IntRange(1), default=4, show_default=True, help="Steps with the memory fed back."
+            "--steps",
+            type=click.IntRange(1),
+            metavar="N",
+            default=4,
+            show_default=True,
+            help="Steps with the memory fed back.",
         ),
         click.option("--max-size", "sizes", multiple=True, metavar="[FORMAT=]SIZE", help="Fail above this size: 1MB."),
         click.option(
@@ -147,8 +170,8 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="FILE",
             help="Recorded inputs (and outputs), an .npz.",
         ),
-        click.option("--atol", type=float, default=1e-5, show_default=True, help="Absolute tolerance."),
-        click.option("--rtol", type=float, default=1e-5, show_default=True, help="Relative tolerance."),
+        click.option("--atol", type=float, metavar="X", default=1e-5, show_default=True, help="Absolute tolerance."),
+        click.option("--rtol", type=float, metavar="X", default=1e-5, show_default=True, help="Relative tolerance."),
     ):
         collected = option(collected)
     return collected

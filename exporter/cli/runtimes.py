@@ -17,7 +17,7 @@ _SAID = {
 }
 
 
-@click.group("runtimes", invoke_without_command=True)
+@click.group("runtimes", invoke_without_command=True, short_help="List the runtimes, and how to install the others.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def runtimes_command(ctx: click.Context, as_json: bool) -> None:

@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
+from exporter.cli.group import Command
+from exporter.cli.options import one_bundle
 from signatures.errors import UsageError
 
 _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
 
 
-@click.command("serve")
-@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE")
+@click.command(
+    "serve",
+    cls=Command,
+    short_help="Open a page on which the policy acts.",
+    examples=(
+        ("export-model serve exported/3DBall --open", "in your browser"),
+        ("export-model serve 3DBall.onnx", "a source: exported for the page"),
+        ("export-model serve exported/3DBall -o site", "files for any web server"),
+    ),
+)
+@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE|SOURCE")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="Port; 0 takes a free one."
@@ -26,7 +40,7 @@ _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
     type=click.Choice(_SCENES),
     default="auto",
     show_default=True,
-    help="The environment that is drawn; auto goes by the policy's name, its observations and its actions.",
+    help="The environment; auto goes by name, sizes and actions.",
 )
 def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | None, scene: str) -> None:
     """A page where the policy acts in your browser: its environment if it is a known one, else a panel of sliders."""
@@ -34,7 +48,8 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
 
     if out is not None and opens:
         raise UsageError("--out and --open contradict each other", fix="host the folder, and open its address")
-    site = assemble(bundle, scene)
+    with _bundle_of(bundle) as folder:
+        site = assemble(folder, scene)
     if out is not None:
         write_site(site, out)
         click.echo(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
@@ -50,3 +65,26 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
             webbrowser.open(server.url)
         server.serve_forever()
     click.echo("ended")
+
+
+@contextmanager
+def _bundle_of(place: Path) -> Iterator[Path]:
+    """The bundle at ``place``; a source is exported into a folder that lasts as long as the context."""
+    found = one_bundle(place, "serve")
+    if found is not None or not place.exists():
+        yield found or place
+        return
+    from exporter.export.pipeline import ExportOptions, export
+
+    with tempfile.TemporaryDirectory(prefix="export-model-") as folder:
+        results = list(export([place], ExportOptions(Path(folder), ("bytes", "tfjs"), verify="none")))
+        if len(results) > 1:
+            raise UsageError(
+                f"{place} holds {len(results)} policies",
+                why=", ".join(r.policy.name for r in results),
+                fix=f"export-model {place} -o exported    (then: export-model serve exported/{results[0].policy.name})",
+            )
+        click.echo(
+            f"exported for this page alone, not compared; to keep it: export-model {place} -o exported", err=True
+        )
+        yield results[0].folder

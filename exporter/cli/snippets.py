@@ -7,19 +7,35 @@ from pathlib import Path
 
 import click
 
+from exporter.cli.group import Command
+from exporter.cli.options import one_bundle
+from signatures.errors import UsageError
 
-@click.command("snippets")
-@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE")
-@click.option(
-    "--for", "target", metavar="NAME", help="Only this one (or all that begin so: serving), ready to be piped."
+
+@click.command(
+    "snippets",
+    cls=Command,
+    short_help="Print code that calls the policy.",
+    examples=(
+        ("export-model snippets exported/3DBall", "all of it"),
+        ("export-model snippets exported/3DBall --for tfjs", "one, ready to be piped"),
+    ),
 )
+@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE")
+@click.option("--for", "target", metavar="NAME", help="Only this one (or all that begin so), ready to be piped.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
     """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""
     from exporter.snippets.contract import read_bundle
     from exporter.snippets.registry import snippets
 
-    found = read_bundle(bundle)
+    place = one_bundle(bundle, "snippets")
+    if place is None and bundle.exists():
+        raise UsageError(
+            f"{bundle} is not a bundle",
+            fix=f"export-model {bundle} -o exported    (then: export-model snippets exported)",
+        )
+    found = read_bundle(place or bundle)
     made, lacking = snippets(found, target)
     if as_json:
         content = {"policy": found.name, "snippets": [s.to_dict() for s in made], "left_out": lacking}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
+from exporter.cli.group import Command
 from exporter.cli.options import comparing, trusting
 
 if TYPE_CHECKING:
@@ -18,13 +19,22 @@ if TYPE_CHECKING:
     from exporter.verify.report import ParityReport
 
 
-@click.command("verify")
+@click.command(
+    "verify",
+    cls=Command,
+    short_help="Verify bundles again: hashes, then every format.",
+    examples=(
+        ("export-model verify exported/3DBall", "one bundle"),
+        ("export-model verify exported --junit parity.xml", "all in a folder"),
+        ("export-model verify out/3DBall --source 3DBall.bytes", "against the original"),
+    ),
+)
 @click.argument("bundles", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="BUNDLE...")
 @click.option("--source", type=click.Path(path_type=Path), help="The file the bundle was exported from.")
 @click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
 @trusting
 @click.option(
-    "--runtimes", default="auto", show_default=True, metavar="auto|full|RUNTIME,...", help="Runtimes to compare in."
+    "--runtimes", default="auto", show_default=True, metavar="WHERE", help="auto, full, browser, or runtimes by name."
 )
 @click.option("--allow-unverified", is_flag=True, help="Succeed although no independent runtime is installed.")
 @reporting
@@ -39,13 +49,18 @@ def verify_command(
     console: Console,
     options: VerifyOptions,
 ) -> None:
-    """Verify bundles again: hashes first, then every format in the runtimes."""
-    from exporter.export.pipeline import verify_folder
+    """Verify bundles again: hashes first, then every format in the runtimes.
+
+    A folder of bundles stands for all of them.
+    """
+    from converters.bundle.bundle import bundles_in
+    from exporter.export.pipeline import counted, verify_folder
 
     console.prepare()
+    bundles = tuple(found for place in bundles for found in bundles_in(place) or [place])
     reports = []
     with console.progress() as progress:
-        for folder in bundles:
+        for number, folder in enumerate(bundles, 1):
             report = verify_folder(
                 folder,
                 source=source,
@@ -54,7 +69,7 @@ def verify_command(
                 runtimes=runtimes,
                 options=options,
                 allow_unverified=allow_unverified,
-                progress=progress,
+                progress=counted(progress, number, len(bundles)),
             )
             reports.append(report)
             progress.clear()

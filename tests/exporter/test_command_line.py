@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from converters.runtimes.javascript.node import install_packages
 from converters.runtimes.registry import RUNTIMES, Runtime
 from exporter.cli.app import app
 from exporter.cli.console import Console
+from exporter.cli.group import GROUPS, Command
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
@@ -73,11 +75,34 @@ def test_help_lists_every_command() -> None:
         assert own.out.startswith(f"Usage: export-model {name} ")
 
 
-def test_every_option_has_a_help_text() -> None:
+def test_every_option_has_a_short_help_and_a_group() -> None:
+    grouped = {name for names in GROUPS.values() for name in names}
     for name, command in app.commands.items():
+        assert 0 < len(command.short_help or "") <= 60, name
         for parameter in command.params:
-            if parameter.param_type_name == "option":
-                assert parameter.help, (name, parameter.name)
+            if isinstance(parameter, click.Option):
+                assert 0 < len(parameter.help or "") <= 60, (name, parameter.name)
+                assert parameter.name in grouped, (name, parameter.name)
+
+
+@pytest.mark.parametrize("name", sorted(n for n, c in app.commands.items() if isinstance(c, Command)))
+def test_the_examples_of_a_help_are_commands_that_there_are(name: str) -> None:
+    command = app.commands[name]
+    assert isinstance(command, Command)
+    assert command.examples
+    shown = export_model(name, "--help").out
+    for typed, _ in command.examples:
+        assert f"    {typed}" in shown
+        program, *words = typed.split(" >")[0].split()
+        assert program == "export-model"
+        command.make_context(name, words[words[0] == name :])
+
+
+def test_help_fits_a_terminal_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for name in app.commands:
+        shown = export_model(name, "--help").out
+        assert max(map(len, shown.splitlines())) <= 80, shown
 
 
 def test_no_argument_shows_the_usage_and_is_status_2() -> None:

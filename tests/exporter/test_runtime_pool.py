@@ -54,6 +54,24 @@ def test_full_is_everything_and_nothing_may_be_missing(here: set[str]) -> None:
     assert caught.value.fix == "get onnxruntime"
 
 
+def test_full_leaves_out_what_the_system_cannot_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    infos = [RuntimeInfo("numpy", True, "1", ""), RuntimeInfo("onnxruntime", True, "1", "")]
+    infos.append(RuntimeInfo("tf1.4", False, None, "only for Linux", supported=False))
+    monkeypatch.setattr(pools, "available_runtimes", lambda: tuple(infos))
+    assert names("full") == ("numpy", "onnxruntime")
+    with pytest.raises(RuntimeUnavailableError, match=r"tf1\.4 is not installed"):
+        names("tf1.4")
+
+
+def test_words_stand_for_several_and_may_be_combined(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = tuple(RuntimeInfo(r.name, True, "1", "") for r in RUNTIMES)
+    monkeypatch.setattr(pools, "available_runtimes", lambda: every)
+    browser = ("tfjs-webgl", "tfjs-cpu@chromium", "tfjs-wasm@chromium", "onnxruntime-web@chromium")
+    assert set(names("browser")) == {"numpy", *browser}
+    assert set(names("onnxruntime,browser")) == {"numpy", "onnxruntime", *browser}
+    assert set(names("auto,browser")) == {*names("auto"), *browser}
+
+
 @pytest.mark.parametrize("wanted", ["tfjs-wasm,onnxruntime", ["tfjs-wasm", "onnxruntime"], "tfjs-wasm,,onnxruntime,"])
 def test_names_are_taken_in_their_order_and_numpy_is_always_there(here: set[str], wanted: str | list[str]) -> None:
     assert names(wanted) == ("numpy", "tfjs-wasm", "onnxruntime")

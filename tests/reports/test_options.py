@@ -60,6 +60,17 @@ def test_verify_writes_the_same_reports(exporting: Exporting, tmp_path: Path) ->
     assert "dense 64, swish" in paths[2].read_text(encoding="utf-8")
 
 
+def test_a_folder_stands_for_the_bundles_in_it(exporting: Exporting, tmp_path: Path) -> None:
+    exporting(command=(fixture("continuous"), fixture("discrete"), "-o", tmp_path / "out"))
+    (tmp_path / "out" / "notes").mkdir()
+    ran = exporting(command=("verify", tmp_path / "out"))
+    assert ran.status == 0
+    assert ran.out.splitlines()[-1].startswith("2 policies: 2 passed; worst |Δ| ")
+    assert ran.out.count(f": {tmp_path / 'out'}") == 2
+    is_refused(exporting(command=("snippets", tmp_path / "out")), "holds 2 bundles", "snippets " + str(tmp_path))
+    is_refused(exporting(command=("snippets", fixture("continuous"))), "not a bundle", "-o exported")
+
+
 def test_markdown_on_stdout_is_all_that_is_there(exporting: Exporting) -> None:
     ran = exporting("--markdown", "-")
     assert ran.out.startswith("## export-model\n")

@@ -16,6 +16,7 @@ from exporter.acting.policy import load_policy
 from exporter.serve.scenes import other_side
 from exporter.serve.server import TYPES
 from exporter.serve.site import PAGE, assemble, write_site
+from fixtures import path as fixture
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from tests.commands import export_model, files_in, is_refused
 from tests.serve.conftest import Bundle
@@ -166,6 +167,15 @@ def test_out_writes_the_site_and_replaces_only_its_own(bundle: Bundle, tmp_path:
     assert export_model("serve", bundle("3DBall"), "--out", place).status == 0
     assert not (place / "old.txt").exists()
     assert files_in(tmp_path / "deep") == {"page", *(f"page/{n}" for n in files_in(place))}
+
+
+def test_a_source_is_exported_for_the_page(bundle: Bundle, tmp_path: Path) -> None:
+    place = tmp_path / "page"
+    ran = export_model("serve", fixture("continuous"), "--out", place)
+    assert ran.status == 0
+    assert "not compared" in ran.err
+    assert (place / "model" / "model.json").read_bytes() == assemble(bundle("continuous"))["model/model.json"]
+    is_refused(export_model("serve", fixture("twobrains"), "--out", place), "holds 2 policies", "-o exported")
 
 
 @pytest.mark.parametrize("inside", ["notes.txt", "policy.json", "site.json"])

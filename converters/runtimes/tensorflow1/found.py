@@ -22,7 +22,7 @@ from signatures.errors import RuntimeUnavailableError
 def _find(release: Release) -> RuntimeInfo:
     reason = unsupported_reason()
     if reason is not None:
-        return RuntimeInfo(release.runtime, False, None, reason)
+        return RuntimeInfo(release.runtime, False, None, reason, supported=False)
     here = is_whole(library_folder(release))
     return RuntimeInfo(release.runtime, here, release.version if here else None, how(release))
 
