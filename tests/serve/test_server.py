@@ -7,12 +7,16 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+from contextlib import suppress
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exporter.serve.server import SiteServer, listening
+import exporter.serve.server as server_module
+from exporter.serve.server import CONTENT_POLICY, HEADERS, SiteServer, listening
+from exporter.serve.site import PAGE
 from signatures.errors import UsageError
 from tests.commands import ROOT, export_model, is_refused
 from tests.serve.browsing import served
@@ -84,6 +88,83 @@ def test_nothing_else_is_served() -> None:
         for target in CROOKED:
             assert ask(server, target)[0] == 404, target
         check()
+
+
+def raw(server: SiteServer, request: bytes, patience: float = 20) -> bytes:
+    """All that comes back until the server closes the connection."""
+    with socket.create_connection(server.server_address[:2], timeout=patience) as connection:
+        connection.sendall(request)
+        parts = []
+        while part := connection.recv(65536):
+            parts.append(part)
+        return b"".join(parts)
+
+
+REQUESTS: dict[str, tuple[bytes, int]] = {
+    "a file": (b"GET / HTTP/1.1\r\nHost: localhost:PORT\r\nConnection: close\r\n\r\n", 200),
+    "by its address": (b"GET / HTTP/1.0\r\nHost: 127.0.0.1:PORT\r\n\r\n", 200),
+    "by a new address": (b"GET / HTTP/1.0\r\nHost: [::1]:PORT\r\n\r\n", 200),
+    "what is not there": (b"GET /<b>x HTTP/1.0\r\nHost: localhost:PORT\r\n\r\n", 404),
+    "a name that was bent to this address": (b"GET / HTTP/1.1\r\nHost: evil.example:PORT\r\n\r\n", 421),
+    "a name that begins right": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1.evil.example:PORT\r\n\r\n", 421),
+    "another port": (b"GET / HTTP/1.1\r\nHost: localhost:1\r\n\r\n", 421),
+    "no name": (b"GET / HTTP/1.1\r\n\r\n", 421),
+    "two names": (b"GET / HTTP/1.1\r\nHost: localhost:PORT\r\nHost: x\r\n\r\n", 421),
+    "a method that is none": (b"POST / HTTP/1.1\r\nHost: localhost:PORT\r\n\r\n", 501),
+    "no version": (b"GET /\r\n\r\n", 421),
+    "a version to come": (b"GET / HTTP/9.9\r\n\r\n", 505),
+    "nonsense": (b"\x16\x03\x01\r\n\r\n", 400),
+    "a path without end": (b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n", 414),
+    "too many headers": (b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 200 + b"\r\n", 431),
+}
+
+
+@pytest.mark.parametrize("what", REQUESTS)
+def test_every_answer_says_what_a_page_may_do(what: str) -> None:
+    request, status = REQUESTS[what]
+    with served(SITE) as server:
+        answer = raw(server, request.replace(b"PORT", str(server.server_address[1]).encode()))
+    head, _, body = answer.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 %d " % status), answer
+    for name, value in HEADERS.items():
+        assert head.count(f"\r\n{name}: {value}\r\n".encode()) + head.endswith(f"{name}: {value}".encode()) == 1, name
+    assert b"Python" not in head
+    if status != 200:
+        assert b"\r\nContent-Type: text/plain; charset=utf-8\r\n" in head
+        assert b"<" not in body
+        assert body.count(b"\n") == 1
+
+
+def test_the_page_says_the_same_policy() -> None:
+    assert f'http-equiv="Content-Security-Policy" content="{CONTENT_POLICY}"' in (PAGE / "index.html").read_text()
+
+
+def test_who_says_nothing_or_no_end_holds_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Connections that wait, and ones that say a header every moment: closed; the others are answered meanwhile."""
+    monkeypatch.setattr(server_module, "PATIENCE", 1.0)
+    monkeypatch.setattr(server_module._Handler, "timeout", 1.0)
+    monkeypatch.setattr(server_module, "MOST_CONNECTIONS", 4)
+    with served(SITE) as server:
+        waiting = [socket.create_connection(server.server_address[:2], timeout=20) for _ in range(3)]
+        assert ask(server, "/")[0] == 200
+        full = [socket.create_connection(server.server_address[:2], timeout=20) for _ in range(4)]
+        talking, end = waiting[0], time.monotonic() + 20
+        with suppress(OSError):
+            while time.monotonic() < end:
+                talking.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n" if end - time.monotonic() > 19.8 else b"a: b\r\n")
+                time.sleep(0.2)
+        assert time.monotonic() < end, "it may talk without end"
+        for connection in (*waiting[1:], *full):
+            with suppress(OSError):
+                assert connection.recv(1) == b""
+            connection.close()
+        talking.close()
+        for _ in range(100):
+            with suppress(OSError, http.client.HTTPException):
+                assert ask(server, "/")[0] == 200
+                return
+            time.sleep(0.1)
+        pytest.fail("no thread came free")
 
 
 def test_a_port_that_is_taken_is_refused(bundle: Bundle) -> None:
