@@ -8,6 +8,7 @@ known are left alone.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,6 +38,16 @@ _SPACES = ("continuous", "discrete", "hybrid")
 _OUTPUT_ROLES = tuple(r.value for r in Role if r not in INPUT_ROLES)
 #: What a placeholder that is fixed may hold.
 _MOST_FIXED = 1_000_000
+#: Numbers that one agent may be fed in all (five images of 512x512x3), and actions in all branches: what is tried and
+#: shown is made of them, whatever the file's size.
+_MOST_FED, _MOST_ACTIONS = 1 << 22, 1 << 16
+#: Role → the ranks that whoever reads the role relies on; of others any.
+_RANKS = {
+    Role.VISUAL: (4,),
+    Role.MASKS: (2,),
+    Role.PREV_ACTION: (1, 2),
+    **dict.fromkeys((Role.VECTOR, Role.ENTITIES, Role.CONTINUOUS, Role.LOG_PROBS, Role.PROBS), tuple(range(1, 33))),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +126,20 @@ def safe_name(name: str) -> str:
 def json_of(text: str | bytes) -> Any:
     """What JSON text says. Raises FieldError."""
     try:
-        return json.loads(text)
+        return json.loads(text, parse_constant=_no_number, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise FieldError("the whole", f"is not JSON ({error})"[:200]) from error
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:20]} is beyond float64")
+    return value
 
 
 def parse(content: Any) -> Contract:
@@ -151,8 +173,12 @@ def parse_signature(whole: Field) -> PolicySignature:
     inputs = _tensors(whole["inputs"], [r.value for r in INPUT_ROLES])
     outputs = _tensors(whole["outputs"], _OUTPUT_ROLES)
     space = whole["action_space"].one_of(_SPACES)
-    if len(outputs) < (2 if space == "hybrid" else 1):
+    _check_sizes(whole, inputs)
+    heads = outputs[: 2 if space == "hybrid" else 1]
+    if len(heads) < (2 if space == "hybrid" else 1) or not all(head.shape for head in heads):
         raise whole["outputs"].error("lacks an action")
+    if space == "hybrid" and len({head.is_continuous for head in heads}) < 2:
+        raise whole["outputs"].error("lacks the continuous or the discrete action of a hybrid")
     named = {s.name: s for s in inputs}
     preprocess = {name: _preprocess(entry) for name, entry in whole["preprocess"].members().items()}
     if not preprocess.keys() <= named.keys():
@@ -206,11 +232,24 @@ def _tensors(entries: Field, roles: Any) -> tuple[TensorSpec, ...]:
     return found
 
 
+def _check_sizes(whole: Field, inputs: tuple[TensorSpec, ...]) -> None:
+    """Raise FieldError where an agent would be fed more than any is."""
+    if sum(math.prod(n for n in s.shape if n is not None) for s in inputs) > _MOST_FED:
+        raise whole["inputs"].error(f"has more than {_MOST_FED} numbers for an agent")
+    if sum(n.integer(1, _MOST_ACTIONS) for n in whole["branches"].items()) > _MOST_ACTIONS:
+        raise whole["branches"].error(f"has more than {_MOST_ACTIONS} actions")
+    for entry, spec in zip(whole["inputs"].items(), inputs, strict=True):
+        if spec.role in (Role.MASKS, Role.PREV_ACTION) and (spec.shape[-1] or 0) > _MOST_ACTIONS:
+            raise entry["shape"].error(f"has more than {_MOST_ACTIONS} actions")
+
+
 def _tensor(entry: Field, roles: Any) -> TensorSpec:
-    shape, source = entry["shape"].shape(), entry["source"]
+    shape, source, role = entry["shape"].shape(), entry["source"], Role(entry["role"].one_of(roles))
+    if len(shape) not in _RANKS.get(role, range(33)):
+        raise entry["shape"].error(f"has {len(shape)} axes, which {role.value} has not")
     return TensorSpec(
         entry["name"].text(),
-        Role(entry["role"].one_of(roles)),
+        role,
         entry["dtype"].one_of(_DTYPES),
         shape,
         tuple(s.text() for s in source.items())
@@ -223,28 +262,27 @@ def _tensor(entry: Field, roles: Any) -> TensorSpec:
 
 
 def _distribution(entry: Field, shape: tuple[int | None, ...]) -> dict[str, Any]:
+    """What its kind says, and nothing else: what is shown and drawn from it was looked at."""
     kind = entry["kind"].one_of(("normal", "uniform", "integer", "mask"))
     if kind == "integer":
-        low = entry["low"].integer(0)
-        entry["high"].integer(low)
-    elif kind == "uniform":
-        entry["low"].number()
-        entry["high"].number()
-    elif kind == "normal":
-        for key in ("mean", "std"):
-            _statistics(entry[key], shape)
-    return dict(entry.value)
+        low = entry["low"].integer(0, 2**31 - 1)
+        return {"kind": kind, "low": low, "high": entry["high"].integer(low, 2**31 - 1)}
+    if kind == "uniform":
+        return {"kind": kind, "low": entry["low"].number(), "high": entry["high"].number()}
+    if kind == "normal":
+        clip = {} if entry["clip"].missing else {"clip": entry["clip"].number()}
+        return {"kind": kind, **{key: _statistics(entry[key], shape) for key in ("mean", "std")}, **clip}
+    return {"kind": kind, **{key: entry[key].integer(0, 1) for key in ("allowed", "forbidden")}}
 
 
-def _statistics(entry: Field, shape: tuple[int | None, ...]) -> None:
+def _statistics(entry: Field, shape: tuple[int | None, ...]) -> Any:
     """A number, or one for each number of the input."""
     if not isinstance(entry.value, list):
-        entry.number()
-        return
-    for number in entry.items(10_000_000):
-        number.number()
-    if shape and shape[-1] not in (None, len(entry.value)) and len(entry.value) != 1:
-        raise entry.error(f"has {len(entry.value)} numbers, and the input {shape[-1]}")
+        return entry.number()
+    found = [number.number() for number in entry.items(_MOST_FED)]
+    if len(found) != 1 and (not shape or shape[-1] != len(found)):
+        raise entry.error(f"has {len(found)} numbers, and the input {shape[-1] if shape else 1}")
+    return found
 
 
 def _preprocess(entry: Field) -> dict[str, Any]:
@@ -252,8 +290,8 @@ def _preprocess(entry: Field) -> dict[str, Any]:
     low, high = (n.number() for n in _pair(entry["range"]))
     if low >= high:
         raise entry["range"].error("does not go up")
-    entry["from_bytes"].text()
-    return dict(entry.value)
+    layout, whole = entry["layout"].value, entry["range"].value
+    return {"layout": layout, "range": list(whole), "from_bytes": entry["from_bytes"].text()}
 
 
 def _pair(entry: Field) -> list[Field]:

@@ -23,6 +23,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from signatures.fields import printable
+
 
 class ExportModelError(Exception):
     """Base of all errors of this project.
@@ -38,13 +40,13 @@ class ExportModelError(Exception):
 
     @property
     def message(self) -> str:
-        """The parts that are known, a line each."""
-        lines = [self.what if self.where is None else f"{self.where}: {self.what}"]
-        if self.why:
-            lines.append(f"  why: {self.why}")
-        if self.fix:
-            lines.append(f"  fix: {self.fix}")
-        return "\n".join(lines)
+        """The parts that are known, a line each, further lines indented; what cannot be printed is replaced."""
+        parts = [self.what if self.where is None else f"{self.where}: {self.what}"]
+        parts += [f"  {key}: {text}" for key, text in (("why", self.why), ("fix", self.fix)) if text]
+        return "\n".join(
+            "\n       ".join(printable(line) for line in part.expandtabs().replace("\r\n", "\n").split("\n"))
+            for part in parts
+        )
 
     def __str__(self) -> str:
         return self.message

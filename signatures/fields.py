@@ -103,6 +103,8 @@ def _is_finite(value: int | float) -> bool:
         return False
 
 
-def printable(text: str) -> str:
-    """The text with U+FFFD for what cannot be printed."""
-    return "".join(c if c.isprintable() else "\ufffd" for c in text)
+def printable(text: str, keep: str = "") -> str:
+    """The text with U+FFFD for what cannot be printed: controls (a terminal obeys them), C1, what turns the direction
+    of writing, lone surrogates. Characters in ``keep`` stay.
+    """
+    return text if text.isprintable() else "".join(c if c.isprintable() or c in keep else "\ufffd" for c in text)

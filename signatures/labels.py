@@ -32,6 +32,9 @@ def parsed(content: Any) -> dict[str, Any]:
     named = content.get("observations", {})
     if not isinstance(named, Mapping):
         raise ValueError("'observations' is no table of lists, one per observation")
+    for name in named:
+        if not str(name).isprintable():
+            raise ValueError(f"{name!r} is no name of an observation")
     branches = content.get("branches", [])
     if not isinstance(branches, Sequence) or isinstance(branches, str):
         raise ValueError("'branches' is no list of lists, one per branch")

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from converters.bundle.embed import embedded, without_contract
 from converters.bundle.exchange import exchange, recover, stage
 from converters.format import Artifact, Format
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph
+from converters.graph.shapes import infer_types
 from signatures.contract import POLICY, Contract, FileEntry, json_of, parse
 from signatures.digest import sha256_hex
 from signatures.errors import BundleError, UsageError
 from signatures.fields import FieldError
 from signatures.spec import PolicySignature
 
+#: Tensor → what its artefact says of it: dtype and shape.
+Declared: TypeAlias = Mapping[str, tuple[str | None, Sequence[object] | None]]
 _AGAIN = "export the policy again"
 #: A contract is some kilobytes; one with labels and statistics of large observations some hundred.
 _MOST_BYTES = 64 << 20
@@ -48,7 +53,7 @@ class Bundle:
         """The bundle in ``folder``. Raises BundleError that names what is wrong with its policy.json."""
         path = folder / POLICY
         try:
-            if path.stat().st_size > _MOST_BYTES:
+            if _file_size(path) > _MOST_BYTES:
                 raise BundleError("is too large", where=str(path), why="no contract is", fix=_AGAIN)
             content = json_of(path.read_bytes())
             contract = parse(content)
@@ -109,8 +114,8 @@ class Bundle:
                 why="a bundle's files lie in its folder",
                 fix=f"do not use this bundle; {_AGAIN}",
             )
-        try:
-            found = sha256_hex(path.read_bytes())
+        try:  # the size first: a file may be of any, and policy.json says which
+            found = sha256_hex(path.read_bytes()) if _file_size(path) == entry.size else None
         except FileNotFoundError as error:
             raise BundleError("is missing", where=str(path), why=f"{POLICY} names it", fix=_AGAIN) from error
         except OSError as error:
@@ -119,7 +124,7 @@ class Bundle:
             raise BundleError(
                 "has been changed since it was exported",
                 where=str(path),
-                why=f"its sha256 is not the one in {POLICY}",
+                why=f"its {'size' if found is None else 'sha256'} is not the one in {POLICY}",
                 fix=f"{_AGAIN}; compare foreign artefacts with export-model compare",
             )
 
@@ -159,6 +164,40 @@ class Bundle:
                 why="it is not the contract that the bundle's own graph embeds",
                 fix=_AGAIN,
             )
+
+    def check_fits(self, place: Path, declared: Declared) -> None:
+        """Raise BundleError where an artefact has a tensor otherwise than policy.json says.
+
+        ``declared`` has its tensors: dtype (None: not said) and shape (an axis that is no int is free; None: not said).
+        """
+        for spec in (*self.signature.inputs, *self.signature.outputs):
+            if spec.name not in declared:
+                raise BundleError(
+                    f"has no tensor {spec.name!r}", where=str(place), why=f"{POLICY} names it", fix=_AGAIN
+                )
+            dtype, shape = declared[spec.name]
+            axes = None if shape is None else [n if isinstance(n, int) else None for n in shape]
+            if (dtype is not None and dtype != spec.dtype) or (axes is not None and not _goes(axes, spec.shape)):
+                raise BundleError(
+                    f"has {spec.name!r} as {dtype or 'a tensor'} {axes}",
+                    where=str(place),
+                    why=f"{POLICY} says {spec.dtype} {list(spec.shape)}",
+                    fix=_AGAIN,
+                )
+
+    def check_graph(self, graph: Graph) -> None:
+        """As ``check_fits``, of the graph of its ``.bytes``. Raises GraphError where that is damaged."""
+        self.check_fits(self.folder / f"{self.name}.bytes", declared_by(graph))
+
+
+def declared_by(graph: Graph) -> Declared:
+    """What ``Bundle.check_fits`` asks, of a graph. Raises GraphError where it is damaged."""
+    types = infer_types(graph)
+    return {n.name: (types[n.name].dtype.name, types[n.name].shape) for n in graph.nodes if n.name in types}
+
+
+def _goes(axes: Sequence[int | None], wanted: Sequence[int | None]) -> bool:
+    return len(axes) == len(wanted) and all(a == b or None in (a, b) for a, b in zip(axes, wanted, strict=True))
 
 
 def dumps(content: Mapping[str, Any]) -> bytes:
@@ -226,6 +265,14 @@ def distinct_names(policies: Sequence[tuple[str, str]]) -> None:
                 why="their names are the same once case and special characters are folded",
                 fix="export them one by one, each with --name",
             )
+
+
+def _file_size(path: Path) -> int:
+    """Bytes of a file that can be read to its end. Raises OSError for what is none (a pipe never ends)."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "it is no file", str(path))
+    return found.st_size
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

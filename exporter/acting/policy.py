@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +17,9 @@ from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
+
+if TYPE_CHECKING:
+    from converters.bundle.bundle import Declared
 
 Array = np.ndarray
 Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
@@ -353,13 +358,15 @@ def load_policy(
 def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     from converters.bundle.bundle import Bundle
     from converters.formats import WRITTEN
+    from exporter.export.sources import naming
 
     found = Bundle.open(folder)
-    files = {"onnxruntime": found.path(WRITTEN["onnx"]), "numpy": found.path(WRITTEN["bytes"])}
-    here = [r for r in RUNTIMES if files[r].is_file() and (r == "numpy" or importlib.util.find_spec(r) is not None)]
+    files = {runtime: found.path(WRITTEN[key]) for runtime, key in _TAKES.items() if found.has(WRITTEN[key])}
+    here = [r for r in RUNTIMES if r in files and (r == "numpy" or importlib.util.find_spec(r) is not None)]
     if runtime is not None and runtime not in here:
-        if not files[runtime].is_file():
-            raise BundleError(f"has no {files[runtime].name}", where=str(folder), fix="export the policy with it again")
+        if runtime not in files:
+            wanted = found.path(WRITTEN[_TAKES[runtime]]).name
+            raise BundleError(f"has no {wanted}", where=str(folder), fix="export the policy with it again")
         raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
     if not here:
         raise BundleError(
@@ -372,7 +379,13 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     found.verify_hashes(WRITTEN[_TAKES[chosen]])
     source = found.contract.source
     kept = source.noise_kept and bool(source.noise)
-    run = _RUNS[chosen](files[chosen].read_bytes())
+    with tempfile.TemporaryDirectory(prefix="export-model-") as scratch, naming(files[chosen]):
+        vetted = WRITTEN[_TAKES[chosen]].vetted
+        assert vetted is not None
+        signature = found.signature
+        copy = vetted(files[chosen], [s.name for s in (*signature.inputs, *signature.outputs)], Path(scratch))
+        run, declared = _RUNS[chosen](copy.read_bytes())
+    found.check_fits(files[chosen], declared)
     return LoadedPolicy(found.name, found.signature, run, chosen, seed, draws_itself=kept)
 
 
@@ -395,33 +408,41 @@ def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) ->
         raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
     with naming(path):
         artifact = WRITTEN[_TAKES[chosen]].artifact(policy, WriteOptions("{}"))
-        run = _RUNS[chosen](artifact.files[artifact.main])
+        run, _ = _RUNS[chosen](artifact.files[artifact.main])
     kept = policy.source.noise_kept and bool(policy.source.noise)
     return LoadedPolicy(policy.name, policy.signature, run, chosen, seed, draws_itself=kept)
 
 
-def _in_onnxruntime(model: bytes) -> Run:
+def _in_onnxruntime(model: bytes) -> tuple[Run, Declared]:
     import onnxruntime  # noqa: TID251  the caller asked for a policy that acts
+    from onnxruntime.capi import onnxruntime_pybind11_state as state  # noqa: TID251
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # a policy is small: threads cost more than they bring
     options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    faults: tuple[type[Exception], ...] = tuple(
+        kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)
+    )
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except faults as error:
+        raise BundleError("onnxruntime does not load it", why=str(error), fix="export the policy again") from error
 
     def run(feeds: Mapping[str, Array], fetch: Sequence[str]) -> dict[str, Array]:
         return dict(zip(fetch, session.run(list(fetch), dict(feeds)), strict=True))
 
-    return run
+    return run, {t.name: (None, t.shape) for t in (*session.get_inputs(), *session.get_outputs())}
 
 
-def _in_numpy(model: bytes) -> Run:
+def _in_numpy(model: bytes) -> tuple[Run, Declared]:
+    from converters.bundle.bundle import declared_by
     from converters.bundle.embed import read_runnable
     from converters.graph.run import run_graph
 
     graph = read_runnable(model)
-    return lambda feeds, fetch: run_graph(graph, feeds, fetch)
+    return lambda feeds, fetch: run_graph(graph, feeds, fetch), declared_by(graph)
 
 
-_RUNS: Mapping[str, Callable[[bytes], Run]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}
+_RUNS: Mapping[str, Callable[[bytes], tuple[Run, Declared]]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}
 #: Runtime → the format that it runs.
 _TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}

@@ -6,6 +6,7 @@ import click
 from click.shell_completion import get_completion_class
 
 from exporter.cli.group import PROGRAM, Command
+from exporter.cli.terminal import say, say_lines
 
 _SHELLS = {
     "bash": 'add this to ~/.bashrc:  eval "$(export-model completion bash)"',
@@ -25,5 +26,5 @@ def completion_command(shell: str) -> None:
     """Print the script that completes commands, options and files; its last line says where it goes."""
     found = get_completion_class(shell)
     assert found is not None
-    click.echo(found(click.Command(PROGRAM), {}, PROGRAM, "_EXPORT_MODEL_COMPLETE").source())
-    click.echo(f"# {_SHELLS[shell]}")
+    say_lines(found(click.Command(PROGRAM), {}, PROGRAM, "_EXPORT_MODEL_COMPLETE").source())
+    say(f"# {_SHELLS[shell]}")

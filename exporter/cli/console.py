@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import functools
-import json
-import os
-import shutil
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from exporter.cli.terminal import Progress, say, say_json, say_lines
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -24,38 +19,7 @@ if TYPE_CHECKING:
     from exporter.verify.report import ParityReport
     from exporter.verify.tolerances import ToleranceRule
 
-_ERASE = "\r\x1b[2K"
 _COLOURS = {True: "green", False: "red", None: "yellow"}
-
-
-class Progress:
-    """Which step is being done: one line that is overwritten, on a terminal; a line each with ``--verbose``."""
-
-    def __init__(self, *, quiet: bool, verbose: bool) -> None:
-        self._lines = verbose
-        self._shown = not quiet and not verbose and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
-        self._start = time.monotonic()
-
-    def __call__(self, text: str) -> None:
-        """Say that a step begins."""
-        if self._lines:
-            click.echo(f"{time.monotonic() - self._start:7.1f} s  {text}", err=True)
-        elif self._shown:
-            room = shutil.get_terminal_size().columns - 3
-            click.echo(f"{_ERASE}  {text[:room]}", nl=False, err=True, color=True)
-
-    def clear(self) -> None:
-        """Make room for a result."""
-        if self._shown:
-            click.echo(_ERASE, nl=False, err=True, color=True)
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.clear()
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +92,11 @@ class Console:
     def write_reports(self, entries: Callable[[], Sequence[Entry]]) -> None:
         """Write the reports that were asked for; ``entries`` is not called where there are none."""
         if self._reports:
+            from exporter.reports.markdown import UNSEEN
             from exporter.reports.write import Destinations
 
-            Destinations(self.junit, self.markdown, self.html).write(entries(), click.echo)
+            echo = functools.partial(say_lines, keep=UNSEEN)
+            Destinations(self.junit, self.markdown, self.html).write(entries(), echo)
 
     # ---- results, for people
 
@@ -139,7 +105,7 @@ class Console:
         if self._silent or (self.quiet and result.passed is not False):
             return
         signature = result.policy.signature
-        click.echo(f"{result.policy.name}: {signature.family}, {signature.action_space} actions -> {result.folder}")
+        say(f"{result.policy.name}: {signature.family}, {signature.action_space} actions -> {result.folder}")
         self._notes(result.notes)
         if result.report is not None:
             self._report(result.report)
@@ -147,14 +113,14 @@ class Console:
         from exporter.cli.tables import size_text, table
 
         rows = [[kind, size_text(size)] for kind, size in result.sizes.items()]
-        click.echo(table(("format", "size"), rows))
-        click.echo("NOT VERIFIED: --verify none")
+        say_lines(table(("format", "size"), rows))
+        say("NOT VERIFIED: --verify none")
 
     def verified(self, report: ParityReport, place: object) -> None:
         """One policy that was verified."""
         if self._silent or (self.quiet and report.passed is not False):
             return
-        click.echo(f"{report.policy}: {place}")
+        say(f"{report.policy}: {place}")
         self._notes(report.notes)
         self._report(report)
 
@@ -163,7 +129,7 @@ class Console:
             from exporter.cli.tables import paragraph
 
             for note in notes:
-                click.echo(paragraph(note, "  note: ", "    "))
+                say_lines(paragraph(note, "  note: ", "    "))
 
     def _report(self, report: ParityReport) -> None:
         from exporter.cli.summary import comparison_table, failure_lines, not_run_line, parity_table, verdict
@@ -171,15 +137,15 @@ class Console:
 
         if not self.quiet and report.comparisons:
             for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
-                failed = line.startswith("FAIL ")
-                _say(f"{click.style('FAIL', fg='red')}{line[4:]}" if failed else line)
+                failed = "FAIL" if line.startswith("FAIL ") else ""
+                say(line[len(failed) :], mark=failed, colour="red")
         for line in failure_lines(report):
             indent = line[: len(line) - len(line.lstrip())]
-            click.echo(paragraph(line.lstrip(), indent, f"{indent}    "))
+            say_lines(paragraph(line.lstrip(), indent, f"{indent}    "))
         missing = not_run_line(report)
         if not self.quiet and report.passed is not None and missing is not None:
-            click.echo(paragraph(missing, rest="  "))
-        _say(click.style(paragraph(verdict(report), rest="  "), fg=_COLOURS[report.passed]))
+            say_lines(paragraph(missing, rest="  "))
+        say_lines(paragraph(verdict(report), rest="  "), colour=_COLOURS[report.passed])
 
     def whole(self, reports: Sequence[ParityReport]) -> None:
         """What came of several policies, in one line."""
@@ -190,7 +156,7 @@ class Console:
 
         verdicts = {r.passed for r in reports}
         colour = _COLOURS[False if False in verdicts else None if None in verdicts else True]
-        _say(click.style(paragraph(whole_summary(reports), rest="  "), fg=colour))
+        say_lines(paragraph(whole_summary(reports), rest="  "), colour=colour)
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""
@@ -205,10 +171,10 @@ class Console:
             return
         width = max(len(p.name) for p in PROFILES)
         for profile in PROFILES:
-            click.echo(f"{profile.name:{width}}  {profile.purpose}")
+            say(f"{profile.name:{width}}  {profile.purpose}")
             details = [f"writes {', '.join(profile.formats)}"]
             details += [f"also called {', '.join(profile.aliases)}"] if profile.aliases else []
-            click.echo(f"{'':{width}}  {'; '.join(details)}")
+            say(f"{'':{width}}  {'; '.join(details)}")
 
     def next_step(self, results: Sequence[ExportResult], names: str, profile: str | None = None) -> None:
         """What to do next, in a line or two."""
@@ -216,9 +182,7 @@ class Console:
             return
         failed = next((r for r in results if r.passed is False), None)
         if failed is not None:
-            click.echo(
-                f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree"
-            )
+            say(f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree")
             return
         if profile is not None:
             last = results[-1]
@@ -226,17 +190,17 @@ class Console:
             from converters.targets.profiles import profile as known
 
             wanted = known(profile)
-            click.echo(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
-            click.echo(f"next: export-model snippets {last.folder} --for {wanted.name}    (what to set there)")
+            say(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
+            say(f"next: export-model snippets {last.folder} --for {wanted.name}    (what to set there)")
             return
         if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
-            click.echo("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
-        click.echo(f"next: {_next(results)}")
+            say("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
+        say(f"next: {_next(results)}")
 
     def json(self, content: Mapping[str, Any]) -> None:
         """The answer for a program, where it was asked for."""
         if self.as_json:
-            click.echo(json.dumps(content, indent=1))
+            say_json(content)
 
 
 def _next(results: Sequence[ExportResult]) -> str:
@@ -253,11 +217,6 @@ def _next(results: Sequence[ExportResult]) -> str:
     if {"tfjs", "bytes"} <= {*last.sizes}:
         return hint(f"export-model serve {last.folder}", "see it act, in a browser")
     return hint(f"export-model snippets {last.folder}", "code for Python, JavaScript, C#, Unity, TF Serving")
-
-
-def _say(text: str) -> None:
-    """Print styled text; click keeps colours for terminals, NO_COLOR (no-color.org) turns them off there too."""
-    click.echo(text, color=False if os.environ.get("NO_COLOR") else None)
 
 
 def reporting(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,6 +12,7 @@ import click
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import Command
 from exporter.cli.options import activating, comparing, read_options, trusting, understanding
+from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
@@ -128,7 +129,7 @@ def export_command(
         def refuse(error: ExportModelError) -> None:
             refused.append(error)
             progress.clear()
-            click.echo(f"error: {error.message}", err=True)
+            say_lines(f"error: {error.message}", err=True)
 
         for result in export(list(sources), job, progress, refused=refuse):
             results.append(result)

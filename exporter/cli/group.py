@@ -13,6 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from exporter.cli.terminal import say
 from exporter.version import __version__
 from signatures.errors import UsageError
 
@@ -100,7 +101,7 @@ def show_version(ctx: click.Context, parameter: click.Parameter, wanted: bool) -
         return
     from converters.runtimes.registry import available_runtimes
 
-    click.echo(f"{PROGRAM}, version {__version__}")
+    say(f"{PROGRAM}, version {__version__}")
     here = [f"{i.name} {i.version or ''}".strip() for i in available_runtimes() if i.installed]
-    click.echo(f"runtimes: {', '.join(here)}")
+    say(f"runtimes: {', '.join(here)}")
     ctx.exit()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ import click
 
 from exporter.cli.group import Command
 from exporter.cli.options import activating, read_options, trusting, understanding
+from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -83,12 +83,12 @@ def inspect_command(
         written = write_pictures(found, logdir, svg)
     if as_json:
         shown = {"written": [str(path) for path in written]} if written else {}
-        click.echo(json.dumps({**found.to_dict(), **shown}, indent=1))
+        say_json({**found.to_dict(), **shown})
         return
-    click.echo(inspection_text(found))
+    say_lines(inspection_text(found))
     for path in written:
-        click.echo(f"wrote {path}")
-    click.echo(f"next: export-model {source}{'' if step is None else f' --step {step}'} -o exported")
+        say(f"wrote {path}")
+    say(f"next: export-model {source}{'' if step is None else f' --step {step}'} -o exported")
 
 
 def _unity(
@@ -111,5 +111,8 @@ def _unity(
 
         with writing(svg):
             svg.write_text(behavior_parameters(verdicts[0]), encoding="utf-8")
-    click.echo(json.dumps(unity_report(verdicts), indent=1) if as_json else unity_text(verdicts))
+    if as_json:
+        say_json(unity_report(verdicts))
+    else:
+        say_lines(unity_text(verdicts))
     return 0 if accepted(verdicts) else 1

@@ -20,11 +20,11 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _run(args: list[str]) -> None:
     import io
-    import json
 
     import click
 
     from exporter.cli.app import app
+    from exporter.cli.terminal import say, say_json, say_lines
     from signatures.errors import ExportModelError, UsageError
 
     wants_json = "--json" in args
@@ -35,18 +35,20 @@ def _run(args: list[str]) -> None:
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     except click.Abort:
-        click.echo("stopped", err=True)
+        say("stopped", err=True)
         sys.exit(130)
     except click.ClickException as error:
         if wants_json:
-            click.echo(json.dumps(UsageError(error.format_message(), fix="export-model --help").to_dict(), indent=1))
-        error.show()
+            say_json(UsageError(error.format_message(), fix="export-model --help").to_dict())
+        shown = io.StringIO()
+        error.show(shown)
+        say_lines(shown.getvalue(), err=True, nl=False)
         sys.exit(2)
     except ExportModelError as error:
         if wants_json:
-            click.echo(json.dumps(error.to_dict(), indent=1))
-        click.echo(f"error: {error.message}", err=True)
+            say_json(error.to_dict())
+        say_lines(f"error: {error.message}", err=True)
         sys.exit(error.exit_status)
     except OSError as error:  # of the terminal or the pipe; files have errors of their own
-        click.echo(f"error: {error}", err=True)
+        say(f"error: {error}", err=True)
         sys.exit(2)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import click
 
+from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import UsageError
 
 #: Part of the confinement of a runtime's process → what it means.
@@ -32,19 +31,17 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     kept = in_force()
     if as_json:
         rows = [{"name": i.name, "installed": i.installed, "version": i.version, "install": i.how} for i in found]
-        click.echo(json.dumps({"runtimes": rows, "confinement": kept}, indent=1))
+        say_json({"runtimes": rows, "confinement": kept})
         return
     cells = [[i.name, i.version or "-", "installed" if i.installed else i.how] for i in found]
-    click.echo(table(("runtime", "version", "state"), cells))
+    say_lines(table(("runtime", "version", "state"), cells))
     lacking = [_SAID[part] for part, there in kept.items() if not there]
     held = [_SAID[part] for part, there in kept.items() if there]
-    click.echo()
+    say()
     if held:
-        click.echo(
-            f"a runtime's process {', '.join(held)}" + (" (a browser has its own sandbox)" if not lacking else "")
-        )
+        say(f"a runtime's process {', '.join(held)}" + (" (a browser has its own sandbox)" if not lacking else ""))
     if lacking:
-        click.echo(f"not on this system: {', '.join(lacking)}")
+        say(f"not on this system: {', '.join(lacking)}")
 
 
 @runtimes_command.command("install")
@@ -58,7 +55,7 @@ def install_command(name: str) -> None:
     steps = list(dict.fromkeys(r.install for r in chosen if r.install is not None))
     if steps:
         for install in steps:
-            install(lambda text: click.echo(text))
+            install(say)
         return
     how = {r.name: r.find().how for r in chosen}.get(name)
     raise UsageError(

@@ -11,6 +11,7 @@ import click
 
 from exporter.cli.group import Command
 from exporter.cli.options import one_bundle
+from exporter.cli.terminal import say
 from signatures.errors import UsageError
 
 _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
@@ -52,19 +53,19 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
         site = assemble(folder, scene)
     if out is not None:
         write_site(site, out)
-        click.echo(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
-        click.echo(f"next: host it anywhere, or: python -m http.server --directory {out}")
+        say(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
+        say(f"next: host it anywhere, or: python -m http.server --directory {out}")
         return
     from exporter.serve.server import listening, until_interrupted
 
     with listening(site, host, port) as server, until_interrupted():
-        click.echo(f"{server.url}  (Ctrl-C ends)")
+        say(f"{server.url}  (Ctrl-C ends)")
         if opens:
             import webbrowser
 
             webbrowser.open(server.url)
         server.serve_forever()
-    click.echo("ended")
+    say("ended")
 
 
 @contextmanager
@@ -84,7 +85,5 @@ def _bundle_of(place: Path) -> Iterator[Path]:
                 why=", ".join(r.policy.name for r in results),
                 fix=f"export-model {place} -o exported    (then: export-model serve exported/{results[0].policy.name})",
             )
-        click.echo(
-            f"exported for this page alone, not compared; to keep it: export-model {place} -o exported", err=True
-        )
+        say(f"exported for this page alone, not compared; to keep it: export-model {place} -o exported", err=True)
         yield results[0].folder

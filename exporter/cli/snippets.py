@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from exporter.cli.group import Command
 from exporter.cli.options import one_bundle
+from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import UsageError
 
 
@@ -38,14 +38,14 @@ def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
     found = read_bundle(place or bundle)
     made, lacking = snippets(found, target)
     if as_json:
-        content = {"policy": found.name, "snippets": [s.to_dict() for s in made], "left_out": lacking}
-        click.echo(json.dumps(content, indent=1))
+        say_json({"policy": found.name, "snippets": [s.to_dict() for s in made], "left_out": lacking})
         return
     if len(made) == 1 and target is not None:
-        click.echo(made[0].code, nl=False)
+        say_lines(made[0].code, nl=False)
         return
     for snippet in made:
-        click.echo(f"==== {snippet.target.title} (--for {snippet.target.name}) ====\n")
-        click.echo(snippet.code)
+        say(f"==== {snippet.target.title} (--for {snippet.target.name}) ====")
+        say()
+        say_lines(snippet.code)
     for name, needed in lacking.items():
-        click.echo(f"left out: {name} needs {needed}, which this bundle has not")
+        say(f"left out: {name} needs {needed}, which this bundle has not")

@@ -9,6 +9,8 @@ import textwrap
 from collections.abc import Sequence
 from itertools import zip_longest
 
+from signatures.fields import printable
+
 #: No column is made narrower.
 _LEAST = 8
 _GAP = 2
@@ -27,12 +29,16 @@ def room() -> int | None:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns two spaces apart, as wide as their longest cell; where the terminal is narrower, long cells wrap."""
-    columns = [[str(r[i]) for r in (head, *rows)] for i in range(len(head))]
+    """Columns two spaces apart, as wide as their longest cell; where the terminal is narrower, long cells wrap.
+
+    What cannot be printed, a line's end too, is replaced: a name in a cell cannot look like another row.
+    """
+    head, *rows = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
+    columns = [[r[i] for r in (head, *rows)] for i in range(len(head))]
     widths = _fitting(columns, room())
     lines = []
     for row in (head, ["-" * w for w in widths], *rows):
-        cells = [_wrap(str(c), w) for c, w in zip(row, widths, strict=True)]
+        cells = [_wrap(c, w) for c, w in zip(row, widths, strict=True)]
         for parts in zip_longest(*cells, fillvalue=""):
             line = "  ".join(part.ljust(w) for part, w in zip(parts, widths, strict=True))
             lines.append(line.rstrip())
@@ -63,7 +69,7 @@ def _wrap(cell: str, width: int) -> list[str]:
 
 def paragraph(text: str, first: str = "", rest: str = "") -> str:
     """``text`` after ``first``, wrapped to the terminal with ``rest`` before the lines that follow."""
-    width = room()
+    text, width = printable(text), room()
     if width is None or len(first) + len(text) <= width:
         return first + text
     return textwrap.fill(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from converters.bundle import bundle
 from converters.bundle.bundle import Bundle
+from converters.bundle.embed import runnable
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
 from converters.frozen_graph.writer import frozen
@@ -425,6 +426,8 @@ def verify_folder(
         with naming(reference):
             embedding = found.graph()
         graph = _whole_graph(embedding, names, artefacts)
+        with naming(reference):
+            found.check_graph(runnable(graph))
     else:
         graph = outline(signature, noise_kept=contract.source.noise_kept)
     graph = graph if again is None else again.policy.graph

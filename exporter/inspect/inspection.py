@@ -18,6 +18,7 @@ from exporter.cli.tables import paragraph, size_text, table
 from exporter.export.sources import naming, read_source
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError
+from signatures.fields import printable
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -138,12 +139,11 @@ def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
 
 def inspection_text(inspection: Inspection) -> str:
     """For the terminal."""
-    parts = [
+    head = (
         f"{inspection.path}: {inspection.kind}, {size_text(inspection.size)}, {inspection.nodes} nodes, "
         f"{len(inspection.policies)} {'policy' if len(inspection.policies) == 1 else 'policies'}"
-    ]
-    parts.extend(_policy_text(p) for p in inspection.policies)
-    return "\n\n".join(parts)
+    )
+    return "\n\n".join([printable(head), *(_policy_text(p) for p in inspection.policies)])
 
 
 def _policy_text(inspected: PolicyInspection) -> str:
@@ -156,9 +156,9 @@ def _policy_text(inspected: PolicyInspection) -> str:
     if signature.memory is not None:
         layout = f" [{'|'.join(signature.memory.layout)}]" if signature.memory.layout else ""
         facts.append(f"memory {signature.memory.size}{layout}")
-    lines = [f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}", ""]
-    lines.append("\n\n".join(table(head, rows) for head, rows in _tables(signature)))
-    lines += _label_lines(signature.labels)
+    head = f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}"
+    lines = [printable(head), "", "\n\n".join(table(head, rows) for head, rows in _tables(signature))]
+    lines += map(printable, _label_lines(signature.labels))
     if signature.constants:
         lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
     lines += [paragraph(note, "note: ", "  ") for note in signature.notes]

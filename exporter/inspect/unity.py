@@ -12,6 +12,7 @@ from converters.targets.unity.consumers import CONSUMERS, consumer
 from converters.targets.unity.findings import Finding, Thrown
 from converters.targets.unity.settings import Brain, parse_actions, parse_sensors, read_brain
 from signatures.errors import UsageError
+from signatures.fields import printable
 
 _MODES = {"stochastic": "Deterministic Inference off", "deterministic": "Deterministic Inference on"}
 _READ = (".onnx", ".nn")
@@ -82,11 +83,12 @@ def _files(source: Path) -> list[Path]:
 
 
 def _verdict_text(verdict: UnityVerdict) -> str:
-    lines = [f"{verdict.path}: {_summary(verdict)} by {verdict.consumer.title}"]
+    lines = [printable(f"{verdict.path}: {_summary(verdict)} by {verdict.consumer.title}")]
     if verdict.refused is not None:
         lines += ["  importing it:", *_thrown_lines(verdict.refused)]
     else:
-        lines += [f"  the agent{' (assumed from the file)' if verdict.assumed else ''}: {_agent_text(verdict.brain)}"]
+        assumed = " (assumed from the file)" if verdict.assumed else ""
+        lines += [printable(f"  the agent{assumed}: {_agent_text(verdict.brain)}")]
         same = len({_outcome(m) for m in verdict.modes.values()}) == 1
         for mode, found in list(verdict.modes.items())[: 1 if same else None]:
             lines += _mode_lines("" if same else f", {_MODES[mode]}", found)
@@ -140,7 +142,7 @@ def _wrapped(head: str, text: str) -> list[str]:
     lines = []
     for number, part in enumerate(text.rstrip("\n").split("\n")):
         lines += textwrap.wrap(
-            (head if number == 0 else " " * 4) + part,
+            (head if number == 0 else " " * 4) + printable(part),
             _WIDTH,
             initial_indent="    ",
             subsequent_indent=" " * 8,

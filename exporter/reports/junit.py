@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 from converters.formats import FORMATS
 from exporter.cli.summary import verdict
 from exporter.reports.entry import Entry
-from exporter.reports.markup import printable
 from exporter.verify.findings import Failure, Finding
+from signatures.fields import printable
 
 
 def junit_xml(entries: Sequence[Entry]) -> bytes:
@@ -91,4 +91,4 @@ def _not_run(entry: Entry) -> dict[str, dict[str, str]]:
 
 
 def _text(text: str) -> str:
-    return printable(text)
+    return printable(text, "\t\n")

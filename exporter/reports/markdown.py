@@ -8,9 +8,11 @@ from collections.abc import Iterable, Sequence
 from exporter.cli.summary import verdict
 from exporter.cli.tables import size_text
 from exporter.reports.entry import Entry
-from exporter.reports.markup import printable
 from exporter.reports.matrix import matrix
+from signatures.fields import printable
 
+#: Behind an @, so that no user is called by it.
+UNSEEN = "\u200b"
 _MARKS = {"passed": "✅", "self-consistent": "✅", "failed": "❌", "not verified": "⚠️"}
 
 
@@ -74,14 +76,14 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def text(value: str) -> str:
     """``value`` as words: nothing in it is markup, a table's bar or a line's end."""
-    flat = " ".join(printable(value).split())
+    flat = printable(" ".join(value.split()))
     marked = re.sub(r"([\\`*_{}\[\]()#!|~])", r"\\\1", flat)
-    return marked.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("@", "@\u200b")
+    return marked.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("@", f"@{UNSEEN}")
 
 
 def code(value: str) -> str:
     """``value`` as code, in a table cell too: a backslash before a bar is the table's, not the code's."""
-    flat = " ".join(printable(value).split())
+    flat = printable(" ".join(value.split()))
     fence = "`" * (max((len(m) for m in re.findall("`+", flat)), default=0) + 1)
     pad = " " if flat.startswith("`") or flat.endswith("`") else ""
     return f"{fence}{pad}{flat}{pad}{fence}".replace("|", "\\|") if flat else "``"

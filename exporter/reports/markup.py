@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import html
-import re
 from collections.abc import Iterable
 from typing import TypeAlias
 
-#: Characters that XML 1.0 has no place for (and HTML no use): controls, lone surrogates, non-characters.
-_UNPRINTABLE = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+from signatures.fields import printable
+
 _VOID = frozenset({"meta", "br", "hr", "wbr"})
 
 
@@ -21,11 +20,6 @@ class Markup(str):
 Child: TypeAlias = "str | int | Iterable[Child] | None"
 
 
-def printable(text: str) -> str:
-    """``text`` with a replacement character wherever XML allows none."""
-    return _UNPRINTABLE.sub("\ufffd", text)
-
-
 def escaped(child: Child) -> Markup:
     """A child as HTML: markup as it is, text escaped, None nothing, anything else its parts."""
     if child is None:
@@ -33,7 +27,7 @@ def escaped(child: Child) -> Markup:
     if isinstance(child, Markup):
         return child
     if isinstance(child, str | int):
-        return Markup(html.escape(printable(str(child))))
+        return Markup(html.escape(printable(str(child), "\t\n")))
     return Markup("".join(escaped(part) for part in child))
 
 

@@ -13,11 +13,11 @@ Left out are outputs that a sampler inside the graph decides, and inputs so larg
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import Graph
 from exporter.verify.difference import floored, ties
 from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
@@ -33,12 +33,10 @@ _MOST_BYTES = 4_000_000
 _STORED = {"int64": "int32", "bool": "uint8"}
 
 
-def golden(signature: PolicySignature, file: Path) -> tuple[dict[str, Any], bytes]:
-    """golden.json and golden.bin for the policy whose ``.bytes`` is ``file``."""
-    from converters.bundle.embed import read_runnable
+def golden(signature: PolicySignature, graph: Graph) -> tuple[dict[str, Any], bytes]:
+    """golden.json and golden.bin for the policy of ``graph``, which the numpy kernels run."""
     from converters.graph.run import run_graph
 
-    graph = read_runnable(file.read_bytes())
     drawn = random_outputs(graph, [s.name for s in signature.outputs])
     names = [s.name for s in signature.outputs if s.name not in drawn]
     book = _Book(signature)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import converters.tfjs
 from converters.bundle.bundle import Bundle, dumps, writing
+from converters.bundle.embed import runnable
 from converters.bundle.exchange import exchange, stage
 from converters.formats import WRITTEN
 from converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
+from exporter.export.sources import naming
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
-from exporter.serve.server import TYPES
+from exporter.serve.server import DATA, TYPES
 from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError
@@ -72,7 +74,10 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     site.update(_model(policy, "model"))
     if opponent is not None:
         site.update(_model(opponent, "opponent"))
-    said, data = golden(policy.signature, policy.graph_file)
+    with naming(policy.graph_file):
+        graph = runnable(policy.graph())
+        policy.check_graph(graph)
+        said, data = golden(policy.signature, graph)
     site["golden.json"], site["golden.bin"] = f"{json.dumps(said, separators=(',', ':'))}\n".encode(), data
     site["policy.json"] = dumps(policy.content)
     site[SITE] = dumps(
@@ -145,8 +150,9 @@ def _checked(folder: Path) -> Bundle:
 
 
 def _model(found: Bundle, place: str) -> dict[str, bytes]:
-    names = sorted(name for name in found.contract.files if WRITTEN["tfjs"].owns(name, found.name))
-    return {f"{place}/{name.removeprefix('tfjs/')}": (found.folder / name).read_bytes() for name in names}
+    """The model of a bundle: data alone. What else lies in its folder (a script, a page) would be its maker's code."""
+    names = [n for n in found.contract.files if WRITTEN["tfjs"].owns(n, found.name) and PurePosixPath(n).suffix in DATA]
+    return {f"{place}/{name.removeprefix('tfjs/')}": (found.folder / name).read_bytes() for name in sorted(names)}
 
 
 def _opponent(first: Bundle, scene: Scene) -> Bundle | None:

@@ -150,8 +150,14 @@ def folded(head: str, items: list[str]) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """A string literal of Python, JavaScript, C# and JSON alike, also inside of a page."""
-    return json.dumps(text).replace("</", "<\\/")
+    """A string literal of Python, JavaScript, C# and JSON alike, also inside of a page's script.
+
+    Characters beyond U+FFFF stand as they are: as a pair of escapes they would be two characters in Python.
+    """
+    escaped = (
+        c if c.isprintable() and c not in "<>&" else f"\\u{ord(c):04x}" for c in json.dumps(text, ensure_ascii=False)
+    )
+    return "".join(escaped)
 
 
 def identifier(name: str) -> str:

@@ -16,7 +16,20 @@ from exporter.snippets.frames import filled
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
-_TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool"}
+_TYPES = {
+    "float16": "Half",
+    "float32": "float",
+    "float64": "double",
+    "bool": "bool",
+    "int8": "sbyte",
+    "int16": "short",
+    "int32": "int",
+    "int64": "long",
+    "uint8": "byte",
+    "uint16": "ushort",
+    "uint32": "uint",
+    "uint64": "ulong",
+}
 
 
 # ------------------------------------------------------------------ TensorFlowSharp

@@ -15,7 +15,21 @@ from signatures.spec import TensorSpec
 _TFJS = ("@tensorflow/tfjs", "@tensorflow/tfjs/dist/tf.fesm.min.js")
 _ORT = ("onnxruntime-web", "onnxruntime-web/dist/ort.wasm.bundle.min.mjs")
 
-_ARRAYS = {"float32": "Float32Array", "int32": "Int32Array", "int64": "BigInt64Array", "bool": "Uint8Array"}
+#: What holds a tensor's numbers (float16: their bits, as onnxruntime-web takes them).
+_ARRAYS = {
+    "float16": "Uint16Array",
+    "float32": "Float32Array",
+    "float64": "Float64Array",
+    "bool": "Uint8Array",
+    "int8": "Int8Array",
+    "int16": "Int16Array",
+    "int32": "Int32Array",
+    "int64": "BigInt64Array",
+    "uint8": "Uint8Array",
+    "uint16": "Uint16Array",
+    "uint32": "Uint32Array",
+    "uint64": "BigUint64Array",
+}
 
 
 def acting_tfjs(bundle: Bundle) -> str:
@@ -145,7 +159,7 @@ def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:
     shape = list(example_shape(spec))
     if tensorflow:
         return f'previous = tf.tensor({taken}.flat(), {shape}, "int32");'
-    values = f"{taken}.map(BigInt)" if spec.dtype == "int64" else taken
+    values = f"{taken}.map(BigInt)" if spec.dtype in ("int64", "uint64") else taken
     return f"previous = new ort.Tensor({quoted(spec.dtype)}, {_ARRAYS[spec.dtype]}.from({values}), {shape});"
 
 
@@ -185,6 +199,6 @@ def _flat(spec: TensorSpec, kind: str | None = None) -> str:
     size = 1
     for n in example_shape(spec):
         size *= n
-    one = "1n" if kind == "BigInt64Array" else "1"
     kind = kind or ("Int32Array" if spec.dtype == "int64" else _ARRAYS[spec.dtype])
+    one = "1n" if kind.startswith("Big") else "1"
     return f"new {kind}({size})" + (f".fill({one})" if spec.role is Role.MASKS else "")

@@ -1,0 +1,74 @@
+"""The one way to the terminal: what a stranger's file is called, or says, cannot act there. Imports click only.
+
+A terminal obeys control characters (colours, the title, the clipboard by OSC 52), and writes backwards where it is told
+so. What cannot be printed is replaced in every text of the commands; only our own colours pass, and the line ends of
+``say_lines``: those who put lines together see to it that no name brings one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+
+import click
+
+from signatures.fields import printable
+
+_ERASE = "\r\x1b[2K"
+
+
+def say(text: str = "", *, mark: str = "", colour: str | None = None, err: bool = False) -> None:
+    """Print one line; ``mark`` stands before it in a colour."""
+    _echo((click.style(mark, fg=colour) if mark else "") + printable(text), err=err)
+
+
+def say_lines(text: str, *, colour: str | None = None, keep: str = "", err: bool = False, nl: bool = True) -> None:
+    """Print a text of several lines, each of which was made safe; ``keep`` is what else passes."""
+    safe = printable(text, f"\n{keep}")
+    _echo(safe if colour is None else click.style(safe, fg=colour), err=err, nl=nl)
+
+
+def _echo(text: str, *, err: bool, nl: bool = True) -> None:
+    """Colours are kept by click for terminals; NO_COLOR (no-color.org) turns them off there too."""
+    click.echo(text, err=err, nl=nl, color=False if os.environ.get("NO_COLOR") else None)
+
+
+def say_json(content: Mapping[str, Any]) -> None:
+    """Print JSON, in ASCII: what cannot be printed is escaped, so that a program gets it as it is."""
+    click.echo(json.dumps(content, indent=1).replace("\x7f", "\\u007f"))
+
+
+class Progress:
+    """Which step is being done: one line that is overwritten, on a terminal; a line each with ``--verbose``."""
+
+    def __init__(self, *, quiet: bool, verbose: bool) -> None:
+        self._lines = verbose
+        self._shown = not quiet and not verbose and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+        self._start = time.monotonic()
+
+    def __call__(self, text: str) -> None:
+        """Say that a step begins."""
+        if self._lines:
+            say(f"{time.monotonic() - self._start:7.1f} s  {text}", err=True)
+        elif self._shown:
+            room = shutil.get_terminal_size().columns - 3
+            click.echo(f"{_ERASE}  {printable(text)[:room]}", nl=False, err=True, color=True)
+
+    def clear(self) -> None:
+        """Make room for a result."""
+        if self._shown:
+            click.echo(_ERASE, nl=False, err=True, color=True)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.clear()
