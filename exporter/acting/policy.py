@@ -361,7 +361,8 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     from exporter.export.sources import naming
 
     found = Bundle.open(folder)
-    files = {runtime: found.path(WRITTEN[key]) for runtime, key in _TAKES.items() if found.has(WRITTEN[key])}
+    named = {r: found.path(WRITTEN[key]) for r, key in _TAKES.items() if found.has(WRITTEN[key])}
+    files = {r: path for r, path in named.items() if path.is_file()}
     here = [r for r in RUNTIMES if r in files and (r == "numpy" or importlib.util.find_spec(r) is not None)]
     if runtime is not None and runtime not in here:
         if runtime not in files:
