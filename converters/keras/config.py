@@ -43,11 +43,11 @@ _CODE = frozenset(
 _VALUES = frozenset(("__keras_tensor__", "__tensor__", "__numpy__", "__tuple__", "__ellipsis__", "__slice__"))
 
 
-def config_of(path: Path) -> Any:
-    """The configuration in a ``.keras`` file (a zip). Raises DamagedFileError."""
+def config_of(path: Path, name: str = "config.json") -> Any:
+    """The configuration in a ``.keras`` file (a zip), or another part of it in JSON. Raises DamagedFileError."""
     try:
         with zipfile.ZipFile(path) as archive:
-            entry = archive.getinfo("config.json")
+            entry = archive.getinfo(name)
             with archive.open(entry) as file:
                 data = file.read(MAX_CONFIG + 1)
         if len(data) > MAX_CONFIG:

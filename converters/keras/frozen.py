@@ -25,7 +25,7 @@ def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
     """
     if importlib.util.find_spec("tensorflow") is None:
         raise RuntimeUnavailableError(
-            "is a Keras model, which can only be read with TensorFlow",
+            "is a Keras model of more than plain layers, which can only be read with TensorFlow",
             why="its layers are turned into a graph by TensorFlow itself, and it is not installed",
             fix="pip install 'export-model[tensorflow]'; or freeze the model where it was made, and give the GraphDef",
         )

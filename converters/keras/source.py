@@ -1,35 +1,132 @@
-"""A Keras model (``.keras``, ``.h5``) as a source, frozen by TensorFlow where the caller trusts the file."""
+"""Keras models as sources: ``.keras``, ``.h5`` and TensorFlow.js layers models, a list of layers and their weights.
+
+They are read as data. What is more than the layers of ``layers/table.py`` is left to Keras itself, for ``.keras`` and
+``.h5`` whose giver the caller trusts: it is frozen by TensorFlow (frozen.py).
+"""
 
 from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from converters import schema
 from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
+from converters.graph.nodes import Graph
 from converters.keras.config import config_of, refuse_code
 from converters.keras.frozen import frozen_by_tensorflow
-from converters.saved_model.signature import expose
+from converters.keras.hdf5 import stored_in
+from converters.keras.model import model_of
+from converters.keras.network import Network, UnknownLayerError
+from converters.keras.weights import Groups, Listed, Weights
+from converters.saved_model.signature import expose, output_names
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
-from signatures.errors import NotAPolicyError
+from signatures.errors import DamagedFileError, RuntimeUnavailableError
+from signatures.roles import OUTPUT_NAMES
+
+_SAVE_AGAIN = "save the model again: model.save('policy.keras')"
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """What calling the model computes, with ``training=False``.
 
-    Raises NotAPolicyError where the file is made of code, or is not trusted; SourceError, RuntimeUnavailableError.
+    Raises NotAPolicyError where the file is made of code, or of layers that are not read as data and is not trusted;
+    RuntimeUnavailableError without h5py; SourceError and its kinds.
     """
+    try:
+        model = _as_data(given)
+        return [_beside_keras(model, given.path) if options.trust_source else model]
+    except UnknownLayerError as error:
+        if options.trust_source:
+            return [_through_keras(given.path)]
+        fix = "--trust-source (trust_source=True) has Keras itself load it, if you know where it comes from"
+        raise UnknownLayerError(error.what, why=error.why, fix=f"{fix}; or save it without that layer") from error
+    except RuntimeUnavailableError:
+        if options.trust_source:
+            return [_through_keras(given.path)]
+        raise
+
+
+def _as_data(given: Fetched) -> SourceModel:
     path = given.path
-    if not given.data.startswith(b"\x89HDF"):  # of an .h5, the child looks before Keras does
-        refuse_code(config_of(path))
-    if not options.trust_source:
-        raise NotAPolicyError(
-            "is a Keras model, which is not loaded unless you say that you trust it",
-            why="only Keras can read it, and Keras builds the classes and functions that the file names",
-            fix="--trust-source (trust_source=True), if you know where it comes from; or give a SavedModel of it "
-            "(model.export('folder')), which is read without running anything",
+    if given.data.startswith(b"PK"):
+        config = config_of(path)
+        refuse_code(config)
+        stored = stored_in(path)
+        version = str((config_of(path, "metadata.json") or {}).get("keras_version", ""))
+        return layered((path,), config, Groups({name: a for (_, name), a in stored.arrays.items()}), version)
+    stored = stored_in(path)
+    if stored.config is None:
+        raise DamagedFileError(
+            "it has no configuration of a model",
+            why="it holds weights alone, or something else",
+            fix="save the whole model: model.save('policy.keras')",
         )
+    try:
+        config = json.loads(stored.config)
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
+    refuse_code(config)
+    entries = [(name, array) for (_, name), array in stored.arrays.items()]
+    return layered((path,), config, Listed(entries, [layer for layer, _ in stored.arrays]), stored.version or "")
+
+
+def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str) -> SourceModel:
+    """The model of a configuration with its weights. Raises UnknownLayerError, SourceError and its kinds."""
+    try:
+        net = Network(version)
+        signature = net.whole(model_of(config), weights)
+        graph, roles = expose(net.graph(), signature)
+    except (AttributeError, KeyError, IndexError, StopIteration, TypeError, ValueError, RecursionError) as error:
+        raise DamagedFileError(
+            "its layers are not in Keras' form", why=f"{type(error).__name__}: {error}"[:200], fix=_SAVE_AGAIN
+        ) from error
+    names = output_names(signature)
+    facts = SourceFacts(
+        roles=roles,
+        outputs={name: OUTPUT_NAMES.get(name) for name in names.values()},
+        memories=net.memories(names),
+        notes=tuple(net.notes),
+    )
+    return SourceModel(graph, files, facts)
+
+
+def of_web_model(files: tuple[Path, ...], topology: Mapping[str, Any], weights: Weights) -> SourceModel:
+    """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``. Raises what ``layered`` raises."""
+    config = topology.get("model_config") or topology
+    version = str(topology.get("keras_version") or "tfjs-layers")
+    return layered(files, json.loads(config) if isinstance(config, str) else config, weights, version)
+
+
+def _beside_keras(model: SourceModel, path: Path) -> SourceModel:
+    """The model with Keras' own beside it, which it is verified against; as it is where there is no TensorFlow."""
+    try:
+        data, signature = frozen_by_tensorflow(path)
+    except RuntimeUnavailableError:
+        return model
+    ends = {"Placeholder": signature.inputs, "Identity": signature.outputs}
+    nodes = []
+    found: dict[str, set[Any]] = {"Placeholder": set(), "Identity": set()}
+    for node in model.graph.nodes:
+        outer = node.op == "Placeholder" or node.name in model.facts.outputs
+        if outer and node.origin in ends[node.op]:
+            found[node.op].add(node.origin)
+            node = replace(node, origin=ends[node.op][str(node.origin)].name)
+        nodes.append(node)
+    if any(found[op] != {*ends[op]} for op in ends):  # what Keras calls its outputs does not tell them apart
+        return model
+    original = OriginalRun("tensorflow", path, definition=schema.parse(schema.GraphDef, data, "TensorFlow graph"))
+    return replace(model, graph=Graph(tuple(nodes)), original=original)
+
+
+def _through_keras(path: Path) -> SourceModel:
+    """What TensorFlow freezes of the model that Keras builds."""
     data, signature = frozen_by_tensorflow(path)
     definition = schema.parse(schema.GraphDef, data, "TensorFlow graph")
     graph, roles = expose(from_graph_def(definition), signature)
     original = OriginalRun("tensorflow", path, definition=definition)
-    return [SourceModel(graph, (path,), SourceFacts(roles=roles), None, original)]
+    return SourceModel(graph, (path,), SourceFacts(roles=roles), None, original)

@@ -73,7 +73,7 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
     keep = [n.name for n in graph.nodes if n.name in (*CONSTANT_NAMES, EMBEDDED)]
     graph = _with_placeholders(graph, signature)
     graph = graph.pruned([*signature.roots, *keep])
-    names = _names(signature)
+    names = output_names(signature)
     taken = {n.name for n in graph.nodes}
     scope = NameScope((*taken, *names.values()))
     pins: list[Node] = []
@@ -132,8 +132,8 @@ def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:
     return role_by_name(key, node)
 
 
-def _names(signature: ModelSignature) -> dict[str, str]:
-    """Output's key → the node that stands for it."""
+def output_names(signature: ModelSignature) -> dict[str, str]:
+    """Output's key → the node that stands for it, once it is exposed."""
     names: dict[str, str] = {}
     left: list[str] = []
     for key, tensor in signature.outputs.items():

@@ -1,4 +1,4 @@
-"""TensorFlow.js graph models: read from any converter, and written."""
+"""TensorFlow.js models: graphs read from any converter, and written; layers models read."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ if TYPE_CHECKING:
     from converters.fetch import Fetched
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
+
+
+def _is_folder_of_one(path: Path) -> bool:
+    from converters.tfjs.reader import model_file
+
+    return path.is_dir() and model_file(path).is_file()
 
 
 def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -44,6 +50,7 @@ FORMATS = (
         label="a TensorFlow.js model",
         sniff=lambda file: "modelTopology" in (file.json or {}),
         marker="model.json",
+        at=_is_folder_of_one,
         read=_read,
         write=_write,
         main="tfjs",

@@ -42,6 +42,8 @@ _NUMBERS = {
     "DT_INT64": 9, "DT_BOOL": 10, "DT_UINT16": 17, "DT_HALF": 19, "DT_RESOURCE": 20, "DT_VARIANT": 21,
 }  # fmt: skip
 _MAX_AXES = 32
+#: How many files of a folder are looked into, and how far, for one that is not called model.json.
+_MAX_FILES, _HEAD = 16, 1 << 16
 _FIX = "copy the model again: model.json and all the .bin files beside it"
 
 
@@ -56,29 +58,39 @@ class WebModel:
     contract: Any = None
 
 
+def model_file(path: Path) -> Path:
+    """The JSON file of a model: ``path``, or in a folder model.json, else the one file that is such (no other name is
+    agreed on: ``model.save('downloads://walker')`` writes walker.json).
+    """
+    if not path.is_dir():
+        return path
+    named = [p for p in sorted(path.glob("*.json"))[:_MAX_FILES] if b'"modelTopology"' in p.read_bytes()[:_HEAD]]
+    return named[0] if len(named) == 1 and not (path / MODEL).exists() else path / MODEL
+
+
+def content_of(given: Fetched) -> dict[str, Any]:
+    """The object in a model.json, which has a topology. Raises DamagedFileError."""
+    try:
+        model = json.loads(given.bytes_of(model_file(given.path)))
+    except (ValueError, RecursionError) as error:
+        raise _damaged("model.json is not JSON", str(error)[:200]) from error
+    if not isinstance(model, dict) or not isinstance(model.get("modelTopology"), dict):
+        raise _damaged("model.json has no modelTopology")
+    return model
+
+
 def read_model(given: Fetched) -> WebModel:
     """Read a model.json (or its folder) and its shards.
 
     Raises DamagedFileError, NotAPolicyError, SourceError, GraphError.
     """
-    path = given.path / MODEL if given.path.is_dir() else given.path
+    path = model_file(given.path)
+    model = content_of(given)
+    topology = model["modelTopology"]
+    if "node" not in topology:
+        raise NotAPolicyError("is a TensorFlow.js layers model", where=path.name, why="it holds layers, not a graph")
     try:
-        model = json.loads(given.bytes_of(path))
-    except (ValueError, RecursionError) as error:
-        raise _damaged("model.json is not JSON", str(error)[:200]) from error
-    topology = model.get("modelTopology") if isinstance(model, dict) else None
-    if not isinstance(topology, dict):
-        raise _damaged("model.json has no modelTopology")
-    if model.get("format") == "layers-model" or "node" not in topology:
-        raise NotAPolicyError(
-            "is a TensorFlow.js layers model",
-            where=path.name,
-            why="it holds Keras layers, not a graph",
-            fix="convert it: tensorflowjs_converter --input_format tfjs_layers_model --output_format tfjs_graph_model; "
-            "or give the Keras model it came from",
-        )
-    try:
-        weights, shards = _weights(model.get("weightsManifest") or [], given, path.parent)
+        weights, shards = weights_of(model, given)
         if topology.get("library", {}).get("function"):
             _refuse_functions(topology)
         graph = Graph(topological([_node(entry, weights) for entry in topology["node"]]))
@@ -114,10 +126,10 @@ def _refuse_functions(topology: Mapping[str, Any]) -> None:
 # ------------------------------------------------------------------ weights
 
 
-def _weights(
-    manifest: Sequence[Mapping[str, Any]], given: Fetched, folder: Path
-) -> tuple[dict[str, np.ndarray], list[Path]]:
+def weights_of(model: Mapping[str, Any], given: Fetched) -> tuple[dict[str, np.ndarray], list[Path]]:
     """(name → value, the shards)."""
+    folder = model_file(given.path).parent
+    manifest: Sequence[Mapping[str, Any]] = model.get("weightsManifest") or []
     found: dict[str, np.ndarray] = {}
     files: list[Path] = []
     for group in manifest:

@@ -1,8 +1,10 @@
-"""A TensorFlow.js graph model as a source: its folder, or its model.json."""
+"""A TensorFlow.js model as a source: its folder, or its model.json."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.renaming import renamed
 from converters.saved_model.signature import expose
 from converters.source import SourceModel
-from converters.tfjs.reader import read_model
+from converters.tfjs.reader import content_of, model_file, read_model, weights_of
 from converters.tfjs.unfuse import unfuse
 from converters.understand.facts import SourceFacts
 from signatures.contract import Contract
@@ -20,6 +22,9 @@ from signatures.contract import Contract
 
 def read(given: Fetched) -> list[SourceModel]:
     """The model's signature as a policy; one that this tool wrote is what its contract says."""
+    content = content_of(given)
+    if "node" not in content["modelTopology"]:
+        return [_layered(content, given)]
     model = read_model(given)
     graph = unfuse(model.graph)
     if model.contract is None:
@@ -28,6 +33,15 @@ def read(given: Fetched) -> list[SourceModel]:
     contract = contract_of(model.contract)
     graph = _retyped(redrawn(graph, contract), contract)
     return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]
+
+
+def _layered(content: Mapping[str, Any], given: Fetched) -> SourceModel:
+    """A layers model: Keras' layers, and weights under their names."""
+    from converters.keras.source import of_web_model
+    from converters.keras.weights import Listed
+
+    weights, shards = weights_of(content, given)
+    return of_web_model((model_file(given.path), *shards), content["modelTopology"], Listed([*weights.items()]))
 
 
 #: The dtypes that TensorFlow.js has.

@@ -108,10 +108,3 @@ def test_a_configuration_that_unfolds_is_not_read(tmp_path: Path) -> None:
 def test_a_configuration_that_is_none(tmp_path: Path, config: bytes) -> None:
     with pytest.raises(DamagedFileError, match="cannot be read"):
         config_of(archive(tmp_path / "bad.keras", config))
-
-
-def test_without_trust_it_says_why_and_names_the_flag(tmp_path: Path) -> None:
-    path = archive(tmp_path / "good.keras", json.dumps(model(DENSE)).encode())
-    with pytest.raises(NotAPolicyError, match="--trust-source") as caught:
-        read_source(path)
-    assert "the file names" in str(caught.value.why)

@@ -211,6 +211,14 @@ def keras(folder: Path) -> None:
     model.save(folder / "policy.h5")
     model.export(folder / "exported")
     keep(folder, "keras", feeds, results)
+    beyond = tf.keras.Model(observation, tf.keras.layers.Dense(2, activation="sparse_plus", name="action")(observation))
+    beyond.save(folder / "beyond.keras")
+    keep(
+        folder,
+        "beyond",
+        {"vector_observation": feeds["vector_observation"]},
+        {"action": beyond(*[*feeds.values()][:1])},
+    )
 
 
 def main(folder: Path) -> None:

@@ -22,17 +22,18 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("written_by_tensorflow")
 FLAT = {name: name for name in ("references", "resources", "bare", "bare-resources", "keys", "partitioned")}
 OF_FUNCTIONS = {"function": "function", "winding": "winding", "exported": "keras"}
 TRUSTED = ReadOptions(trust_source=True)
-THROUGH_TENSORFLOW = {"policy.keras": "keras", "policy.h5": "keras"}
+#: Read as data, Keras' own run beside it; and one whose activation Keras alone knows.
+WITH_KERAS = {"policy.keras": "keras", "policy.h5": "keras", "beyond.keras": "beyond"}
 
 
-@pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *OF_FUNCTIONS.items(), *THROUGH_TENSORFLOW.items()])
+@pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *OF_FUNCTIONS.items(), *WITH_KERAS.items()])
 def test_reads_what_tensorflow_computes(models: Path, name: str, archive: str) -> None:
     (policy,) = read_source(models / name, TRUSTED).policies()
     assert policy.name == Path(name).stem
     assert_agrees(policy, models / f"{archive}.npz")
 
 
-@pytest.mark.parametrize("name", [*FLAT, *OF_FUNCTIONS, *THROUGH_TENSORFLOW])
+@pytest.mark.parametrize("name", [*FLAT, *OF_FUNCTIONS, *WITH_KERAS])
 def test_agrees_in_all_runtimes_with_the_original(models: Path, name: str, tmp_path: Path, pool: RuntimePool) -> None:
     (result,) = export([models / name], ExportOptions(tmp_path, read=TRUSTED), pool=pool)
     assert result.report is not None
@@ -93,21 +94,33 @@ def test_a_checkpoint_of_objects_is_refused_with_the_remedy(models: Path) -> Non
     assert "SavedModel" in str(caught.value.fix)
 
 
-@pytest.mark.parametrize("name", THROUGH_TENSORFLOW)
-def test_without_tensorflow_it_says_so(models: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "package", "extra"), [("beyond.keras", "tensorflow", "tensorflow"), ("policy.h5", "h5py", "keras")]
+)
+def test_what_is_not_installed_is_said(
+    models: Path, name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "tensorflow" else real(n, *a))
-    with pytest.raises(RuntimeUnavailableError, match=r"export-model\[tensorflow\]") as caught:
-        read_source(models / name, TRUSTED)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == package else real(n, *a))
+    with pytest.raises(RuntimeUnavailableError, match=rf"export-model\[{extra}\]") as caught:
+        read_source(models / name, TRUSTED if package == "tensorflow" else ReadOptions())
     assert caught.value.exit_status == 3
     assert name in str(caught.value)
 
 
-@pytest.mark.parametrize("name", THROUGH_TENSORFLOW)
-def test_keras_is_loaded_only_where_the_caller_trusts_it(models: Path, name: str) -> None:
-    with pytest.raises(NotAPolicyError, match="trust") as caught:
-        read_source(models / name)
+def test_keras_is_loaded_only_where_the_caller_trusts_it(models: Path) -> None:
+    with pytest.raises(
+        NotAPolicyError, match=r"'action' \(Dense\) is not read: its activation is 'sparse_plus'"
+    ) as caught:
+        read_source(models / "beyond.keras")
     assert "--trust-source" in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("name", ["policy.keras", "policy.h5"])
+def test_layers_are_read_without_keras(models: Path, name: str) -> None:
+    source = read_source(models / name)
+    assert source.models[0].original is None
+    assert_agrees(source.policies()[0], models / "keras.npz")
 
 
 @pytest.mark.parametrize("name", ["policy.keras", "policy.h5"])

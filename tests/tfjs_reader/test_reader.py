@@ -153,14 +153,6 @@ def test_weights_over_several_shards_and_groups(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ topology
 
 
-def test_a_layers_model_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    def change(content: dict[str, Any]) -> None:
-        content["format"] = "layers-model"
-
-    with pytest.raises(NotAPolicyError, match="layers model"):
-        read_source(model(tmp_path, change))
-
-
 def test_functions_are_refused(tmp_path: Path) -> None:
     def change(content: dict[str, Any]) -> None:
         content["modelTopology"]["library"] = {"function": [{"signature": {"name": "body"}}]}

@@ -12,10 +12,18 @@ from signatures.errors import UnsupportedOpError
 
 
 def batch(
-    b: Builder, x: str, scale: np.ndarray, bias: np.ndarray, mean: np.ndarray, variance: np.ndarray, epsilon: float
+    b: Builder,
+    x: str,
+    scale: np.ndarray,
+    bias: np.ndarray,
+    mean: np.ndarray,
+    variance: np.ndarray,
+    epsilon: float,
+    *,
+    channels: int = 1,
 ) -> str:
-    """(x − mean)·scale/√(variance + ε) + bias per channel of x [B, C, …]; the statistics are [C]."""
-    shape = (1, -1, *(1,) * (b.rank(x) - 2))
+    """(x − mean)·scale/√(variance + ε) + bias per channel of x; the statistics are [C], as is the axis ``channels``."""
+    shape = [-1 if i == channels else 1 for i in range(b.rank(x))]
     wide = [a.astype(np.float64) for a in (scale, variance, mean, bias)]
     factor = wide[0] / np.sqrt(wide[1] + epsilon)
     centre, width, shift = (

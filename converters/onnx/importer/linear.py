@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from converters.graph.nn import reduction
-from converters.graph.nn.linear import matmul
-from converters.graph.types import INT64, Dim, product
+from converters.graph.nn.linear import einsum, matmul
+from converters.graph.types import INT64, product
 from converters.onnx.importer.elementwise import is_bias
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
@@ -46,62 +46,7 @@ def _matmul(op: Op, net: Importer) -> str:
 
 
 def _einsum(op: Op, net: Importer) -> str:
-    """Sums of products of one or two tensors, each label at most once per operand."""
-    equation = op.text("equation", "").replace(" ", "")
-    left, arrow, result = equation.partition("->")
-    terms = left.split(",")
-    if not arrow:
-        letters = sorted(set(left) - {","})
-        result = "".join(c for c in letters if left.count(c) == 1)
-    simple = "." not in equation and all(len(set(t)) == len(t) for t in (*terms, result))
-    if not simple or len(terms) != len(op.inputs) or len(terms) > _MATRIX or set(result) - set(left):
-        raise op.refused(
-            f"the equation {equation!r} is no plain product",
-            "one or two operands without repeated labels are written as products; no policy uses others",
-        )
-    tensors = [op.need(i) for i in range(len(terms))]
-    lone = [[c for c in t if c not in result and not any(c in o for o in terms if o is not t)] for t in terms]
-    for i, labels in enumerate(lone):
-        if labels:
-            tensors[i] = net.reduce("Sum", tensors[i], [terms[i].index(c) for c in labels], keep=False)
-            terms[i] = "".join(c for c in terms[i] if c not in labels)
-    if len(terms) == 1:
-        return net.transpose(tensors[0], [terms[0].index(c) for c in result])
-    return _contracted(op, net, tensors, terms, result)
-
-
-def _contracted(op: Op, net: Importer, tensors: Sequence[str], terms: Sequence[str], result: str) -> str:
-    """Two operands as one batch of matrix products: [batch, rows, inner] × [batch, inner, columns]."""
-    a, b = terms
-    groups = {
-        "batch": [c for c in a if c in b and c in result],
-        "inner": [c for c in a if c in b and c not in result],
-        "rows": [c for c in a if c not in b],
-        "columns": [c for c in b if c not in a],
-    }
-    lengths: dict[str, Dim] = {}
-    for tensor, term in zip(tensors, terms, strict=True):
-        lengths.update(zip(term, net.shape(tensor), strict=True))
-
-    def total(name: str) -> Dim:
-        return product((lengths[c] for c in groups[name]), net.symbols)
-
-    matrices = []
-    for tensor, term, (first, second) in zip(tensors, terms, (("rows", "inner"), ("inner", "columns")), strict=True):
-        order = [*groups["batch"], *groups[first], *groups[second]]
-        turned = net.transpose(tensor, [term.index(c) for c in order])
-        sizes = [total("batch"), total(first), total(second)]
-        matrices.append(net.reshape(turned, _one_open(sizes)))
-    value = net.add("BatchMatMul", matrices)
-    order = [*groups["batch"], *groups["rows"], *groups["columns"]]
-    value = net.reshape(value, [lengths[c] for c in order])
-    return net.transpose(value, [order.index(c) for c in result])
-
-
-def _one_open(sizes: Sequence[Dim]) -> list[Dim]:
-    """A single length that is not known as -1."""
-    names = [s for s in sizes if isinstance(s, str)]
-    return [-1 if isinstance(s, str) and len(names) == 1 else s for s in sizes]
+    return einsum(net, op.text("equation", ""), [op.need(i) for i in range(len(op.inputs))])
 
 
 # ------------------------------------------------------------------ reductions

@@ -1,0 +1,238 @@
+"""Layers put together as a graph: each call of each layer, in the order in which they depend on one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from converters.graph.builder import Builder
+from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.types import FLOAT32
+from converters.keras.layers.step import Step
+from converters.keras.layers.table import LAYERS, OPERATIONS
+from converters.keras.model import Layer, LayeredModel, Place, input_shape, tensors_in
+from converters.keras.weights import Weights
+from converters.saved_model.signature import ModelSignature, Tensor
+from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
+from signatures.memories import SeparateMemory
+
+Results = dict[tuple[str, int], list[str]]
+_RECURRENT = frozenset(("LSTM", "GRU", "SimpleRNN", "RNN"))
+_MAX_DEPTH = 32
+#: What a layer may be told in a call, beside its tensors.
+_ARGUMENTS = frozenset(
+    (
+        *("initial_state", "query", "value", "key", "attention_mask", "mask"),
+        *("use_causal_mask", "return_attention_scores"),
+    )
+)
+
+
+class UnknownLayerError(NotAPolicyError):
+    """A layer that is not read as data; Keras itself may know it."""
+
+
+class Network(Builder):
+    """The graph of a model in the making."""
+
+    def __init__(self, version: str) -> None:
+        super().__init__(NameScope(()))
+        #: ``3.15.1``, ``2.11.0``, ``tfjs-layers 4.22.0``: which defaults and formulas hold
+        self.version = version
+        self.notes: list[str] = []
+        #: a state's placeholder → the tensor that holds it after the last step
+        self.states: dict[str, str] = {}
+        #: what those of stateful layers are called, which are no outputs of the model
+        self.kept: dict[str, str] = {}
+        #: the outputs' names → their tensors
+        self.results: dict[str, str] = {}
+        self._single_step = False
+
+    def whole(self, model: LayeredModel, weights: Weights) -> ModelSignature:
+        """Build a model; returns its signature on the graph. Raises UnknownLayerError, UnsupportedOpError and more."""
+        self._single_step = _carries_state(model)
+        places: dict[str, Tensor] = {}
+        given: dict[Place, str] = {}
+        for place in model.inputs:
+            layer = next(x for x in model.layers if x.name == place.layer)
+            given[place] = self._input(layer, places)
+        self.results = dict(zip(model.outputs, self.model(model, weights, given, "", 0), strict=True))
+        for placeholder, name in self.kept.items():
+            self.results[name] = self.states[placeholder]
+            places[placeholder] = Tensor(placeholder, FLOAT32, self.nodes[self.position[placeholder]].attrs["shape"])
+        self.prefix = ""
+        keys = {key: self._output(key, reference) for key, reference in self.results.items()}
+        return ModelSignature(places, keys)
+
+    def _output(self, key: str, reference: str) -> Tensor:
+        return Tensor(self.append(Node(self._fresh(key), "Identity", (reference,), origin=key)))
+
+    def _input(self, layer: Layer, places: dict[str, Tensor]) -> str:
+        """A placeholder for an input, its batch free."""
+        if layer.config.get("sparse") or layer.config.get("ragged"):
+            raise UnknownLayerError(f"its input {layer.name!r} is sparse or ragged")
+        batch, *rest = input_shape(layer)
+        if batch is not None:
+            self.notes.append(f"the input {layer.name} was saved for {batch} rows; any number is taken")
+        if rest and rest[0] is None and len(rest) > 1 and self._single_step:
+            rest[0] = 1
+            self.notes.append(f"the input {layer.name} takes sequences of any length; one step at a time is exported")
+        if None in rest:
+            raise NotAPolicyError(
+                f"the input {layer.name!r} has the shape {[batch, *rest]}",
+                why="only the batch may be free: a game gives the same observation at every step",
+                fix="save the model with an Input of a fixed shape, the length of a history included",
+            )
+        dtype = layer.config.get("dtype") or "float32"
+        kind = np.dtype(str(dtype["config"]["name"] if isinstance(dtype, Mapping) else dtype))
+        kind = FLOAT32 if kind.kind == "f" else kind
+        shape = TensorShape((None, *(int(n) for n in rest if n is not None)))
+        self.prefix = ""
+        made = self.append(
+            Node(self._fresh(layer.name), "Placeholder", attrs={"dtype": kind, "shape": shape}, origin=layer.name)
+        )
+        places[layer.name] = Tensor(made, kind, shape)
+        return made
+
+    # ------------------------------------------------------------------ calls in their order
+
+    def model(
+        self, model: LayeredModel, weights: Weights, given: Mapping[Place, str], prefix: str, depth: int
+    ) -> list[str]:
+        """The outputs of a model whose inputs are ``given``."""
+        if depth > _MAX_DEPTH:
+            raise DamagedFileError("its models are nested too deep", fix="save the model again")
+        arrays = weights.among(model.layers)
+        results: Results = {(place.layer, place.call): [reference] for place, reference in given.items()}
+        waiting = [(layer, n) for layer in model.layers for n in range(len(layer.calls))]
+        first = _first_calls(model)
+        while waiting:
+            left = []
+            for layer, number in waiting:
+                call = layer.calls[number]
+                needs = [*tensors_in(call.args), *tensors_in(call.kwargs)]
+                if all((p.layer, p.call) in results for p in needs):
+                    made = self._called(layer, number, results, arrays, prefix, depth)
+                    results[layer.name, number + first.get(layer.name, 0)] = made
+                else:
+                    left.append((layer, number))
+            if len(left) == len(waiting):
+                raise DamagedFileError(
+                    f"the layer {left[0][0].name!r} reads what no layer gives", fix="save the model again"
+                )
+            waiting = left
+        return [results[p.layer, p.call][p.tensor] for p in model.outputs.values()]
+
+    def _called(
+        self,
+        layer: Layer,
+        number: int,
+        results: Results,
+        arrays: Mapping[str, Weights],
+        prefix: str,
+        depth: int,
+    ) -> list[str]:
+        call = layer.calls[number]
+        args, kwargs = _resolved(list(call.args), results), _resolved(dict(call.kwargs), results)
+        path = f"{prefix}{layer.name}"
+        weights = arrays.get(layer.name)
+        if layer.model is not None:
+            assert weights is not None
+            tensors = [t for a in args for t in (a if isinstance(a, list) else [a])]
+            inputs = dict(zip(layer.model.inputs, tensors, strict=True))
+            return self.model(layer.model, weights, inputs, f"{path}/", depth + 1)
+        self.prefix = path
+        self._check(layer, path, args, kwargs)
+        table = OPERATIONS if layer.operation else LAYERS
+        if layer.kind not in table:
+            raise unknown(layer, path)
+        step = Step(self, layer, () if weights is None else weights.arrays(layer), args, kwargs, path)
+        try:
+            made = table[layer.kind](step)
+        except UnsupportedOpError as error:
+            raise UnknownLayerError(
+                f"its layer {path!r} ({layer.kind}) is not read: {error.what}", why=error.why, fix=error.fix
+            ) from error
+        if step.left:
+            raise DamagedFileError(
+                f"its layer {path!r} ({layer.kind}) has {len(step.left)} weights more than such a layer",
+                fix="save the model again",
+            )
+        return [made] if isinstance(made, str) else list(made)
+
+    def _check(self, layer: Layer, path: str, args: Any, kwargs: Mapping[str, Any]) -> None:
+        """Raise UnknownLayerError where a layer is called or computes in a way that would be left out in silence."""
+        flat = [v for a in args for v in (a if isinstance(a, list) else [a])]
+        odd = [] if layer.operation else [str(v)[:60] for v in flat if not isinstance(v, str | None)]
+        odd += [f"{k}={str(v)[:60]}" for k, v in kwargs.items() if v not in (None, False) and k not in _ARGUMENTS]
+        if odd and not layer.operation:
+            raise UnknownLayerError(f"its layer {path!r} ({layer.kind}) is called with {', '.join(odd)}")
+        policy = layer.config.get("dtype")
+        if isinstance(policy, Mapping):
+            if policy.get("class_name") not in ("DTypePolicy", "Policy"):
+                raise UnknownLayerError(f"its layer {path!r} ({layer.kind}) computes in {policy.get('class_name')}")
+            policy = policy["config"]["name"]
+        note = "it was saved to compute in 16 bits; here it computes in 32"
+        if "float16" in str(policy) and note not in self.notes:
+            self.notes.append(note)
+
+    # ------------------------------------------------------------------ states
+
+    def state(self, width: int) -> str:
+        """A state that a stateful layer keeps from call to call: an input of its own, zeros at first."""
+        name = self._fresh("state_in").replace("/", "_")
+        made = self.append(
+            Node(name, "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, width))}, origin=name)
+        )
+        self.kept[made] = made.replace("state_in", "state_out")
+        return made
+
+    def memories(self, names: Mapping[str, str]) -> tuple[SeparateMemory, ...]:
+        """The states that are inputs and outputs of the model; ``names`` are the outputs' nodes by their keys."""
+        keys = {reference: key for key, reference in self.results.items()}
+        found = []
+        for taken, given in self.states.items():
+            if given in keys:
+                shape = (None, self.length(taken, -1))
+                found.append(SeparateMemory(taken, names[keys[given]], shape, shape))
+        return tuple(found)
+
+
+def _first_calls(model: LayeredModel) -> dict[str, int]:
+    """The number of a layer's first call, where it is not 0: a model was called once while it was made (Keras 2)."""
+    counts = {layer.name: len(layer.calls) for layer in model.layers if layer.model is not None}
+    calls = [call for layer in model.layers for call in layer.calls]
+    places = [*model.outputs.values(), *tensors_in([[c.args, c.kwargs] for c in calls])]
+    return {p.layer: 1 for p in places if p.layer in counts and p.call == counts[p.layer]}
+
+
+def unknown(layer: Layer, path: str) -> UnknownLayerError:
+    """A layer that the table does not have."""
+    kind = layer.kind if layer.kind.isprintable() else repr(layer.kind)
+    return UnknownLayerError(f"its layer {path[:200]!r} is {kind[:200]}, which is not read as data")
+
+
+def _carries_state(model: LayeredModel) -> bool:
+    """Whether a recurrent layer is given its state, or keeps it: then one step is what a policy takes."""
+    for layer in model.layers:
+        if layer.model is not None and _carries_state(layer.model):
+            return True
+        if layer.kind in _RECURRENT and (
+            layer.config.get("stateful")
+            or any(c.kwargs.get("initial_state") is not None or len([*tensors_in(c.args)]) > 1 for c in layer.calls)
+        ):
+            return True
+    return False
+
+
+def _resolved(value: Any, results: Results) -> Any:
+    """Arguments with references in place of their tensors."""
+    if isinstance(value, Place):
+        return results[value.layer, value.call][value.tensor]
+    if isinstance(value, dict):
+        return {k: _resolved(v, results) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_resolved(v, results) for v in value]
+    return value

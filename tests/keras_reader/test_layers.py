@@ -1,0 +1,43 @@
+"""Every layer of the table computes what Keras computes, from the file alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.fetch import Fetched
+from converters.keras.config import config_of
+from converters.keras.layers.table import LAYERS
+from converters.keras.source import read
+from converters.source import ReadOptions
+from tests.keras_reader.agreement import assert_agrees
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("keras_reader")]
+#: Layers of the table that no model here has, with the reason.
+NOT_MET = {
+    "SyncBatchNormalization": "BatchNormalization under its name in Keras 2",
+    "ThresholdedReLU": "gone from Keras 3",
+}
+
+
+def test_files_say_what_keras_computes(models: Path) -> None:
+    files = sorted(p for p in models.iterdir() if p.suffix != ".npz")
+    assert len(files) > 40
+    for file in files:
+        (model,) = read(Fetched(file), ReadOptions())
+        with np.load(file.with_suffix(".npz")) as kept:
+            fed = [kept[f"in/{i}"] for i in range(sum(k.startswith("in/") for k in kept.files))]
+            wanted = [kept[f"out/{i}"] for i in range(len(kept.files) - len(fed))]
+        assert_agrees(model, fed, wanted, file.name)
+
+
+def test_no_layer_is_left_out(models: Path) -> None:
+    met: set[str] = set()
+    stack = [config_of(p) for p in models.glob("*.keras")]
+    while stack:
+        value = stack.pop()
+        met |= {str(value["class_name"])} if isinstance(value, dict) and "class_name" in value else set()
+        stack.extend(value.values() if isinstance(value, dict) else value if isinstance(value, list) else ())
+    assert set(LAYERS) - met == set(NOT_MET)
