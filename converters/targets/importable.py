@@ -10,6 +10,11 @@ from converters.targets.unity.readings import MEASURED, misreadings
 from signatures.errors import ProfileError
 
 
+def _other_format(profile: Profile) -> str:
+    """What to try first: a format of the same consumer whose layers are others."""
+    return "".join(f"write a .{key} for the same one (--to {key}), or " for key in profile.undressed)
+
+
 def importable(profile: Profile, files: Mapping[str, bytes], name: str) -> None:
     """Raise ProfileError where an importer misreads or refuses a construct, or none is known to read it."""
     import onnx
@@ -26,7 +31,7 @@ def importable(profile: Profile, files: Mapping[str, bytes], name: str) -> None:
                 f"{name!r} cannot be made for {profile.name}: {first.importer} does not read its {first.construct.op}",
                 where=f"node {first.construct.name}",
                 why=f"{first.rule.reading.value}: {first.rule.says} (measured: {first.rule.evidence})",
-                fix="export for a later consumer (--for help lists them)",
+                fix=f"{_other_format(profile)}export for a later consumer (--for help lists them)",
             )
         if unknown:
             raise ProfileError(

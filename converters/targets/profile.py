@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NoReturn
 
 from converters.policy import Policy
@@ -18,7 +18,8 @@ class Profile:
     layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
     ``converters/targets/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
     releases of ``converters/targets/unity/consumers.py`` that must accept it. ``opset`` is the ONNX opset.
-    ``undressed`` are formats whose writer gives the consumer's names by itself (``.nn``).
+    ``undressed`` are formats whose writer gives the consumer's names by itself (``.nn``), each with what raises
+    ProfileError where the consumer does not take the policy in it.
     """
 
     name: str
@@ -26,7 +27,7 @@ class Profile:
     purpose: str
     formats: tuple[str, ...]
     dress: Callable[[Policy], Policy]
-    undressed: tuple[str, ...] = ()
+    undressed: Mapping[str, Callable[[Policy], None]] = field(default_factory=dict)
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()

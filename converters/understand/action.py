@@ -35,11 +35,12 @@ def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: boo
     if dtype.kind in "iu":
         if all(traits(p).sampler == "categorical" for p in producers):
             return ActionMeaning(Role.SAMPLED, tuple(p.inputs[0] for p in producers), tuple(p.name for p in producers))
-        if all(p.op == "ArgMax" for p in producers):
-            logits = [_without_gumbel(graph, p.inputs[0]) for p in producers]
-            if all(logits):
-                return ActionMeaning(Role.SAMPLED, tuple(r for r in logits if r))
-            return ActionMeaning(Role.DETERMINISTIC, tuple(p.inputs[0] for p in producers))
+        if all(p.op == "ArgMax" or traits(p).sampler == "categorical" for p in producers):
+            logits = [_without_gumbel(graph, p.inputs[0]) if p.op == "ArgMax" else p.inputs[0] for p in producers]
+            # beside draws, an ArgMax is a branch of one action (``settle_single_draws`` writes it so)
+            drawn = all(logits) or any(p.op != "ArgMax" for p in producers)
+            branches = tuple(r if r and drawn else p.inputs[0] for r, p in zip(logits, producers, strict=True))
+            return ActionMeaning(Role.SAMPLED if drawn else Role.DETERMINISTIC, branches)
         return ActionMeaning(Role.DETERMINISTIC)
     if all(p.op == "Log" or p.op == "LogSoftmax" for p in producers):
         return ActionMeaning(Role.LOG_PROBS, tuple(leaves))

@@ -132,8 +132,11 @@ class Exporter:
         self.options = options
         wanted = None if options.profile is None else _profile(options.profile)
         self._formats = _formats(options, wanted)
-        undressed = wanted is not None and all(f.key in wanted.undressed for f in self._formats)
-        self._profile = None if undressed else wanted
+        taken = (
+            {} if wanted is None else {k: w for k, w in wanted.undressed.items() if k in {f.key for f in self._formats}}
+        )
+        self._undressed = taken
+        self._profile = None if taken else wanted
         if not self._formats:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
         self.runtimes, self._known = (
@@ -172,6 +175,8 @@ class Exporter:
         for model, policy in found:
             name, note = names.claim(source.path, safe_name(policy.name))
             own = replace(policy, name=name)
+            for key in self._undressed:
+                self._undressed[key](own)
             dressed = labelled(own if wanted is None else wanted.dress(own), self._labels)
             jobs.append(_Job(source, model, dressed, wanted, None if wanted is None else own, note))
         return jobs

@@ -231,3 +231,12 @@ def test_a_memory_goes_to_old_barracuda_as_nn(tmp_path: Path) -> None:
         export_model(recurrent, tmp_path, for_="barracuda-1.0", verify="none")
     (result,) = export_model(recurrent, tmp_path, for_="barracuda-1.0", to="nn", verify="none")
     assert [p.suffix for p in result.folder.iterdir() if p.suffix != ".json"] == [".nn"]
+
+
+@pytest.mark.parametrize("wanted", ["barracuda-1.4", "barracuda-3"])
+def test_a_newer_barracuda_takes_nn_but_for_its_memory(wanted: str, tmp_path: Path) -> None:
+    """Release 17 to 20 read version 2 too, and throw where it has a memory."""
+    with pytest.raises(ProfileError, match="keeps as API version 2 did"):
+        export_model(ROOT / "fixtures" / "recurrent.bytes", tmp_path, for_=wanted, to="nn", verify="none")
+    (result,) = export_model(ROOT / "fixtures" / "discrete.bytes", tmp_path, for_=wanted, to="nn", verify="none")
+    assert list(result.sizes) == ["nn"]

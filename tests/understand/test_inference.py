@@ -419,6 +419,16 @@ def test_a_draw_is_sampled_and_its_logits_are_the_branches() -> None:
     assert meaning(two, INT64) == (Role.SAMPLED, ("l0", "l1"))
 
 
+def test_a_branch_of_one_action_beside_draws_is_a_draw() -> None:
+    """A draw of a single class is written as an ArgMax, which makes none of the branches deterministic."""
+    mixed = [
+        op("m0", "Multinomial", "l0", "axis"),
+        op("m1", "ArgMax", "l1", "axis"),
+        op("action", "ConcatV2", "m0", "m1", "axis"),
+    ]
+    assert meaning(mixed, INT64) == (Role.SAMPLED, ("l0", "l1"))
+
+
 def test_an_argmax_is_deterministic() -> None:
     assert meaning([op("action", "ArgMax", "l0", "axis")], INT64) == (Role.DETERMINISTIC, ("l0",))
     assert meaning([op("action", "Cast", "l0")], INT64) == (Role.DETERMINISTIC, ())

@@ -1,0 +1,144 @@
+"""Every policy at hand under every profile: what is held, what is refused and why, and whether it acts the same.
+
+``python -m tests.figures --profiles`` writes the outcome into docs/figures. A policy that is held is run as the tests
+of each format run it: ONNX in onnxruntime and by our checkers, ``.bytes`` in the TensorFlow of its generation, ``.nn``
+by the layer rules of the format.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from converters.policy import Policy
+from converters.runtimes.pool import RuntimePool
+from converters.source import ReadOptions
+from converters.targets.profile import Profile
+from converters.targets.profiles import PROFILES
+from exporter.export.sources import read_source
+from signatures.errors import ExportModelError
+from tests.barracuda.test_writer import assert_answers
+from tests.barracuda.test_writer import written as written_nn
+from tests.corpus.conftest import SHARED
+from tests.legacy.test_profiles_in_tf1 import ATOL, runtime_of
+from tests.targets.dressed import Pair
+
+BATCHES = (1, 3, 16)
+_SUFFIXES = (".bytes", ".pb", ".nn", ".onnx", ".pt", ".keras")
+#: What a `.pt` or a Keras model has to be told.
+_SENSORS = {"mla_ppo_vis_fully_connected.pt": ((5,), (1, 12, 12))}
+
+
+@dataclass
+class Held:
+    """What came of one profile in one format."""
+
+    held: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    #: policies that act otherwise, or that a checker refuses: there should be none
+    wrong: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "held": self.held,
+            "refused": dict(sorted(self.refused.items(), key=lambda item: (-item[1], item[0]))),
+            "wrong": self.wrong,
+        }
+
+
+def sources() -> list[Path]:
+    """Every file that may hold a policy, and every folder of a run."""
+    rooms = [SHARED / room for room in ("genuine", "corpus", "foreign")]
+    files = [p for room in rooms for p in sorted(room.rglob("*")) if p.suffix in _SUFFIXES and p.is_file()]
+    folders = {p.parent for room in rooms for p in room.rglob("checkpoint") if p.is_file()}
+    return [*files, *sorted(folders)]
+
+
+def reason(error: ExportModelError) -> str:
+    """A refusal without the names of the policy, its nodes and its numbers."""
+    text = re.sub(r"^.* cannot be made for [\w.-]+: ", "", error.what)
+    text = re.sub(r"node '.*' \((\w+)\)", r"\1", text)
+    text = re.sub(r"has \d+ branches", "has several branches", text)
+    text = re.sub(r"its observation \w+ is", "one of its observations is", text)
+    text = re.sub(r"its memory \(.*\)", "its memory", text)
+    return re.sub(r"the policy takes a memory and gives none, .*", "its memory is taken but not given back", text)
+
+
+def tried(policy: Policy, wanted: Profile, form: str, pool: RuntimePool, folder: Path, atol: float) -> tuple[str, str]:
+    """(held, refused or wrong; why). Held is: it acts the same, and is accepted."""
+    try:
+        if form in wanted.undressed:
+            wanted.undressed[form](policy)
+            assert_answers(policy, written_nn(policy), BATCHES)
+            return "held", ""
+        pair = Pair.of(policy, wanted)
+    except ExportModelError as error:
+        return "refused", reason(error)
+    except AssertionError as error:
+        return "wrong", str(error)[:200]
+    model = None
+    if form == "bytes":
+        file = folder / "policy.bytes"
+        file.write_bytes(pair.data)
+        model = pool.process(_runtime(wanted.name)).load(str(file))
+    for seed, rows in enumerate(BATCHES):
+        found = pair.difference(rows, seed, None if model is None else model.run, atol)
+        if found is not None:
+            return "wrong", f"batch {rows}: {found}"
+    if model is not None:
+        model.unload()
+    for release, verdict in pair.verdicts(folder).items():
+        modes = ["stochastic"] if wanted.name == "barracuda-1.0" else list(verdict.accepted)
+        if not all(verdict.accepted[mode] for mode in modes):
+            return "wrong", f"{release} does not accept it"
+    return "held", ""
+
+
+@functools.cache
+def _runtime(name: str) -> str:
+    return runtime_of(next(p for p in PROFILES if p.name == name))
+
+
+def swept(files: list[Path], pool: RuntimePool) -> dict[str, Any]:
+    """Everything that is counted, as JSON."""
+    cells = {(p.name, form): Held() for p in PROFILES for form in p.formats}
+    unread: Counter[str] = Counter()
+    policies = 0
+    for number, (path, found) in enumerate(_read(files, unread), 1):
+        print(f"{number} of {len(files)}: {path.name}", file=sys.stderr, flush=True)
+        for policy in found:
+            policies += 1
+            for wanted in PROFILES:
+                for form in wanted.formats:
+                    cell = cells[wanted.name, form]
+                    with tempfile.TemporaryDirectory() as folder:
+                        atol, _ = ATOL.get(path.name, (1e-5, ""))
+                        outcome, why = tried(policy, wanted, form, pool, Path(folder), atol)
+                    if outcome == "refused":
+                        cell.refused[why] += 1
+                    elif outcome == "wrong":
+                        cell.wrong.append(f"{path.relative_to(SHARED)}: {why}")
+                    else:
+                        cell.held += 1
+    return {
+        "files": len(files),
+        "unread": dict(sorted(unread.items())),
+        "policies": policies,
+        "profiles": [{"profile": p, "format": f, **cell.to_dict()} for (p, f), cell in cells.items()],
+    }
+
+
+def _read(files: list[Path], unread: Counter[str]) -> Iterator[tuple[Path, list[Policy]]]:
+    for path in files:
+        try:
+            options = ReadOptions(sensors=_SENSORS.get(path.name, ()), trust_source=path.suffix == ".keras")
+            yield path, read_source(path, options).policies()
+        except ExportModelError as error:
+            unread[re.sub(r"'[^']*'", "…", error.what)] += 1
