@@ -17,6 +17,7 @@ ROOMS = (
     "tfjs",
     "onnx",
     "barracuda",
+    "stable_baselines3",
     "torch_checkpoint",
     "keras",
 )

@@ -24,7 +24,7 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001
 #: What zipfile raises for a damaged or encrypted archive.
-_ZIP_ERRORS = (
+ZIP_ERRORS = (
     zipfile.BadZipFile,
     KeyError,
     ValueError,
@@ -36,7 +36,7 @@ _ZIP_ERRORS = (
     zlib.error,
 )
 _COPY_AGAIN = "copy or download it again"
-_FOREIGN = "give a checkpoint as ML-Agents wrote it (checkpoint.pt, <behavior>-<step>.pt)"
+_FOREIGN = "give a checkpoint as its trainer wrote it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class Archive:
         if identity[5:] not in ((), (None,)):
             raise NotAPolicyError(
                 "it holds a storage that is a view of another",
-                why="only PyTorch before 0.4 wrote such files, and ML-Agents never used it",
+                why="only PyTorch before 0.4 wrote such files, and none of the trainers that are read",
                 fix=_FOREIGN,
             )
         width = 2 if kind.dtype == "bfloat16" else np.dtype(kind.dtype).itemsize
@@ -125,7 +125,7 @@ class Archive:
                     raise NotAPolicyError(
                         "is a TorchScript module (torch.jit.save)",
                         why="it holds code of its own, which is not run",
-                        fix="give the checkpoint.pt of the run, or export the module to ONNX with torch.onnx.export",
+                        fix="give the checkpoint of the run, or export the module to ONNX with torch.onnx.export",
                     )
                 self._check_sizes(list(entries.values()))
                 if f"{root}byteorder" in entries and archive.read(f"{root}byteorder") == b"big":
@@ -134,7 +134,7 @@ class Archive:
                     if name.startswith(f"{root}data/"):
                         self._storages[name.removeprefix(f"{root}data/")] = memoryview(archive.read(name))
                 pickle = archive.read(names[0])
-        except _ZIP_ERRORS as error:
+        except ZIP_ERRORS as error:
             raise _damaged(f"its archive cannot be read: {error}", "the file is cut off or damaged") from error
         return unpickle(io.BytesIO(pickle), self._persistent)
 

@@ -15,7 +15,8 @@ from converters.graph.nn.normalisation import standardised
 from converters.graph.nn.reduction import over_last_axis
 from converters.graph.types import FLOAT32
 from converters.torch_checkpoint.network import TINY, Network
-from converters.torch_checkpoint.state import LET_IT_EXPORT, State
+from converters.torch_checkpoint.state import LET_IT_EXPORT
+from converters.torch_checkpoint.weights import Weights
 from signatures.errors import DamagedFileError
 
 #: Of ``ResidualSelfAttention``: heads, what a forbidden score becomes, which sum of squares is no entity yet.
@@ -81,7 +82,7 @@ def _self_attention(net: Network, x: str, mask: str, module: str) -> str:
 # ------------------------------------------------------------------ hidden layers
 
 
-def body_width(state: State, body: str) -> int:
+def body_width(state: Weights, body: str) -> int:
     """How many numbers the first hidden layer reads. Raises DamagedFileError."""
     for first in (f"{body}.seq_layers.0", f"{body}.layers.0"):
         if f"{first}.weight" in state:
@@ -94,7 +95,7 @@ def body_width(state: State, body: str) -> int:
     )
 
 
-def goal_width(state: State, body: str) -> int:
+def goal_width(state: Weights, body: str) -> int:
     """How many numbers the goals have, after which the weights are made; 0: there is none."""
     modules = [f"{body}.layers.{i}" for i in state.indices(f"{body}.layers.")]
     made = [m for m in modules if f"{m}.hypernet.0.weight" in state]
@@ -113,7 +114,7 @@ def hidden_layers(net: Network, x: str, goal: str | None, body: str) -> str:
     return x
 
 
-def _layers_of(state: State, module: str) -> list[int]:
+def _layers_of(state: Weights, module: str) -> list[int]:
     return state.indices(f"{module}.hypernet.")
 
 

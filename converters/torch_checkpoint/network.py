@@ -6,15 +6,18 @@ Source: mlagents/trainers/torch_entities/{layers,encoders,distributions}.py of 1
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nn.activations import clip
 from converters.graph.nn.linear import matmul
-from converters.graph.nn.recurrent import lstm
+from converters.graph.nn.recurrent import gru, lstm
 from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32
-from converters.torch_checkpoint.state import State
+from converters.torch_checkpoint.activations import Activation
+from converters.torch_checkpoint.weights import Weights
 
 #: Added before a logarithm (``EPSILON`` in distributions.py).
 TINY = 1e-7
@@ -24,7 +27,7 @@ _TO_NHWC, _TO_NCHW = (0, 2, 3, 1), (0, 3, 1, 2)
 class Network(Builder):
     """Nodes in the making; methods read the weights they need from the state dictionary."""
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: Weights) -> None:
         # Nodes are called <module>/<op>; inputs and outputs, without a slash, cannot meet them.
         super().__init__(NameScope(()))
         self.state = state
@@ -44,7 +47,7 @@ class Network(Builder):
 
     def at(self, module: str) -> None:
         """Name the nodes that follow after a module."""
-        self.prefix = module.replace(".", "/").strip("_/")
+        self.prefix = re.sub(r"[^A-Za-z0-9_/\-]", "_", module.replace(".", "/")).strip("_/")
 
     def width(self, reference: str) -> int:
         """The last axis of a tensor."""
@@ -84,6 +87,52 @@ class Network(Builder):
         recurrent = self.const(inner.T.copy(), "recurrent_kernel")
         result, cell = lstm(self, product, h, c, recurrent, np.asarray(bias, FLOAT32), "ifgo")
         return result, self.reshape(self.concat([result, cell], 1), (-1, 1, 2 * hidden))
+
+    def mlp(self, x: str, module: str, activation: Activation, *, ends: bool = False) -> str:
+        """``nn.Sequential`` of linear layers with an activation after each, not after the last where it ``ends``.
+
+        Raises SourceError where something else that has weights stands between them.
+        """
+        found = self.state.indices(f"{module}.")
+        if found != list(range(0, 2 * len(found), 2)):
+            raise self.state.unknown(
+                f"{module} (with weights at {', '.join(map(str, found[:8]))})",
+                "a linear layer and an activation by turns are expected",
+            )
+        for index in found:
+            x = self.linear(x, f"{module}.{index}")
+            if index != found[-1] or not ends:
+                x = activation(self, x)
+        return x
+
+    def recurrent(self, x: str, memory: str, module: str) -> tuple[str, str]:
+        """One step of ``nn.LSTM`` or ``nn.GRU`` of any number of layers, by their weights' shapes.
+
+        ``memory`` is [B, …]: the layers' h, then (LSTM) their c. Returns the output [B, H] and the new memory.
+        """
+        hidden, gates, layers = rnn_sizes(self.state, module)
+        after: dict[str, list[str]] = {"h": [], "c": []}
+        for layer in range(layers):
+            kernel = self.state.array(f"{module}.weight_ih_l{layer}", gates * hidden, self.width(x))
+            inner = self.state.array(f"{module}.weight_hh_l{layer}", gates * hidden, hidden)
+            biases = [self.state.array(f"{module}.bias_{k}_l{layer}", gates * hidden) for k in ("ih", "hh")]
+            self.at(module)
+            h = self.slice(memory, 1, layer * hidden, (layer + 1) * hidden)
+            if gates == 4:
+                c = self.slice(memory, 1, (layers + layer) * hidden, (layers + layer + 1) * hidden)
+                product = self.add("MatMul", [x, self.const(kernel.T.copy(), "kernel")])
+                recurrent = self.const(inner.T.copy(), "recurrent_kernel")
+                x, cell = lstm(self, product, h, c, recurrent, biases[0] + biases[1], "ifgo")
+                after["c"].append(cell)
+            else:
+                order = (1, 0, 2)  # PyTorch has r, z, n; the layer is given z, r, n
+                parts = [np.split(w, 3)[i].T.copy() for w in (kernel, inner) for i in order]
+                kernels = [self.const(w, "kernel") for w in parts]
+                shifts = [np.split(v, 3)[i] for v in biases for i in order]
+                x = gru(self, x, h, kernels[:3], kernels[3:], shifts, linear_before_reset=True)
+            after["h"].append(x)
+        self.at(module)
+        return x, self.concat([*after["h"], *after["c"]], 1)
 
     # ------------------------------------------------------------------ images, NHWC inside
 
@@ -155,3 +204,12 @@ class Network(Builder):
     def log(self, probs: str) -> str:
         """The logarithm of p + 1e-7, which all generations before 0.26 exported."""
         return self.add("Log", [self.add("Add", [probs, self.floats(TINY)])])
+
+
+def rnn_sizes(state: Weights, module: str) -> tuple[int, int, int]:
+    """(hidden size, gates: 4 of an LSTM, 3 of a GRU, layers) of a recurrent module. Raises SourceError."""
+    hidden = state.length(f"{module}.weight_hh_l0", 1)
+    gates, rest = divmod(state.length(f"{module}.weight_hh_l0", 0), max(hidden, 1))
+    if rest or gates not in (3, 4):
+        raise state.unknown(module, "its weights are no LSTM's and no GRU's")
+    return hidden, gates, sum(name.startswith("weight_hh_l") for name in state.under(f"{module}."))

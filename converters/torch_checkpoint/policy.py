@@ -27,6 +27,7 @@ import numpy as np
 from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
 from converters.graph.types import INT64
+from converters.torch_checkpoint.activations import LEAKY_SLOPE
 from converters.torch_checkpoint.body import attended, body_width, goal_width, hidden_layers
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
@@ -36,8 +37,6 @@ from converters.understand.generations import TORCH_VERSION_3
 from signatures.errors import DamagedFileError, SourceError
 
 _BODY = "network_body"
-#: Of ``nn.LeakyReLU()``.
-LEAKY_SLOPE = 0.01
 #: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.
 _FACTS = (
     "is_continuous_int",

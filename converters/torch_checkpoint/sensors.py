@@ -11,7 +11,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from converters.torch_checkpoint.state import LET_IT_EXPORT, State, unknown_part
+from converters.torch_checkpoint.state import LET_IT_EXPORT
+from converters.torch_checkpoint.weights import Weights
 from signatures.errors import DamagedFileError, SourceError, UsageError
 
 #: Larger sides are not looked for.
@@ -54,7 +55,7 @@ _RESNET = Encoder("resnet", ((3, 2), (3, 2), (3, 2)), 32)
 _DENSE = Encoder("fully_connected", (), 0)
 
 
-def encoder_of(state: State, module: str) -> Encoder | None:
+def encoder_of(state: Weights, module: str) -> Encoder | None:
     """The visual encoder that a module is, None where it is none."""
     names = state.under(f"{module}.")
     if any(n.startswith("sequential.") for n in names):
@@ -68,7 +69,7 @@ def encoder_of(state: State, module: str) -> Encoder | None:
     return _SIMPLE if shape[-1] == 8 else _MATCH3
 
 
-def dense_name(state: State, module: str) -> str:
+def dense_name(state: Weights, module: str) -> str:
     """The last layer of a visual encoder."""
     return f"{module}.dense" if f"{module}.dense.weight" in state else f"{module}.dense.0"
 
@@ -77,7 +78,7 @@ def dense_name(state: State, module: str) -> str:
 
 
 def find_sensors(
-    state: State, lists: Sequence[str], encoder: str, width: int, told: Sequence[tuple[int, ...]]
+    state: Weights, lists: Sequence[str], encoder: str, width: int, told: Sequence[tuple[int, ...]]
 ) -> tuple[list[Sensor], bool]:
     """The sensors in the order of the first layer's columns (``width`` of them), and whether vectors stand joined.
 
@@ -100,7 +101,7 @@ def find_sensors(
             and f"{module}.normalizer.running_mean" not in state
             and not _is_list(state, module)
         ):
-            raise unknown_part(
+            raise state.unknown(
                 f"{module} ({', '.join(state.under(module + '.')[:3])})",
                 "it encodes a sensor as no ML-Agents does; a plugin may have made it",
             )
@@ -143,7 +144,7 @@ def find_sensors(
 
 
 def find_goals(
-    state: State, sensors: Sequence[Sensor], width: int, told: Sequence[int], *, joined: bool
+    state: Weights, sensors: Sequence[Sensor], width: int, told: Sequence[int], *, joined: bool
 ) -> tuple[int, ...]:
     """The places of the sensors that the last hidden layer's weights are made from, ``width`` numbers in all.
 
@@ -191,25 +192,25 @@ def _summing(widths: Sequence[tuple[int, int]], total: int) -> list[tuple[int, .
     return found
 
 
-def _is_list(state: State, module: str) -> bool:
+def _is_list(state: Weights, module: str) -> bool:
     return f"{module}.self_ent_encoder.seq_layers.0.weight" in state
 
 
-def _entity_length(state: State, module: str, encoder: str) -> int:
+def _entity_length(state: Weights, module: str, encoder: str) -> int:
     """The numbers of one entity: what its encoder reads, without what the agent observes of itself."""
     read = state.length(f"{module}.self_ent_encoder.seq_layers.0.weight", -1)
     own = f"{encoder}.x_self_encoder.seq_layers.0.weight"
     return read - (state.length(own, 0) if own in state else 0)
 
 
-def _known_width(state: State, module: str | None) -> int:
+def _known_width(state: Weights, module: str | None) -> int:
     assert module is not None
     if encoder_of(state, module) is not None:
         return state.length(f"{dense_name(state, module)}.weight", 0)
     return state.length(f"{module}.normalizer.running_mean", 0)
 
 
-def _told_by_weights(state: State, module: str) -> Sensor:
+def _told_by_weights(state: Weights, module: str) -> Sensor:
     """A sensor whose shape follows from its module."""
     encoder = encoder_of(state, module)
     if encoder is None:
@@ -229,7 +230,7 @@ def _told_by_weights(state: State, module: str) -> Sensor:
     )
 
 
-def _sizes(state: State, module: str, encoder: Encoder, columns: int) -> list[tuple[int, int, int]]:
+def _sizes(state: Weights, module: str, encoder: Encoder, columns: int) -> list[tuple[int, int, int]]:
     """The image sizes C, H, W that an encoder may have been built for."""
     if encoder is _DENSE:
         if columns > _LONGEST**2:
@@ -253,7 +254,7 @@ def _sizes(state: State, module: str, encoder: Encoder, columns: int) -> list[tu
     ]
 
 
-def _channels(state: State, module: str, encoder: Encoder) -> int:
+def _channels(state: Weights, module: str, encoder: Encoder) -> int:
     first = "sequential.0.weight" if encoder is _RESNET else "conv_layers.0.weight"
     shape = state.shape(f"{module}.{first}")
     return shape[1] if len(shape) == 4 else 0
@@ -263,7 +264,7 @@ def _channels(state: State, module: str, encoder: Encoder) -> int:
 
 
 def _as_told(
-    state: State,
+    state: Weights,
     lists: Sequence[str],
     modules: Sequence[str | None],
     lengths: Mapping[str, int],
@@ -311,7 +312,7 @@ def _as_told(
 
 
 def _check_image(
-    state: State, module: str, encoder: Encoder, shape: tuple[int, ...], told: Sequence[tuple[int, ...]]
+    state: Weights, module: str, encoder: Encoder, shape: tuple[int, ...], told: Sequence[tuple[int, ...]]
 ) -> None:
     columns = state.length(f"{dense_name(state, module)}.weight", 1)
     if encoder is _DENSE:

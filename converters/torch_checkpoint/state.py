@@ -1,16 +1,14 @@
-"""The state dictionary of an actor: tensors by name, each taken once, so that nothing in it goes unread."""
+"""The actor of ML-Agents in a checkpoint."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import numpy as np
-
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.unpickle import Tensor
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from converters.torch_checkpoint.weights import Weights
+from signatures.errors import NotAPolicyError
 
 #: What a reader of a checkpoint can always do instead: ML-Agents writes the ONNX when it saves.
 LET_IT_EXPORT = (
@@ -21,7 +19,7 @@ LET_IT_EXPORT = (
 _NOT_POLICY = ("critic.", "value_heads.")
 
 
-class State:
+class State(Weights):
     """The tensors of ``Policy``; ``step_is_float``: its step counter is one of ML-Agents 0.20 and 0.21."""
 
     def __init__(self, archive: Archive) -> None:
@@ -38,79 +36,10 @@ class State:
                 fix="a state dictionary does not say what is computed with it: export the model to ONNX in its own "
                 "project (torch.onnx.export), and give that",
             )
-        self._archive = archive
-        self._tensors: Mapping[str, Tensor] = {k: v for k, v in policy.items() if isinstance(v, Tensor)}
-        self._left = {name for name in policy if not str(name).startswith(_NOT_POLICY)}
+        super().__init__(archive, policy, holder="its Policy", maker="ML-Agents", fix=LET_IT_EXPORT)
+        self.forget(*_NOT_POLICY)
         self.modules = sorted(str(k) for k in value) if policy is not value else []
         self.step_is_float = _step_is_float(value)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._tensors
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """The shape of a tensor; raises DamagedFileError where there is none of that name."""
-        if name not in self._tensors:
-            raise DamagedFileError(
-                f"its Policy has no {name}",
-                why="what stands beside it belongs to a network that has one",
-                fix=LET_IT_EXPORT,
-            )
-        return self._tensors[name].shape
-
-    def length(self, name: str, axis: int) -> int:
-        """The length of an axis of a tensor; raises DamagedFileError where it has none."""
-        shape = self.shape(name)
-        if not -len(shape) <= axis < len(shape):
-            raise DamagedFileError(
-                f"{name} has the shape {list(shape)}", why="it lacks an axis that such a weight has", fix=LET_IT_EXPORT
-            )
-        return shape[axis]
-
-    def array(self, name: str, *shape: int | None) -> np.ndarray:
-        """A tensor as float32, its shape checked (None: any length). Raises DamagedFileError."""
-        found = self.shape(name)
-        if len(found) != len(shape) or any(w is not None and w != n for w, n in zip(shape, found, strict=False)):
-            wanted = ", ".join("?" if n is None else str(n) for n in shape)
-            raise DamagedFileError(
-                f"{name} has the shape {list(found)}, and [{wanted}] fits the network",
-                why="the checkpoint is of a network that ML-Agents did not build, or damaged",
-                fix=LET_IT_EXPORT,
-            )
-        array = self._archive.array(self._tensors[name], name)
-        if array.dtype.kind not in "fiu":
-            raise DamagedFileError(f"{name} holds no numbers", why=f"its dtype is {array.dtype}", fix=LET_IT_EXPORT)
-        self._left.discard(name)
-        return array.astype(np.float32)
-
-    def number(self, name: str) -> float:
-        """A tensor of one element."""
-        array = self.array(name, *([1] * len(self.shape(name))))
-        return float(array.reshape(()))
-
-    def indices(self, prefix: str) -> list[int]:
-        """The numbers that follow ``prefix`` in the names (the members of a ModuleList), in order."""
-        pattern = re.compile(re.escape(prefix) + r"(\d{1,6})\.")
-        return sorted({int(m[1]) for m in map(pattern.match, self._tensors) if m is not None})
-
-    def under(self, prefix: str) -> list[str]:
-        """The names that begin with ``prefix``, without it."""
-        return [n.removeprefix(prefix) for n in self._tensors if n.startswith(prefix)]
-
-    def forget(self, *prefixes: str) -> None:
-        """Say that tensors are second names of others, or facts that are not needed."""
-        self._left = {n for n in self._left if not str(n).startswith(prefixes)}
-
-    def check_all_read(self) -> None:
-        """Raise SourceError where the actor has parts that are not known."""
-        if self._left:
-            names = sorted(str(n) for n in self._left)
-            shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-            raise unknown_part(shown, "it is part of no network that ML-Agents builds without plugins")
-
-
-def unknown_part(what: str, why: str) -> SourceError:
-    """The refusal of a network that is not built here."""
-    return SourceError(f"its network has a part that is not read from a checkpoint: {what}", why=why, fix=LET_IT_EXPORT)
 
 
 def _is_actor(policy: Mapping[Any, Any]) -> bool:

@@ -18,13 +18,13 @@ from typing import IO, Any
 
 from signatures.errors import DamagedFileError, NotAPolicyError
 
-#: A checkpoint of ML-Agents has some thousands of opcodes; with a critic and an optimizer some ten thousands.
+#: A checkpoint has some thousands of opcodes; with a critic and an optimizer some ten thousands.
 MAX_OPCODES = 1 << 21
 #: Items that its calls (OrderedDict, Size) may copy in all: a call of few bytes copies whatever the memo holds.
 MAX_COPIED = 1 << 20
 #: Of a tensor: kernels of images have four, and no axis is longer than a file can be.
 MAX_AXES, MAX_LENGTH = 8, 1 << 31
-_FIX = "give a checkpoint as ML-Agents wrote it (checkpoint.pt, <behavior>-<step>.pt)"
+_FIX = "give a checkpoint as its trainer wrote it"
 _MARK = object()
 _KEYS = (str, int, float, bool, type(None))
 
@@ -313,7 +313,7 @@ def _named(module: str, name: str) -> Any:
         raise NotAPolicyError(
             f"its pickle asks for {module[:100]}.{name[:100]}",
             why="only tensors and plain containers are built from a checkpoint, and nothing in it is run; a file that "
-            "asks for more may be an attack, or no checkpoint of ML-Agents",
+            "asks for more may be an attack, or no checkpoint of a policy",
             fix=_FIX,
         )
     return found

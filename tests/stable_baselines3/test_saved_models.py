@@ -1,0 +1,187 @@
+"""Saved models of Stable-Baselines3 and sb3-contrib against what their own ``predict`` gave (fixtures/sb3_zip)."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.graph.run import run_graph
+from converters.policy import Policy
+from converters.source import ReadOptions
+from exporter.export.sources import read_source
+from fixtures.goldens import read_npz
+from fixtures.sb3_zip import FOLDER, ROWS, WHOLE
+from fixtures.torch_checkpoint.cases import waves
+from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UsageError
+from tests.torch_checkpoint.pt_files import Writer, zipped
+
+NAMES = sorted(p.stem for p in FOLDER.glob("*.npz"))
+#: The widest gap between float32 sums in PyTorch's order and in ours.
+ATOL, RTOL = 2e-6, 2e-5
+
+
+def saved(name: str, folder: Path) -> Path:
+    """The model's ZIP: as the library wrote it, or put together from its data and shapes."""
+    if name in WHOLE:
+        return FOLDER / f"{name}.zip"
+    about = json.loads((FOLDER / f"{name}.json").read_text())
+    writer = Writer()
+    state = {}
+    for key, entry in about["tensors"].items():
+        state[key] = waves(entry["waves"], entry["shape"]) * np.float32(0.3 if key.endswith("log_std") else 1)
+    path = folder / f"{name}.zip"
+    path.write_bytes(
+        zipped({"data": json.dumps(about["data"]).encode(), "policy.pth": writer.zip(writer.state(state))})
+    )
+    return path
+
+
+def changed(folder: Path, name: str, state: Mapping[str, np.ndarray] | None = None, **data: Any) -> Path:
+    """A model with other data, or further tensors."""
+    about = json.loads((FOLDER / f"{name}.json").read_text())
+    writer = Writer()
+    tensors = {k: waves(k, e["shape"]) for k, e in about["tensors"].items()} | dict(state or {})
+    path = folder / "changed.zip"
+    entries = {"data": json.dumps(about["data"] | data).encode(), "policy.pth": writer.zip(writer.state(tensors))}
+    path.write_bytes(zipped(entries))
+    return path
+
+
+def compiled(path: Path) -> Policy:
+    (policy,) = read_source(path).policies()
+    return policy
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gives_what_predict_gives(name: str, tmp_path: Path) -> None:
+    policy = compiled(saved(name, tmp_path))
+    golden = read_npz(FOLDER / f"{name}.npz")
+    given = {k.removeprefix("in/").replace(" ", "_"): v for k, v in golden.items() if k.startswith("in/")}
+    feeds = {}
+    for spec in policy.signature.inputs:
+        key = spec.source if spec.source in given else spec.name
+        rows = tuple(ROWS if n is None else n for n in spec.shape)
+        feeds[spec.name] = np.zeros(rows, np.float32) if key == "epsilon" else given[str(key)].astype(spec.dtype)
+    names = [s.name for s in policy.signature.outputs]
+    answers = run_graph(policy.graph, feeds, names)
+    wanted = golden["deterministic"]
+    assert answers["deterministic_action"].reshape(wanted.shape) == pytest.approx(wanted, abs=ATOL, rel=RTOL)
+    assert len(np.unique(wanted.reshape(len(wanted), -1), axis=0)) > 1 or {"probs", "q_values"} & set(golden)
+    if "drawn" in golden:
+        drawn = run_graph(policy.graph, {**feeds, "epsilon": given["epsilon"]}, ["action"])["action"]
+        assert drawn.reshape(golden["drawn"].shape) == pytest.approx(golden["drawn"], abs=ATOL, rel=RTOL)
+    if "probs" in golden:
+        probs = np.exp(answers["action_log_probs"])
+        if probs.shape != golden["probs"].shape:  # of a bit there are two
+            probs = probs[:, 1::2]
+        assert probs == pytest.approx(golden["probs"], abs=ATOL, rel=RTOL)
+    for name_of in ("q_values", "recurrent_out"):
+        assert (name_of in golden) == (name_of in answers)
+        if name_of in golden:
+            assert answers[name_of] == pytest.approx(golden[name_of], abs=ATOL, rel=RTOL)
+
+
+def test_an_unpacked_folder_is_the_same_model(tmp_path: Path) -> None:
+    with zipfile.ZipFile(FOLDER / "ppo_box.zip") as archive:
+        archive.extractall(tmp_path / "ppo_box")
+    whole, folder = compiled(FOLDER / "ppo_box.zip"), compiled(tmp_path / "ppo_box")
+    assert whole.signature.inputs == folder.signature.inputs
+    assert whole.signature.algorithm == folder.signature.algorithm == "PPO"
+    assert any("VecNormalize" in note for note in whole.signature.notes)
+
+
+def custom(name: str, module: str = "__main__") -> dict[str, Any]:
+    return {":type:": "<class 'abc.ABCMeta'>", ":serialized:": "", "__module__": module, "__name__": name}
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("a2c_discrete", {"policy_class": custom("Mine")}, "its class is of __main__"),
+        ("a2c_discrete", {"policy_class": None}, "its class is not told"),
+        (
+            "ppo_eye",
+            {"policy_kwargs": {"features_extractor_class": "<class '__main__.MyEyes'>"}},
+            "its features extractor is MyEyes",
+        ),
+        (
+            "a2c_discrete",
+            {"policy_kwargs": {"activation_fn": "<function <lambda> at 0x7f00>"}},
+            "its activation is not known",
+        ),
+        (
+            "a2c_discrete",
+            {"action_space": {":type:": "<class 'gym.spaces.tuple.Tuple'>"}},
+            "its action_space is a Tuple",
+        ),
+    ],
+)
+def test_what_is_not_in_the_file_is_refused_and_named(
+    name: str, data: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError) as caught:
+        read_source(changed(tmp_path, name, **data))
+    assert words in str(caught.value)
+
+
+def test_an_activation_of_ones_own_is_said_and_one_that_is_known_is_not_overruled(tmp_path: Path) -> None:
+    elu = compiled(saved("a2c_discrete", tmp_path))
+    unknown = changed(tmp_path, "a2c_discrete", policy_kwargs={"activation_fn": "<function <lambda> at 0x7f00>"})
+    (said,) = read_source(unknown, ReadOptions(activation="elu")).policies()
+    assert [n.op for n in said.graph.nodes] == [n.op for n in elu.graph.nodes]
+    with pytest.raises(UsageError, match="contradicts the file"):
+        read_source(saved("a2c_discrete", tmp_path), ReadOptions(activation="tanh"))
+    with pytest.raises(UsageError, match="no such activation"):
+        read_source(unknown, ReadOptions(activation="elou"))
+
+
+def test_weights_that_no_layer_reads_are_refused(tmp_path: Path) -> None:
+    more = {"mlp_extractor.policy_net.1.weight": np.ones(8, np.float32)}  # a LayerNorm, a PReLU
+    with pytest.raises(SourceError, match=r"with weights at 0, 1, 2"):
+        read_source(changed(tmp_path, "a2c_discrete", more))
+    with pytest.raises(SourceError, match="attention"):
+        read_source(changed(tmp_path, "a2c_discrete", {"attention.weight": np.ones(8, np.float32)}))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"action_space": {}},
+        {"observation_space": {":type:": "<class 'gym.spaces.dict.Dict'>", "spaces": "{'a': Box((((("}},
+        {"observation_space": {":type:": "<class 'gym.spaces.box.Box'>", "_shape": [10**12]}},
+        {"observation_space": {":type:": "<class 'gym.spaces.box.Box'>", "_shape": "no"}},
+        {"action_space": {":type:": "<class 'gym.spaces.discrete.Discrete'>", "n": "5"}},
+        {"action_space": {":type:": "<class 'gym.spaces.box.Box'>", "_shape": [4], "low": "[-1 ... -1]", "high": "1"}},
+        {"policy_kwargs": {"activation_fn": 3}},
+    ],
+)
+def test_data_that_does_not_fit_is_an_error_and_no_traceback(data: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(ExportModelError):
+        compiled(changed(tmp_path, "a2c_discrete", **data))
+
+
+def test_a_bomb_is_refused_before_it_unfolds_and_nothing_in_a_pickle_is_run(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    path.write_bytes(zipped({"data": bytes(1 << 26), "policy.pth": b"x"}, zipfile.ZIP_DEFLATED))
+    with pytest.raises(DamagedFileError, match="unfolds to"):
+        read_source(path)
+    code = pickle.dumps({"a": _Runs(tmp_path / "touched")}, 2)
+    path.write_bytes(zipped({"data": b"{}", "policy.pth": zipped({"a/data.pkl": code})}))
+    with pytest.raises(NotAPolicyError, match="its pickle asks for"):
+        read_source(path)
+    assert not (tmp_path / "touched").exists()
+
+
+class _Runs:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return Path.touch, (self.path,)
