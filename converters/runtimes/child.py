@@ -32,13 +32,13 @@ def claim_stdout() -> BinaryIO:
 
     The first call of a child: from here on it ends when its parent does.
     """
-    _end_with_parent()
+    end_with_parent()
     stream = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return stream
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """A parent that is killed closes stdin, which is noticed between requests only: this looks during one, too."""
     parent = os.getppid()
 

@@ -85,6 +85,22 @@ class Console:
                 fix="check its names against the report, or take it out",
             )
 
+    @property
+    def wants_reports(self) -> bool:
+        """Whether a report is to be written."""
+        return self._reports
+
+    def progress_bar(self, length: int, rate: Callable[[], float]) -> Any:
+        """A bar for many sources, with how many of them are done in a second."""
+        return click.progressbar(
+            length=length,
+            file=sys.stderr,
+            hidden=self.quiet or self.verbose or self._silent or not sys.stderr.isatty(),
+            show_pos=True,
+            show_eta=True,
+            item_show_func=lambda name: None if name is None else f"{rate():.1f}/s  {name}",
+        )
+
     def progress(self) -> Progress:
         """For the steps of a command; nothing where stdout is for a program and stderr should stay empty."""
         return Progress(quiet=self.quiet or self._silent, verbose=self.verbose)
@@ -115,6 +131,13 @@ class Console:
         rows = [[kind, size_text(size)] for kind, size in result.sizes.items()]
         say_lines(table(("format", "size"), rows))
         say("NOT VERIFIED: --verify none")
+
+    def fleet(self, failures: Sequence[str], summary: str) -> None:
+        """Many sources: what failed, and the sum."""
+        for line in failures:
+            click.echo(line, err=True)
+        if not self._silent and not self.quiet:
+            click.echo(summary)
 
     def verified(self, report: ParityReport, place: object) -> None:
         """One policy that was verified."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -80,6 +80,9 @@ if TYPE_CHECKING:
     metavar="WHERE",
     help="auto, full, browser, none, or runtimes by name.",
 )
+@click.option("--jobs", type=int, metavar="N", help="Export N sources at a time (default: 1).")
+@click.option("--again", is_flag=True, help="Of many sources, export the unchanged ones too.")
+@click.option("--fail-fast", is_flag=True, help="Of many sources, stop at the first that fails.")
 @reporting
 @understanding
 @comparing
@@ -96,6 +99,9 @@ def export_command(
     activation: str | None,
     trust_source: bool,
     labels: Path | None,
+    jobs: int | None,
+    again: bool,
+    fail_fast: bool,
     compiling: CompileOptions,
     console: Console,
     options: VerifyOptions,
@@ -122,6 +128,11 @@ def export_command(
         labels,
         profile,
     )
+    if jobs is not None or again or fail_fast or _is_many(sources):
+        from exporter.cli.fleet import run_fleet
+
+        run_fleet(sources, job, jobs or 1, again, fail_fast, console)
+        return
     results: list[ExportResult] = []
     refused: list[ExportModelError] = []
     with console.progress() as progress:
@@ -137,7 +148,7 @@ def export_command(
             console.result(result)
     console.whole([r.report for r in results if r.report is not None])
     told = {"refused": [e.to_dict() for e in refused]} if refused else {}
-    console.json({"policies": [_result_dict(r) for r in results], **told})
+    console.json({"policies": [r.to_dict() for r in results], **told})
     console.next_step(results, compiling.names, profile)
     console.write_reports(lambda: _entries(results, options.steps))
     if refused:
@@ -146,17 +157,15 @@ def export_command(
         sys.exit(1)
 
 
+def _is_many(sources: Sequence[Path]) -> bool:
+    if all(path.is_file() and path.suffix != ".txt" for path in sources):  # nearly always; what follows reads files
+        return False
+    from exporter.fleet.sources import is_many
+
+    return is_many(sources)
+
+
 def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:
     from exporter.reports.entry import of_result
 
     return [entry for entry in (of_result(result, steps) for result in results) if entry is not None]
-
-
-def _result_dict(result: ExportResult) -> dict[str, Any]:
-    return {
-        "name": result.policy.name,
-        "folder": str(result.folder),
-        "passed": result.passed,
-        "sizes": dict(result.sizes),
-        "parity": None if result.report is None else result.report.to_dict(),
-    }

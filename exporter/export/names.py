@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Protocol
 
 from signatures.contract import safe_name
+
+#: A name, and why it is another than the source's.
+Claimed = tuple[str, str | None]
+
+
+class Naming(Protocol):
+    """Who says what policies are called."""
+
+    def claim(self, path: Path, names: Sequence[str]) -> list[Claimed]:
+        """For each policy of the source at ``path`` the name, and a note where that is not the one it was to have."""
+        ...
 
 
 class Names:
@@ -14,11 +26,15 @@ class Names:
     def __init__(self) -> None:
         self._taken: dict[str, Path] = {}
 
-    def claim(self, path: Path, name: str) -> tuple[str, str | None]:
-        """The name for a policy of the source at ``path``, and a note where that is not ``name``.
+    def claim(self, path: Path, names: Sequence[str]) -> list[Claimed]:
+        """As ``Naming`` says: of a name that is taken, with as many parts of the path in front as are needed."""
+        return [self._claim(path, name) for name in names]
 
-        A name that another policy has gets the parts of the path in front of it, the last first, as many as are needed.
-        """
+    def reserve(self, path: Path, name: str) -> None:
+        """A name that a policy of ``path`` has already."""
+        self._taken[name.casefold()] = path
+
+    def _claim(self, path: Path, name: str) -> Claimed:
         found = next(wish for wish in _wishes(path, name) if wish.casefold() not in self._taken)
         self._taken[found.casefold()] = path
         if found == name:

@@ -23,7 +23,7 @@ from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from exporter.export.labels import Labels, check_labels, labelled, read_labels
-from exporter.export.names import Names
+from exporter.export.names import Names, Naming
 from exporter.export.sources import Source, naming, read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.inner_tensors import saved_graph
@@ -102,6 +102,16 @@ class ExportResult:
         """What a user should know of the policy."""
         return (*self.policy.signature.notes, *([] if self.renamed is None else [self.renamed]))
 
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "name": self.policy.name,
+            "folder": str(self.folder),
+            "passed": self.passed,
+            "sizes": dict(self.sizes),
+            "parity": None if self.report is None else self.report.to_dict(),
+        }
+
     @property
     def passed(self) -> bool | None:
         """Whether the formats agree; None where no independent runtime ran."""
@@ -109,7 +119,7 @@ class ExportResult:
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class Job:
     """One policy to write, and where it comes from."""
 
     source: Source
@@ -161,7 +171,7 @@ class Exporter:
         check_rules(rules, outputs, {f.key: f.runtimes for f in self._formats}, self.runtimes)
         check_labels(self._labels, list(outputs))
 
-    def compiled(self, path: Path | str | Source, names: Names, progress: Progress) -> list[_Job]:
+    def compiled(self, path: Path | str | Source, names: Naming, progress: Progress) -> list[Job]:
         """The policies of a source, under the names that they will have. Raises ExportModelError."""
         options, wanted = self.options, self._profile
         progress(f"reading {path.path if isinstance(path, Source) else path}")
@@ -172,20 +182,17 @@ class Exporter:
                 raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
             found = [(model, replace(policy, name=options.name)) for model, policy in found]
         jobs = []
-        for model, policy in found:
-            name, note = names.claim(source.path, safe_name(policy.name))
+        called = names.claim(source.path, [safe_name(policy.name) for _, policy in found])
+        for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
             for key in self._undressed:
                 self._undressed[key](own)
             dressed = labelled(own if wanted is None else wanted.dress(own), self._labels)
-            jobs.append(_Job(source, model, dressed, wanted, None if wanted is None else own, note))
+            jobs.append(Job(source, model, dressed, wanted, None if wanted is None else own, note))
         return jobs
 
-    def export(
-        self, path: Path | str | Source, names: Names, pool: RuntimePool, progress: Progress
-    ) -> Iterator[ExportResult]:
-        """Export every policy of a source; all of them are compiled before the first is written."""
-        jobs = self.compiled(path, names, progress)
+    def written(self, jobs: Sequence[Job], pool: RuntimePool, progress: Progress) -> Iterator[ExportResult]:
+        """Write and verify the policies of a source. Raises ExportModelError, before the first is written if it can."""
         for job in jobs:
             bundle.check_replaceable(self.options.out / job.policy.name)
         made = [(j, *_write(j, self._formats, self.options)) for j in jobs]
@@ -193,7 +200,7 @@ class Exporter:
             yield self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
 
     def _verified(
-        self, job: _Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool, progress: Progress
+        self, job: Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool, progress: Progress
     ) -> ExportResult:
         """The bundle of a policy, verified and put in its place."""
         options, policy = self.options, job.policy
@@ -243,7 +250,8 @@ def export(
     with nullcontext(pool) if pool is not None else RuntimePool() as pool:
         for number, path in enumerate(paths, 1):
             try:
-                yield from exporter.export(path, names, pool, counted(progress, number, len(paths)))
+                told = counted(progress, number, len(paths))
+                yield from exporter.written(exporter.compiled(path, names, told), pool, told)
             except ExportModelError as error:
                 if len(paths) == 1:
                     raise
@@ -299,7 +307,7 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     return [written(target) for target in targets]
 
 
-def _write(job: _Job, formats: Sequence[Format], options: ExportOptions) -> tuple[Contract, list[Artifact]]:
+def _write(job: Job, formats: Sequence[Format], options: ExportOptions) -> tuple[Contract, list[Artifact]]:
     with naming(job.source.path):
         contract = contract_of(
             job.policy, job.source, job.model, options.read, None if job.profile is None else job.profile.name
@@ -343,7 +351,7 @@ def contract_of(
     return contract
 
 
-def _tested(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
+def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     policy = job.policy
     paths = {a.format.key: stage / a.main for a in artifacts}
     reference = paths.get("bytes")
@@ -367,7 +375,7 @@ def _tested(job: _Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path
     )
 
 
-def _tested_in(job: _Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
+def _tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
     """A policy written to a folder that is thrown away."""
     artifacts = [f.artifact(job.policy, WriteOptions("{}")) for f in formats]
     for artifact in artifacts:

@@ -1,0 +1,106 @@
+"""Many sources on the command line: a bar while they are exported, and a summary of what failed."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from exporter.cli.console import Console
+from exporter.fleet.fleet import export_fleet
+from exporter.fleet.sources import sources_in
+from exporter.fleet.worker import Outcome, Wanted
+
+if TYPE_CHECKING:
+    from exporter.export.pipeline import ExportOptions
+    from exporter.reports.entry import Entry
+
+#: Failures that are told in full; of more, the number.
+_MOST_SHOWN = 50
+
+
+def run_fleet(
+    given: Sequence[Path], options: ExportOptions, jobs: int, again: bool, fail_fast: bool, console: Console
+) -> None:
+    """Export what the paths stand for. Ends with status 2 where a source was refused, 1 where formats disagree."""
+    paths = sources_in(given, options.out)
+    wanted = Wanted(console.as_json, console.wants_reports)
+    tally = _Tally(len(paths))
+    entries: list[Entry] = []
+    answers: list[Any] = []
+    refused: list[Any] = []
+    outcomes = export_fleet(paths, options, jobs=jobs, again=again, fail_fast=fail_fast, wanted=wanted)
+    shown = console.progress_bar(len(paths), lambda: tally.rate)
+    with shown as bar:
+        for outcome in outcomes:
+            tally.count(outcome)
+            bar.update(1, outcome.path.name)
+            entries.extend(p.entry for p in outcome.policies if p.entry is not None)
+            answers.extend(p.answer for p in outcome.policies if p.answer is not None)
+            if outcome.error is not None and console.as_json:
+                refused.append(outcome.error.to_dict())
+            if console.verbose:
+                for line in _lines(outcome):
+                    click.echo(line)
+    console.json({"policies": answers, "unchanged": tally.unchanged, **({"refused": refused} if refused else {})})
+    console.fleet(tally.failures, tally.summary)
+    console.write_reports(lambda: entries)
+    if tally.refused:
+        sys.exit(2)
+    if tally.disagree:
+        sys.exit(1)
+
+
+class _Tally:
+    """What became of the sources so far."""
+
+    def __init__(self, sources: int) -> None:
+        self.sources, self.done, self.unchanged = sources, 0, 0
+        self.policies, self.verified, self.disagree, self.refused = 0, 0, 0, 0
+        self.failures: list[str] = []
+        self._start = time.monotonic()
+
+    @property
+    def rate(self) -> float:
+        """Sources that were exported in a second."""
+        return (self.done - self.unchanged) / max(time.monotonic() - self._start, 1e-3)
+
+    def count(self, outcome: Outcome) -> None:
+        """One more source."""
+        self.done += 1
+        self.unchanged += outcome.unchanged
+        self.policies += len(outcome.policies)
+        self.verified += sum(p.passed is True for p in outcome.policies)
+        self.disagree += sum(p.passed is False for p in outcome.policies)
+        self.refused += outcome.error is not None
+        if outcome.failed and len(self.failures) <= _MOST_SHOWN:
+            self.failures.extend(_lines(outcome, failed=True))
+
+    @property
+    def summary(self) -> str:
+        """All of it in a line."""
+        seconds = time.monotonic() - self._start
+        parts = [f"{self.policies} policies exported ({self.verified} verified)"]
+        parts += [f"{self.unchanged} sources unchanged"] if self.unchanged else []
+        parts += [f"{self.disagree} DISAGREE"] if self.disagree else []
+        parts += [f"{self.refused} sources REFUSED"] if self.refused else []
+        parts += [f"{self.sources - self.done} sources not reached"] if self.done < self.sources else []
+        return f"{self.done} of {self.sources} sources in {seconds:.1f} s ({self.rate:.1f}/s): {', '.join(parts)}"
+
+
+def _lines(outcome: Outcome, *, failed: bool = False) -> list[str]:
+    """What is said of a source; ``failed``: only what went wrong."""
+    lines = [f"{outcome.path}: unchanged"] if outcome.unchanged else []
+    for policy in outcome.policies:
+        if failed and policy.passed is not False:
+            continue
+        verdict = {True: "passed", False: f"FAILED: {policy.failure}", None: "not verified"}[policy.passed]
+        note = "" if policy.renamed is None else f" ({policy.renamed})"
+        lines.append(f"{outcome.path}: {policy.what} -> {policy.folder}: {verdict}{note}")
+    if outcome.error is not None:
+        lines.append(f"error: {outcome.error.message}")
+    return lines

@@ -1,0 +1,209 @@
+"""Export many sources, with as many processes as are asked for; results come as they are made, and none is kept.
+
+What is written does not depend on the number of processes: a policy's name is the only thing that depends on the other
+sources, and names are given in the order of the sources.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from converters.runtimes.pool import RuntimePool
+from exporter.export.names import Names
+from exporter.export.pipeline import Exporter, ExportOptions
+from exporter.fleet.ledger import Ledger
+from exporter.fleet.worker import Claim, Outcome, Wanted, exported, work
+from signatures.errors import SourceError, UsageError
+
+#: How long a worker may take to clean up when it is told to end.
+_GRACE_SECONDS = 10.0
+
+
+def export_fleet(
+    paths: Sequence[Path],
+    options: ExportOptions,
+    *,
+    jobs: int = 1,
+    again: bool = False,
+    fail_fast: bool = False,
+    wanted: Wanted | None = None,
+) -> Iterator[Outcome]:
+    """Export every source, ``jobs`` at a time; what ended last comes last.
+
+    A source that was exported to the same folder with the same options, and is unchanged, is left out unless ``again``
+    is set. ``fail_fast`` ends with the first source that is refused or disagrees. Raises UsageError,
+    RuntimeUnavailableError before the first source is read; what becomes of a source is in its Outcome.
+    """
+    if jobs < 1:
+        raise UsageError(f"--jobs {jobs}", fix="give a number from 1 on")
+    if options.name is not None and len(paths) > 1:
+        raise UsageError("--name goes with a single policy", fix="export one source, or leave --name out")
+    wanted = wanted or Wanted()
+    exporter, names = Exporter(options), Names()
+    exporter.check(paths, lambda text: None)
+    ledger = Ledger(options, exporter.runtimes)
+    waiting = []
+    for path in paths:
+        done = None if again else ledger.unchanged(path)
+        if done is None:
+            waiting.append(path)
+            continue
+        for name in done:
+            names.reserve(path, name)
+        yield Outcome(path, unchanged=True)
+    made = (
+        _here(exporter, waiting, names, wanted)
+        if jobs == 1 or len(waiting) < 2
+        else _Crew(options, wanted, names, waiting).run(min(jobs, len(waiting)))
+    )
+    for outcome in made:
+        if not outcome.failed and outcome.files is not None:
+            ledger.record(outcome.path, outcome.files, [p.name for p in outcome.policies])
+        yield outcome
+        if fail_fast and outcome.failed:
+            return
+
+
+def _here(exporter: Exporter, paths: Sequence[Path], names: Names, wanted: Wanted) -> Iterator[Outcome]:
+    with RuntimePool() as pool:
+        for path in paths:
+            yield exported(exporter, path, names, pool, wanted)
+
+
+@dataclass
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    #: which source it is at
+    at: int
+
+
+@dataclass
+class _Crew:
+    """Workers, each with one source at a time. Names are given to the sources in their order, so that they do not
+    depend on who is quick: a worker waits until all sources before its own have theirs.
+    """
+
+    options: ExportOptions
+    wanted: Wanted
+    names: Names
+    paths: Sequence[Path]
+    #: workers that wait for names, by their source
+    asking: dict[int, tuple[_Worker, Claim]] = field(default_factory=dict)
+    #: sources that have names, or ended without
+    named: set[int] = field(default_factory=set)
+    first_unnamed: int = 0
+    workers: list[_Worker] = field(default_factory=list)
+    #: workers that have nothing left to do, and end
+    ending: list[_Worker] = field(default_factory=list)
+
+    def run(self, count: int) -> Iterator[Outcome]:
+        """What becomes of the sources, as it comes."""
+        todo = iter(range(len(self.paths)))
+        with self:
+            for _ in range(count):
+                self._start(next(todo))
+            while self.workers:
+                for ready in wait([w.pipe for w in self.workers]):
+                    worker = next(w for w in self.workers if w.pipe is ready)
+                    outcome = self._heard(worker)
+                    if outcome is None:
+                        continue
+                    self._settle(worker.at)
+                    self._next(worker, next(todo, None))
+                    yield outcome
+
+    def _heard(self, worker: _Worker) -> Outcome | None:
+        """What a worker says: the end of a source, or None where it asked for names."""
+        path = self.paths[worker.at]
+        try:
+            message: Any = worker.pipe.recv()
+        except (EOFError, OSError):
+            worker.process.join()
+            return Outcome(
+                path,
+                error=SourceError(
+                    "the process that exported it ended",
+                    where=str(path),
+                    why=f"its status is {worker.process.exitcode}",
+                    fix="export it alone to see more; if memory ran out, use fewer --jobs",
+                ),
+            )
+        if isinstance(message, Claim):
+            self.asking[worker.at] = (worker, message)
+            self._give_names()
+            return None
+        assert isinstance(message, Outcome)
+        return message
+
+    def _settle(self, index: int) -> None:
+        self.asking.pop(index, None)
+        if index >= self.first_unnamed:
+            self.named.add(index)
+        self._give_names()
+
+    def _give_names(self) -> None:
+        while True:
+            if self.first_unnamed in self.named:
+                self.named.remove(self.first_unnamed)
+            elif self.first_unnamed in self.asking:
+                worker, claim = self.asking.pop(self.first_unnamed)
+                self._send(worker, self.names.claim(claim.path, claim.names))
+            else:
+                return
+            self.first_unnamed += 1
+
+    def _next(self, worker: _Worker, index: int | None) -> None:
+        if not worker.process.is_alive():
+            worker.pipe.close()
+            self.workers.remove(worker)
+            if index is not None:
+                self._start(index)
+        elif index is None:
+            self._send(worker, None)
+            self.workers.remove(worker)
+            self.ending.append(worker)
+        else:
+            worker.at = index
+            self._send(worker, self.paths[index])
+
+    def _start(self, index: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=work, args=(theirs, self.options, self.wanted), daemon=False)
+        process.start()
+        theirs.close()
+        worker = _Worker(process, ours, index)
+        self.workers.append(worker)
+        self._send(worker, self.paths[index])
+
+    @staticmethod
+    def _send(worker: _Worker, message: Any) -> None:
+        try:
+            worker.pipe.send(message)
+        except OSError:  # it has ended, which the next wait tells
+            return
+
+    def __enter__(self) -> _Crew:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for worker in self.workers:
+            worker.process.terminate()
+        for worker in (*self.workers, *self.ending):
+            worker.process.join(_GRACE_SECONDS)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+            worker.pipe.close()
+        self.workers.clear()
+        self.ending.clear()

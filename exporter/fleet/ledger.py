@@ -1,0 +1,108 @@
+"""What was exported to a folder: the next run leaves out what is unchanged, and goes on where one was stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from exporter.export.labels import read_labels
+from exporter.export.pipeline import ExportOptions
+from exporter.version import __version__
+from signatures.contract import POLICY
+from signatures.digest import sha256_hex
+from signatures.errors import BundleError
+
+_NAME = ".exported.jsonl"
+#: size, time of the last change in ns, sha256
+Stamp = list[Any]
+
+
+class Ledger:
+    """A line per source in a file of the output folder, appended when its bundles are in their places.
+
+    It is no proof, only a reason not to do work again: a line that is not understood says nothing.
+    """
+
+    def __init__(self, options: ExportOptions, runtimes: Sequence[str]) -> None:
+        self._path = options.out / _NAME
+        self._out = options.out
+        self._key = _key(options, runtimes)
+        self._lines: dict[str, Mapping[str, Any]] = {}
+        try:
+            text = self._path.read_text(encoding="utf-8") if self._path.is_file() else ""
+        except (OSError, ValueError):
+            text = ""
+        for line in text.splitlines():
+            try:
+                entry = json.loads(line)
+                self._lines[entry["source"]] = entry
+            except (ValueError, TypeError, KeyError, RecursionError):  # the last line of a run that was killed
+                continue
+
+    def unchanged(self, source: Path) -> list[str] | None:
+        """The names of a source's policies, where they were exported and all is as it was; else None."""
+        entry = self._lines.get(str(source), {})
+        try:
+            same = (
+                entry.get("options") == self._key
+                and entry["folder"] == _listing(source)
+                and all(_is_same(Path(path), stamp) for path, stamp in entry["files"].items())
+                and all(sha256_hex((self._out / n / POLICY).read_bytes()) == h for n, h in entry["policies"].items())
+            )
+            return [str(name) for name in entry["policies"]] if same else None
+        except (OSError, LookupError, TypeError, ValueError, AttributeError):
+            return None
+
+    def record(self, source: Path, files: Mapping[str, Stamp], policies: Iterable[str]) -> None:
+        """Note that a source was exported. Raises BundleError."""
+        try:
+            hashes = {n: sha256_hex((self._out / n / POLICY).read_bytes()) for n in policies}
+            entry = {
+                "source": str(source),
+                "options": self._key,
+                "folder": _listing(source),
+                "files": files,
+                "policies": hashes,
+            }
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+        except OSError as error:
+            raise BundleError(
+                "cannot be written", where=str(self._path), why=error.strerror, fix="make room"
+            ) from error
+
+
+def stamps(files: Iterable[Path]) -> dict[str, Stamp]:
+    """What tells whether files are as they are now. Raises OSError."""
+    return {str(f): [*_times(f), sha256_hex(f.read_bytes())] for f in sorted(set(files))}
+
+
+def _is_same(path: Path, stamp: Stamp) -> bool:
+    """By size and time, as git does it; a file that was only touched is read."""
+    size, time, digest = stamp
+    now = _times(path)
+    return now == [size, time] or (now[0] == size and sha256_hex(path.read_bytes()) == digest)
+
+
+def _times(path: Path) -> list[int]:
+    found = path.stat()
+    return [found.st_size, found.st_mtime_ns]
+
+
+def _listing(source: Path) -> str | None:
+    """What lies in a folder: a run may have written a newer checkpoint since."""
+    if not source.is_dir():
+        return None
+    inside = sorted(p for p in source.rglob("*") if p.is_file())
+    return sha256_hex(repr([(str(p.relative_to(source)), *_times(p)) for p in inside]).encode())
+
+
+def _key(options: ExportOptions, runtimes: Sequence[str]) -> str:
+    """What an export depends on beside its source: options, contents of the files that they name, the version."""
+    golden = options.parity.golden
+    said = replace(options, out=Path(), verify=tuple(runtimes), labels=None)
+    content = None if golden is None else sha256_hex(Path(golden).read_bytes())
+    return sha256_hex(repr((__version__, said, read_labels(options.labels), content)).encode())

@@ -1,0 +1,123 @@
+"""Sources in what a person gives for many: patterns, folders, lists of paths in a file."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from converters.bundle import BUNDLE
+from converters.fetch import Fetched, unreadable
+from converters.recognise import recognised
+from converters.source import ReadOptions
+from signatures.errors import SourceError, UsageError
+
+_MAGIC = frozenset("*?[")
+#: What a folder holds besides models is passed over, but for what stands there in a model's place.
+_TELLING = ("lfs_pointer",)
+
+
+def is_many(given: Sequence[Path]) -> bool:
+    """Whether one of the paths stands for others: a pattern, a list, or a folder that is no source itself."""
+    return any(
+        (path.is_dir() and not _is_source(path))
+        or (not path.exists() and not _MAGIC.isdisjoint(str(path)))
+        or (path.suffix == ".txt" and path.is_file())
+        for path in given
+    )
+
+
+def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
+    """The sources that the paths stand for, each once, in their order; those of a pattern or folder by name.
+
+    ``**`` goes through all folders. A ``.txt`` has a path a line, from where the command is called; ``#`` begins a
+    comment. What lies in ``out`` is no source. Raises UsageError where a path stands for none.
+    """
+    found: dict[Path, None] = {}
+    for path in given:
+        here = list(_expanded(path, out.resolve()))
+        if not here:
+            raise UsageError(
+                f"{path} stands for no source",
+                why="nothing there is a model in any form that is read",
+                fix="give model files, run folders, or folders that hold them",
+            )
+        found.update(dict.fromkeys(here))
+    return list(found)
+
+
+def _expanded(path: Path, out: Path) -> Iterator[Path]:
+    if path.is_dir():
+        yield from _walked(path, out)
+    elif path.suffix == ".txt" and path.is_file():
+        for line in _lines(path):
+            yield from _expanded(Path(line), out)
+    elif not path.exists() and not _MAGIC.isdisjoint(str(path)):
+        yield from _matching(path, out)
+    else:
+        yield path
+
+
+def _matching(pattern: Path, out: Path) -> Iterator[Path]:
+    """What a pattern finds; of a folder that is a source itself, nothing that lies in it."""
+    whole: set[Path] = set()
+    matches = sorted(glob.glob(str(pattern), recursive=True))  # noqa: PTH207 (a Path cannot glob from anywhere)
+    for match in map(Path, matches):
+        if not whole.isdisjoint(match.parents) or out in (match.resolve(), *match.resolve().parents):
+            continue
+        if match.is_file():
+            yield from [match] if _is_source(match) else []
+        elif "**" not in pattern.parts or _is_source(match):  # a ** goes into the others by itself
+            whole.add(match)
+            yield from _walked(match, out)
+
+
+def _lines(path: Path) -> Iterator[str]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"{path} is no list of paths", why=str(error), fix="write one path a line, in UTF-8"
+        ) from error
+    for line in text.splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield line.strip()
+
+
+def _walked(folder: Path, out: Path) -> Iterator[Path]:
+    """What is a source in a folder: itself, or the first on each way down."""
+    if folder.resolve() == out:
+        return
+    if _is_source(folder):
+        yield from _parts(folder)
+        return
+    try:
+        inside = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError as error:
+        raise unreadable(folder, error) from error
+    for entry in inside:
+        if entry.name.startswith("."):
+            continue
+        if entry.is_dir(follow_symlinks=False):
+            yield from _walked(Path(entry.path), out)
+        elif entry.is_file() and _is_source(Path(entry.path)):
+            yield Path(entry.path)
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The files of a folder that has a policy in each, under the file's name; else the folder, which is one source."""
+    found = recognised(Fetched(folder))
+    if found.members is None:
+        return [folder]
+    members = found.members(folder, ReadOptions())
+    apart = all(m.path.is_file() and m.path.parent == folder and m.path.stem == m.name for m in members)
+    return [m.path for m in members] if apart else [folder]
+
+
+def _is_source(path: Path) -> bool:
+    try:
+        found = recognised(Fetched(path))
+    except SourceError:
+        return False
+    return found.readable or found is BUNDLE or found.key in _TELLING

@@ -1,0 +1,133 @@
+"""One source of many, exported: in this process, or in one of several that take sources from a pipe."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from converters.runtimes.child import end_with_parent
+from converters.runtimes.pool import RuntimePool
+from exporter.export.names import Claimed, Naming
+from exporter.export.pipeline import Exporter, ExportOptions, ExportResult
+from exporter.fleet.ledger import Stamp, stamps
+from exporter.reports.entry import Entry, of_result
+from signatures.errors import ExportModelError, SourceError
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A policy of many, written; ``entry`` where reports were asked for, ``failure`` where formats disagree."""
+
+    name: str
+    folder: Path
+    passed: bool | None
+    what: str
+    renamed: str | None = None
+    failure: str | None = None
+    answer: Mapping[str, Any] | None = None
+    entry: Entry | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a source: its policies, or why there are none (or not all of them)."""
+
+    path: Path
+    policies: tuple[Written, ...] = ()
+    error: ExportModelError | None = None
+    unchanged: bool = False
+    files: Mapping[str, Stamp] | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether it was refused or formats disagree."""
+        return self.error is not None or any(p.passed is False for p in self.policies)
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a caller needs of each policy beside the verdict; nothing of it is kept otherwise."""
+
+    answers: bool = False
+    entries: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What a worker asks: names for the policies of its source."""
+
+    path: Path
+    names: Sequence[str]
+
+
+def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, wanted: Wanted) -> Outcome:
+    """Export one source."""
+    policies: list[Written] = []
+    files: Mapping[str, Stamp] | None = None
+    try:
+        jobs = exporter.compiled(path, names, _silent)
+        files = stamps(f for job in jobs for f in job.model.files)
+        steps = exporter.options.parity.steps
+        policies.extend(_written(result, wanted, steps) for result in exporter.written(jobs, pool, _silent))
+    except ExportModelError as error:
+        return Outcome(path, tuple(policies), error)
+    except OSError as error:
+        return Outcome(path, tuple(policies), SourceError("cannot be read", where=str(path), why=error.strerror))
+    return Outcome(path, tuple(policies), None, files=files)
+
+
+def _written(result: ExportResult, wanted: Wanted, steps: int) -> Written:
+    signature, report = result.policy.signature, result.report
+    failures = [] if report is None else report.failures
+    return Written(
+        result.policy.name,
+        result.folder,
+        result.passed,
+        f"{signature.family}, {signature.action_space} actions",
+        result.renamed,
+        failures[0].sentence() if failures else None,
+        result.to_dict() if wanted.answers else None,
+        of_result(result, steps) if wanted.entries else None,
+    )
+
+
+def _silent(text: str) -> None:
+    """Steps of one of many are not told."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Asking:
+    """Asks the process that knows all names."""
+
+    pipe: Connection
+
+    def claim(self, path: Path, names: Sequence[str]) -> list[Claimed]:
+        """As ``Names.claim``."""
+        self.pipe.send(Claim(path, names))
+        answer: list[Claimed] = self.pipe.recv()
+        return answer
+
+
+def work(pipe: Connection, options: ExportOptions, wanted: Wanted) -> None:
+    """Take sources from the pipe until it says None; what they need is set up once. The program of a worker."""
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
+    signal.signal(signal.SIGTERM, _stop)
+    exporter = Exporter(options)
+    try:
+        with RuntimePool() as pool:
+            while (path := pipe.recv()) is not None:
+                pipe.send(exported(exporter, path, _Asking(pipe), pool, wanted))
+    except (EOFError, BrokenPipeError):  # nobody listens any more
+        sys.exit(1)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """Leave as an exception does, so that nothing is left behind."""
+    sys.exit(128 + number)

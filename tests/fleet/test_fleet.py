@@ -1,0 +1,157 @@
+"""Many sources: the same bytes by any number of processes; unchanged ones left out; what dies or is refused is told."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from exporter.export.pipeline import ExportOptions
+from exporter.fleet.fleet import export_fleet
+from exporter.fleet.worker import Outcome
+from fixtures import path as fixture
+from signatures.errors import UsageError
+from tests.commands import export_model
+
+NAMES = ("continuous", "discrete", "twobrains", "visual")
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> list[Path]:
+    """Policies of the same names in two folders, and one that is none."""
+    paths = []
+    for folder in ("a", "b"):
+        for name in NAMES:
+            path = tmp_path / folder / f"{name}.bytes"
+            path.parent.mkdir(exist_ok=True)
+            shutil.copy(fixture(name), path)
+            paths.append(path)
+    (tmp_path / "a" / "broken.bytes").write_bytes(fixture("discrete").read_bytes()[:-700])
+    paths.insert(2, tmp_path / "a" / "broken.bytes")
+    return paths
+
+
+def contents(folder: Path) -> Mapping[str, bytes]:
+    files = (p for p in folder.rglob("*") if p.is_file() and p.name != ".exported.jsonl")
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+def run(sources: list[Path], out: Path, jobs: int = 1, **more: bool) -> dict[str, Outcome]:
+    options = ExportOptions(out, verify="none")
+    return {str(o.path): o for o in export_fleet(sources, options, jobs=jobs, **more)}  # type: ignore[arg-type]
+
+
+def test_what_is_written_does_not_depend_on_the_number_of_processes(sources: list[Path], tmp_path: Path) -> None:
+    one, three = run(sources, tmp_path / "one"), run(sources, tmp_path / "three", jobs=3)
+    assert contents(tmp_path / "one") == contents(tmp_path / "three")
+    assert one.keys() == three.keys() == set(map(str, sources))
+    refused = [o for o in three.values() if o.error is not None]
+    assert [o.path.name for o in refused] == ["broken.bytes"]
+    names = [p.name for o in three.values() for p in o.policies]
+    assert len(names) == len(set(names)) == 10
+    assert "a-continuous" not in names  # the first in order has the plain name, whoever is quicker
+    assert {"continuous", "b-continuous"} < set(names)
+
+
+def test_what_is_unchanged_is_left_out(sources: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(sources, out, jobs=2)
+    before = contents(out)
+    again = run(sources, out)
+    assert [o.path.name for o in again.values() if not o.unchanged] == ["broken.bytes"]  # which may have been mended
+    os.utime(sources[0])  # touched, not changed
+    shutil.copy(fixture("recurrent"), sources[1])
+    shutil.rmtree(out / "b-visual")
+    third = run(sources, out)
+    done = {o.path for o in third.values() if not o.unchanged and o.error is None}
+    assert done == {sources[1], sources[-1]}
+    assert contents(out).keys() == before.keys()
+    assert not any(o.unchanged for o in run(sources, out, again=True).values())
+    other = export_fleet(sources, ExportOptions(out, verify="none", targets=("onnx",)))
+    assert not any(o.unchanged for o in other)
+
+
+def test_a_run_that_was_stopped_goes_on(sources: list[Path], tmp_path: Path) -> None:
+    run(sources, tmp_path / "whole")
+    stopped = export_fleet(sources, ExportOptions(tmp_path / "out", verify="none"), jobs=2)
+    for _ in range(3):
+        next(stopped)
+    stopped.close()
+    ledger = tmp_path / "out" / ".exported.jsonl"
+    lines = ledger.read_text().splitlines()
+    ledger.write_text("\n".join(lines)[:-40])  # cut off in the middle of a line
+    rest = run(sources, tmp_path / "out", jobs=2)
+    assert sum(o.unchanged for o in rest.values()) == len(lines) - 1
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    assert not [p for p in (tmp_path / "out").iterdir() if p.name.startswith(".export-model")]
+
+
+def test_a_process_that_dies_costs_one_source(
+    sources: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from exporter.fleet import fleet
+
+    real = fleet._Crew._heard
+
+    def killing(crew: fleet._Crew, worker: fleet._Worker) -> Outcome | None:
+        if crew.paths[worker.at].name == "discrete.bytes" and crew.paths[worker.at].parent.name == "a":
+            assert worker.process.pid is not None
+            os.kill(worker.process.pid, signal.SIGKILL)
+            worker.process.join()
+            while worker.pipe.poll():
+                try:
+                    worker.pipe.recv()
+                except EOFError:
+                    break
+        return real(crew, worker)
+
+    monkeypatch.setattr(fleet._Crew, "_heard", killing)
+    made = run(sources, tmp_path / "out", jobs=2)
+    lost = made[str(tmp_path / "a" / "discrete.bytes")]
+    assert lost.error is not None
+    assert "its status is -9" in lost.error.message
+    assert sum(o.error is None for o in made.values()) == len(sources) - 2
+
+
+def test_the_first_failure_may_be_the_end(sources: list[Path], tmp_path: Path) -> None:
+    made = list(export_fleet(sources, ExportOptions(tmp_path / "out", verify="none"), fail_fast=True))
+    assert made[-1].error is not None
+    assert len(made) == 3
+
+
+@pytest.mark.parametrize("jobs", [0, -1])
+def test_some_number_of_processes_is_needed(jobs: int, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--jobs"):
+        next(export_fleet([fixture("continuous")], ExportOptions(tmp_path), jobs=jobs))
+
+
+@pytest.mark.runtimes
+def test_the_command_line_sums_up(sources: list[Path], tmp_path: Path) -> None:
+    ran = export_model(tmp_path / "a", "-o", tmp_path / "out", "--jobs", "2", "--verify", "onnxruntime")
+    assert ran.status == 2
+    assert "5 of 5 sources in" in ran.out
+    assert "5 policies exported (5 verified), 1 sources REFUSED" in ran.out
+    assert "broken.bytes" in ran.err
+    (tmp_path / "a" / "broken.bytes").unlink()
+    ran = export_model(tmp_path / "a", "-o", tmp_path / "out", "--jobs", "1", "--verify", "onnxruntime", "--json")
+    assert (ran.status, ran.json) == (0, {"policies": [], "unchanged": 4})
+    ran = export_model(tmp_path / "a", "-o", tmp_path / "new", "--again", "--json", "--verify", "none")
+    assert sorted(p["name"] for p in ran.json["policies"]) == sorted(
+        p.name for p in (tmp_path / "new").iterdir() if p.is_dir()
+    )
+
+
+def lines(path: Path) -> Iterator[dict[str, object]]:
+    return (json.loads(line) for line in path.read_text().splitlines())
+
+
+def test_only_what_is_in_its_place_is_recorded(sources: list[Path], tmp_path: Path) -> None:
+    run(sources, tmp_path / "out")
+    assert {entry["source"] for entry in lines(tmp_path / "out" / ".exported.jsonl")} == {
+        str(s) for s in sources if s.name != "broken.bytes"
+    }

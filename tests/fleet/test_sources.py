@@ -1,0 +1,74 @@
+"""What patterns, folders and lists stand for."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from exporter.fleet.sources import is_many, sources_in
+from fixtures import path as fixture
+from signatures.errors import UsageError
+from tests.commands import ROOT
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Models in folders, one of them called as nothing, beside what is no model; and a run's folder."""
+    for target in ("runs/a/one.bytes", "runs/a/two.bytes", "runs/b/model.weights"):
+        (tmp_path / target).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(fixture("continuous"), tmp_path / target)
+    (tmp_path / "runs/b/notes.md").write_text("# what we tried\n")
+    (tmp_path / "runs/.cache").mkdir()
+    shutil.copy(fixture("continuous"), tmp_path / "runs/.cache/policy.bytes")
+    shutil.copytree(ROOT / "fixtures/trained/3DBall", tmp_path / "runs/ball/3DBall")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+FLAT = ["runs/a/one.bytes", "runs/a/two.bytes", "runs/b/model.weights"]
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ("runs", [*FLAT, "runs/ball"]),
+        ("runs/**/*.bytes", [*FLAT[:2]]),
+        ("runs/*", [*FLAT, "runs/ball"]),
+        ("runs/[ab]/*", FLAT),
+    ],
+)
+def test_a_folder_and_a_pattern_stand_for_the_models_in_them(given: str, found: list[str], place: Path) -> None:
+    assert is_many([Path(given)])
+    assert sorted(map(str, sources_in([Path(given)], Path("out")))) == sorted(found)
+
+
+def test_a_list_has_a_path_a_line(place: Path) -> None:
+    (place / "more.txt").write_text("# the good ones\nruns/b\n\nruns/a/one.bytes  \nruns/a/one.bytes\n")
+    assert is_many([Path("more.txt")])
+    assert [str(p) for p in sources_in([Path("more.txt")], Path("out"))] == [FLAT[2], FLAT[0]]
+
+
+def test_what_was_written_before_is_no_source(place: Path) -> None:
+    shutil.copytree(place / "runs/a", place / "runs/out")
+    for given in ("runs", "runs/**/*.bytes"):
+        assert not [p for p in sources_in([Path(given)], Path("runs/out")) if "out" in p.parts]
+
+
+def test_a_file_and_a_run_are_one_source(place: Path) -> None:
+    assert not is_many([Path(FLAT[0]), Path("runs/ball"), Path("gone.onnx")])
+    assert sources_in([Path("gone.onnx")], Path("out")) == [Path("gone.onnx")]  # which its reader refuses
+
+
+def test_files_in_a_folder_are_one_source_each(place: Path) -> None:
+    """Such a folder is read as a run's, all at once, where it is given alone."""
+    assert not is_many([Path("runs/a")])
+    assert sources_in([Path("runs/a")], Path("out")) == [Path("runs/a/one.bytes"), Path("runs/a/two.bytes")]
+
+
+@pytest.mark.parametrize("given", ["*.onnx", "empty"])
+def test_what_stands_for_nothing_is_refused(given: str, place: Path) -> None:
+    (place / "empty").mkdir()
+    with pytest.raises(UsageError, match="stands for no source"):
+        sources_in([Path(given)], Path("out"))
