@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from exporter.cli.terminal import Progress, say, say_json, say_lines
+from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -90,16 +90,9 @@ class Console:
         """Whether a report is to be written."""
         return self._reports
 
-    def progress_bar(self, length: int, rate: Callable[[], float]) -> Any:
-        """A bar for many sources, with how many of them are done in a second."""
-        return click.progressbar(
-            length=length,
-            file=sys.stderr,
-            hidden=self.quiet or self.verbose or self._silent or not sys.stderr.isatty(),
-            show_pos=True,
-            show_eta=True,
-            item_show_func=lambda name: None if name is None else f"{rate():.1f}/s  {name}",
-        )
+    def progress_bar(self, length: int) -> Bar:
+        """A bar for many sources."""
+        return Bar(length, shown=not (self.quiet or self.verbose or self._silent))
 
     def progress(self) -> Progress:
         """For the steps of a command; nothing where stdout is for a program and stderr should stay empty."""
@@ -135,9 +128,9 @@ class Console:
     def fleet(self, failures: Sequence[str], summary: str) -> None:
         """Many sources: what failed, and the sum."""
         for line in failures:
-            click.echo(line, err=True)
+            say_lines(line, err=True)
         if not self._silent and not self.quiet:
-            click.echo(summary)
+            say(summary)
 
     def verified(self, report: ParityReport, place: object) -> None:
         """One policy that was verified."""

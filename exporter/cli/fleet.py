@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from exporter.cli.console import Console
+from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
 from exporter.fleet.worker import Outcome, Wanted
@@ -34,18 +33,17 @@ def run_fleet(
     answers: list[Any] = []
     refused: list[Any] = []
     outcomes = export_fleet(paths, options, jobs=jobs, again=again, fail_fast=fail_fast, wanted=wanted)
-    shown = console.progress_bar(len(paths), lambda: tally.rate)
-    with shown as bar:
+    with console.progress_bar(len(paths)) as bar:
         for outcome in outcomes:
             tally.count(outcome)
-            bar.update(1, outcome.path.name)
+            bar.advance(outcome.path.name, tally.rate)
             entries.extend(p.entry for p in outcome.policies if p.entry is not None)
             answers.extend(p.answer for p in outcome.policies if p.answer is not None)
             if outcome.error is not None and console.as_json:
                 refused.append(outcome.error.to_dict())
             if console.verbose:
                 for line in _lines(outcome):
-                    click.echo(line)
+                    say_lines(line)
     console.json({"policies": answers, "unchanged": tally.unchanged, **({"refused": refused} if refused else {})})
     console.fleet(tally.failures, tally.summary)
     console.write_reports(lambda: entries)

@@ -72,3 +72,32 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.clear()
+
+
+class Bar:
+    """How many of many are done, how many in a second, and how long the rest takes; on a terminal only."""
+
+    def __init__(self, length: int, *, shown: bool) -> None:
+        self._rate = 0.0
+        self._bar: Any = click.progressbar(
+            length=length,
+            file=sys.stderr,
+            hidden=not shown or not sys.stderr.isatty(),
+            show_pos=True,
+            show_eta=True,
+            item_show_func=lambda name: None if name is None else f"{self._rate:.1f}/s  {printable(name)}",
+        )
+
+    def advance(self, name: str, rate: float) -> None:
+        """One more is done, ``rate`` in a second."""
+        self._rate = rate
+        self._bar.update(1, name)
+
+    def __enter__(self) -> Bar:
+        self._bar.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.__exit__(kind, error, trace)

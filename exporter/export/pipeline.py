@@ -581,14 +581,14 @@ def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
         return None if original is None else original.narrowed(contract.source)
 
 
-def _made_again(found: Source, contract: Contract, wanted: Profile) -> _Job:
+def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
     """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
     compiled = list(found.compiled())
     named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
     for model, own in named or compiled[: len(compiled) == 1]:
         dressed = wanted.dress(own)
         if _tensors(dressed.signature) == _tensors(contract.signature):
-            return _Job(found, model, replace(dressed, name=contract.name), wanted, own)
+            return Job(found, model, replace(dressed, name=contract.name), wanted, own)
     raise BundleError(
         "cannot be held against its source",
         where=str(found.path),

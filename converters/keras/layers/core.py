@@ -14,7 +14,6 @@ from converters.graph.nn.shaping import padded, taken
 from converters.graph.types import FLOAT32, INT32, Dim
 from converters.keras.layers.activations import activated
 from converters.keras.layers.step import Step, Translate
-from converters.keras.model import layer_of
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 
@@ -199,24 +198,6 @@ def _normalization(step: Step) -> str:
     return b.add("RealDiv", [b.add("Sub", [x, operands[0]]), operands[1]])
 
 
-def _time_distributed(step: Step) -> str:
-    """The same layer at every step: steps are rows of one batch."""
-    from converters.keras.layers.table import LAYERS
-
-    b, x = step.net, step.x
-    inner = layer_of(step.get("layer"))
-    if inner.kind not in LAYERS:
-        raise UnsupportedOpError(f"it wraps a {inner.kind}")
-    rows, time, *rest = b.shape(x)
-    flat = b.reshape(x, (-1, *rest))
-    inside = step.inner(inner, [flat], step.left)
-    value = LAYERS[inner.kind](inside)
-    step.left = inside.left
-    if not isinstance(value, str):
-        raise UnsupportedOpError(f"it wraps a {inner.kind} with several results")
-    return b.reshape(value, (rows, time, *b.shape(value)[1:]))
-
-
 _IDENTITIES = (
     *("Dropout", "SpatialDropout1D", "SpatialDropout2D", "GaussianNoise", "GaussianDropout", "AlphaDropout"),
     *("ActivityRegularization", "Identity"),
@@ -240,5 +221,4 @@ LAYERS: Mapping[str, Translate] = {
     **dict.fromkeys(("UpSampling1D", "UpSampling2D"), _up_sampling),
     "Rescaling": _rescaling,
     "Normalization": _normalization,
-    "TimeDistributed": _time_distributed,
 }

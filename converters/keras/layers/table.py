@@ -5,7 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from converters.keras.layers import activations, attention, convolution, core, normalisation, operations, recurrent
-from converters.keras.layers.step import Translate
+from converters.keras.layers.step import Step, Translate
+from converters.keras.model import layer_of
+from signatures.errors import UnsupportedOpError
+
+
+def _time_distributed(step: Step) -> str:
+    """The same layer at every step: steps are rows of one batch."""
+    b, x = step.net, step.x
+    inner = layer_of(step.get("layer"))
+    if inner.kind not in LAYERS:
+        raise UnsupportedOpError(f"it wraps a {inner.kind}")
+    rows, time, *rest = b.shape(x)
+    flat = b.reshape(x, (-1, *rest))
+    inside = step.inner(inner, [flat], step.left)
+    value = LAYERS[inner.kind](inside)
+    step.left = inside.left
+    if not isinstance(value, str):
+        raise UnsupportedOpError(f"it wraps a {inner.kind} with several results")
+    return b.reshape(value, (rows, time, *b.shape(value)[1:]))
+
 
 LAYERS: Mapping[str, Translate] = {
     **activations.LAYERS,
@@ -14,5 +33,6 @@ LAYERS: Mapping[str, Translate] = {
     **normalisation.LAYERS,
     **recurrent.LAYERS,
     **attention.LAYERS,
+    "TimeDistributed": _time_distributed,
 }
 OPERATIONS: Mapping[str, Translate] = operations.OPERATIONS
