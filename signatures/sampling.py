@@ -2,7 +2,7 @@
 
 Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, 30 to 300, 1e3, float32
 denormals, every two inputs at opposite extremes, all but one action masked, a memory far from zero), images in 0..1,
-batches of 1, 2 and 7, and a large odd one where there are no images.
+pixels at their ends, batches of 1, 2 and 7, and a large odd one (a smaller one of large images).
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
-#: Tried once, and not with images, which take long.
+#: Tried once; with images, which take long, the largest whose pixels are no more than these.
 LARGE_BATCH = 131
+LARGE_BATCHES_OF_IMAGES = (67, 33, 17, 9)
+MAX_PIXELS = 1 << 21
 #: Values that are far from typical ones and near enough to be met: between eight deviations and 1e3.
 FAR = (30.0, 100.0, 300.0)
 #: What a free axis behind the batch is tried with (image sides, number of entities).
@@ -64,11 +66,14 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     if any(s.role is Role.MASKS for s in signature.inputs):
         cases.append(_case(signature, rng, "all but one action masked", 7, _typical, masks=_one_allowed))
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
+    large = _large_batch(signature)
     if any(s.role is Role.VISUAL for s in signature.inputs):
+        cases.append(_case(signature, rng, "pixels at their ends", 3, _pixel_ends))
+        cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
         if any(_is_free(s) for s in signature.inputs):
             cases.append(_case(signature, rng, "30 to 300", len(FAR), _far(signature, few=True)))
         return cases
-    cases.append(_case(signature, rng, f"typical, batch {LARGE_BATCH}", LARGE_BATCH, _typical))
+    cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
     if not any(_is_free(s) for s in signature.inputs):
         return cases
     pattern = len(_opposed(signature))
@@ -115,7 +120,8 @@ def _other(
             return rng.integers(0, sizes[0], shape)
         return np.stack([rng.integers(0, sizes[min(i, len(sizes) - 1)], shape[0]) for i in range(shape[1])], axis=1)
     if spec.role is Role.VISUAL:
-        return rng.random(shape) * float((spec.distribution or {}).get("high", 1.0))
+        pixels = _ends(rng, shape) if style is _pixel_ends else rng.random(shape)
+        return pixels * float((spec.distribution or {}).get("high", 1.0))
     if spec.role is Role.NOISE:
         return rng.standard_normal(shape)
     if spec.role is Role.MEMORY_IN:
@@ -138,6 +144,18 @@ def _statistics(spec: TensorSpec) -> tuple[np.ndarray, np.ndarray]:
 def _typical(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     mean, std = _statistics(spec)
     return np.asarray(mean + std * rng.standard_normal(shape))
+
+
+def _pixel_ends(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """Of images; what else is observed is typical."""
+    return _typical(rng, spec, shape)
+
+
+def _ends(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Images that are black, white, and both at random, in turn."""
+    pixels = rng.integers(0, 2, shape).astype(np.float64)
+    pixels[0::3], pixels[1::3] = 0, 1
+    return pixels
 
 
 def _zeros(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
@@ -179,6 +197,14 @@ def _opposed(signature: PolicySignature) -> np.ndarray:
     bits = np.arange(max(1, (count - 1).bit_length()))[:, None]
     signs = np.where(np.arange(count) >> bits & 1, 1.0, -1.0)
     return np.concatenate([signs, -signs, np.ones((1, count)), -np.ones((1, count))])
+
+
+def _large_batch(signature: PolicySignature) -> int:
+    pixels = sum(_numbers(s.shape) for s in signature.inputs if s.role is Role.VISUAL)
+    if not pixels:
+        return LARGE_BATCH
+    fitting = (n for n in LARGE_BATCHES_OF_IMAGES if n * pixels <= MAX_PIXELS)
+    return next(fitting, LARGE_BATCHES_OF_IMAGES[-1])
 
 
 def _numbers(shape: Sequence[int | None]) -> int:

@@ -43,6 +43,10 @@ class Runtime:
     independent: bool = True
     #: How it approximates functions (converters/graph/jitter.py).
     arithmetic: Arithmetic = "processor"
+    #: All sessions of a process begin to draw alike, whatever their models.
+    sessions_alike: bool = False
+    #: Multiplications that a policy's products take a second on one core, about (measured).
+    products_per_second: float = 1e9
     #: ``auto`` takes it where it is installed; a browser is started only on request.
     automatic: bool = True
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from exporter.export.sources import naming, read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, unload
+from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, loading, unload
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
@@ -385,8 +386,9 @@ def _participants(
 ) -> Iterator[Participant]:
     chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
+        again = loading(runtime, path, candidate.ports.options, partial(_renamed, candidate))
         try:
-            model = pool.process(runtime).load(str(path), **candidate.ports.options)
+            model, run = again(pool)
         except RunFailedError as error:
             failure(candidate.label, runtime, error, "*")
             for problem in candidate.problems:
@@ -400,13 +402,14 @@ def _participants(
             yield Participant(
                 ":".join((candidate.format.key, *filter(None, [candidate.ports.options.get("signature")]))),
                 runtime,
-                _renamed(model, candidate),
+                run,
                 list(candidate.outputs),
                 model,
                 candidate.label,
                 candidate.drawn,
                 path,
                 candidate.fed,
+                again,
             )
         unload(model)
 
@@ -422,7 +425,7 @@ def _same_numbers(
         return {}
     case = draw_cases(policy.signature)[1]
     try:
-        answers = _renamed(model, replace(candidate, outputs={n: n for n in left}))(case.feeds, left)
+        answers = _renamed(replace(candidate, outputs={n: n for n in left}), model)(case.feeds, left)
     except RunFailedError:  # said where it is run for the comparison
         return {}
     expected = numpy_model.run(case.feeds, wanted)
@@ -434,7 +437,7 @@ def _same_numbers(
     return hints
 
 
-def _renamed(model: LoadedModel, candidate: _Candidate) -> Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]:
+def _renamed(candidate: _Candidate, model: LoadedModel) -> Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]:
     """A run under canonical names."""
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,6 +66,8 @@ class Participant:
     path: Path | None = None
     #: what the model itself is fed, where any tool may have made it: its own names for the policy's inputs
     fed: Callable[[Feeds], Feeds] | None = None
+    #: loads it anew in a pool: the model, to be unloaded, and how to run that
+    again: Callable[[RuntimePool], tuple[LoadedModel, Run]] | None = None
 
     @property
     def name(self) -> str:
@@ -106,15 +110,17 @@ def participants_of(
             loads = {key: list(names[1]) for key, names in tested.signatures.items()}
         for key, names in loads.items():
             label = kind if key in ("", "serving_default") else f"{kind}:{key}"
+            limit = tested.signatures.get(key)
+            running = partial(_predicting, names) if WRITTEN[kind].predicts else partial(_limited, limit)
+            again = loading(runtime, path, WRITTEN[kind].loader(key), running)
             try:
-                model = pool.process(runtime).load(str(path), **WRITTEN[kind].loader(key))
+                model, run = again(pool)
             except RunFailedError as error:
                 failure(label, runtime, error, "*")
                 continue
-            run = _limited(model.run, tested.signatures.get(key))
-            if WRITTEN[kind].predicts:
-                run = _predicting(model, names)
-            yield Participant(label, runtime, run, names, model, path=path)
+            # The numpy kernels draw from the seed of the verification, whatever the artefact.
+            anew = None if runtime == "numpy" else again
+            yield Participant(label, runtime, run, names, model, path=path, again=anew)
             unload(model)
 
 
@@ -131,21 +137,33 @@ def in_order(results: Iterable[Finding], tested: PolicyUnderTest) -> tuple[Findi
     return tuple(sorted(results, key=place))
 
 
+def loading(
+    runtime: str, path: Path, options: Mapping[str, Any], running: Callable[[LoadedModel], Run]
+) -> Callable[[RuntimePool], tuple[LoadedModel, Run]]:
+    """What loads an artefact, as often as it is called, and says by ``running`` how it is run."""
+
+    def load(pool: RuntimePool) -> tuple[LoadedModel, Run]:
+        model = pool.process(runtime).load(str(path), **options)
+        return model, running(model)
+
+    return load
+
+
 def unload(model: LoadedModel) -> None:
     """Free a model; a runtime that has died has freed it already."""
     with contextlib.suppress(RunFailedError):
         model.unload()
 
 
-def _limited(run: Run, signature: tuple[Sequence[str], Sequence[str]] | None) -> Run:
+def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:
     """Feed only what a signature takes."""
     if signature is None:
-        return run
+        return model.run
     inputs = frozenset(signature[0])
-    return lambda feeds, fetch: run({n: a for n, a in feeds.items() if n in inputs}, fetch)
+    return lambda feeds, fetch: model.run({n: a for n, a in feeds.items() if n in inputs}, fetch)
 
 
-def _predicting(model: LoadedModel, outputs: Sequence[str]) -> Run:
+def _predicting(outputs: Sequence[str], model: LoadedModel) -> Run:
     """The call that people make in TensorFlow.js, ``predict``, wherever all outputs are asked for."""
     return lambda feeds, fetch: (
         model.predict(feeds, outputs) if list(fetch) == list(outputs) else model.run(feeds, fetch)

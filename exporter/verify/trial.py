@@ -20,6 +20,7 @@ from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.reference import Reference
 from exporter.verify.rounding import Rounding
 from exporter.verify.tolerances import Tolerance, ruled, tolerance_for
+from exporter.verify.work import Allowance, products
 from signatures.roles import Role
 from signatures.sampling import Case, draw_cases, draw_rollout
 
@@ -36,6 +37,10 @@ class Trial:
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
         self.steps = self._rollout_feeds()
+        self._cost = 0
+        self._allowances: dict[tuple[str, str], Allowance] = {}
+        #: files that were started twice, to see whether they draw alike
+        self.started: set[Path] = set()
         self.expected: list[Arrays] = []
         self.expected_steps: list[Arrays] = []
 
@@ -48,6 +53,18 @@ class Trial:
         self.rounding = Rounding(self.options.seed, numbers, self._settled)
         self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
         self._flushed: dict[str, Arrays] = {}
+
+    def allowance(self, participant: Participant, purpose: str = "inputs") -> Allowance:
+        """What time there is for an artefact in a runtime; there is as much for inputs as for draws."""
+        key = (f"{participant.name} in {participant.runtime}", purpose)
+        if key not in self._allowances:
+            self._cost = self._cost or products(self.tested.graph)
+            self._allowances[key] = Allowance(self._cost, participant.runtime)
+        return self._allowances[key]
+
+    def notes(self) -> list[str]:
+        """What was left out, for the report."""
+        return [note for (who, _), each in self._allowances.items() if (note := each.note(who)) is not None]
 
     def drawn(self, name: str, participant: Participant) -> bool:
         """Whether the reference or the participant draws an output: there is no number to compare then."""

@@ -51,15 +51,16 @@ def verify(
     options = options or VerifyOptions()
     check_budget(options.budget, tested.sizes)
     trial = Trial(tested, pool, options)
-    reference, findings = "none", list[Finding]()
+    reference, findings, notes = "none", list[Finding](), list[str]()
     if runtimes:
         progress(f"{tested.name}: starting the runtimes, running the source")
         pool.start(needed_runtimes(tested, runtimes))
         with Reference(tested, runtimes, pool, options.seed) as answering:
             reference = answering.name
             findings += _findings(trial, answering, runtimes, progress, participants)
+        notes = trial.notes()
     findings += consumers(tested.profile, tested.files)
-    return _report(trial, reference, runtimes, known, in_order(findings, tested))
+    return _report(trial, reference, runtimes, known, in_order(findings, tested), notes)
 
 
 def _findings(
@@ -103,6 +104,7 @@ def _report(
     runtimes: Sequence[str],
     known: Iterable[RuntimeInfo],
     findings: Sequence[Finding],
+    notes: Sequence[str],
 ) -> ParityReport:
     tested, options = trial.tested, trial.options
     versions = trial.pool.versions()
@@ -129,6 +131,6 @@ def _report(
         states,
         tuple(findings),
         tested.sizes,
-        tested.signature.notes,
+        (*tested.signature.notes, *notes),
         self_consistent=tested.source is None,
     )

@@ -80,6 +80,10 @@ class Artefact(ABC):
         """A new Cast; gives its name."""
 
     @abstractmethod
+    def seed(self, name: str, value: int) -> None:
+        """Give a sampler a seed of its own."""
+
+    @abstractmethod
     def retype_indices(self, name: str, dtype: Any) -> None:
         """Declare another dtype for a Concat whose inputs have it now."""
 
@@ -158,6 +162,9 @@ class _GraphDef(Artefact):
     def cast(self, name: str, tensor: str, source: Any, target: Any) -> str:
         self.graph.node.add().CopyFrom(node(name, "Cast", tensor, SrcT=source, DstT=target))
         return name
+
+    def seed(self, name: str, value: int) -> None:
+        self._node(name).attr["seed"].i = self._node(name).attr["seed2"].i = value
 
     def retype_indices(self, name: str, dtype: Any) -> None:
         self._node(name).attr["T"].type = schema.dtype_number(np.dtype(dtype))
@@ -275,6 +282,9 @@ class Web(Artefact):
         self.nodes.append({"name": name, "op": "Cast", "input": [tensor], "attr": types})
         return name
 
+    def seed(self, name: str, value: int) -> None:
+        self._node(name)["attr"].update(seed={"i": str(value)}, seed2={"i": str(value)})
+
     def retype_indices(self, name: str, dtype: Any) -> None:
         self._node(name)["attr"]["T"]["type"] = _web_type(dtype)
 
@@ -360,6 +370,9 @@ class Onnx(Artefact):
     def cast(self, name: str, tensor: str, source: Any, target: Any) -> str:
         kind = self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(target))
         return self._placed(self.onnx.helper.make_node("Cast", [tensor], [name], to=kind), name)
+
+    def seed(self, name: str, value: int) -> None:
+        self._node(name).attribute.append(self.onnx.helper.make_attribute("seed", float(value)))
 
     def retype_indices(self, name: str, dtype: Any) -> None:
         kind = self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype))

@@ -191,5 +191,13 @@ FAULTS = (
         "Multinomial",
         "draws",
     ),
+    Fault(
+        "a sampler with a fixed seed",
+        "sampled",
+        lambda artefact: artefact.seed("multinomial_1/Multinomial", 7),
+        "action",
+        kind="draws",
+        words="the same after every start",
+    ),
     Fault("an output renamed", "continuous", _rename("action", "actions"), "action", kind="failure", words="action"),
 )

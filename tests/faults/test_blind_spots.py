@@ -16,6 +16,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export.pipeline import ExportOptions, export
+from exporter.verify import work
 from exporter.verify.checks.draws import least_likely, with_zeros
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
@@ -127,6 +128,43 @@ REGIONS = {
 def test_a_region_that_is_wrong_is_met(region: str, tmp_path: Path, processes: RuntimePool) -> None:
     report = verified("continuous", tmp_path, processes, where(REGIONS[region]))
     assert "action" in {f.output for f in report.failures if f.kind == "numbers"}
+
+
+IMAGES = {
+    "rows from the 65th on": lambda x: np.arange(len(x)) >= 64,
+    "black": lambda x: (x == 0).all((1, 2, 3)),
+    "white": lambda x: (x == 1).all((1, 2, 3)),
+}
+
+
+@pytest.mark.parametrize("region", IMAGES)
+def test_images_that_are_answered_wrongly_are_met(region: str, tmp_path: Path, processes: RuntimePool) -> None:
+    def spoil(feeds: Feeds, answers: Arrays) -> Arrays:
+        if "value_estimate" in answers:
+            (image,) = (a for a in feeds.values() if a.ndim == 4)
+            answers["value_estimate"] = answers["value_estimate"] + IMAGES[region](image)[:, None].astype(np.float32)
+        return answers
+
+    report = verified("visual", tmp_path, processes, spoil)
+    assert "value_estimate" in {f.output for f in report.failures if f.kind == "numbers"}
+
+
+def test_a_slow_runtime_is_given_less_and_that_is_said(
+    tmp_path: Path, processes: RuntimePool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(work._SPEEDS, "onnxruntime", 1e4)
+    fed: list[int] = []
+
+    def spoil(feeds: Feeds, answers: Arrays) -> Arrays:
+        fed.append(max(len(a) for a in feeds.values()))
+        return answers
+
+    report = verified("visual", tmp_path, processes, spoil)
+    (note,) = (n for n in report.notes if "is slow" in n)
+    assert note.startswith("onnx in onnxruntime is slow (")
+    assert "typical, batch 67" in note
+    assert report.passed is True
+    assert max(fed) < 67
 
 
 def test_a_memory_that_is_clipped_is_met(tmp_path: Path, processes: RuntimePool) -> None:

@@ -19,6 +19,7 @@ from converters.runtimes.javascript.node import (
     INSTALL_NODE,
     INSTALL_TFJS,
     JS_SOURCE,
+    SPEEDS,
     install_packages,
     js_home,
     node_executable,
@@ -100,7 +101,12 @@ def _command(name: str) -> list[str]:
 def _runtime(name: str, kind: str, *packages: str, arithmetic: Arithmetic = "processor") -> Runtime:
     find, command = partial(_find, name, packages), partial(_command, name)
     return Runtime(
-        name, (kind,), find, command, install_packages, automatic=False, confined=False, arithmetic=arithmetic
+        *(name, (kind,), find, command, install_packages),
+        automatic=False,
+        confined=False,
+        arithmetic=arithmetic,
+        sessions_alike=kind == "onnx",
+        products_per_second=SPEEDS.get(name.partition("@")[0], 3e8),
     )
 
 

@@ -38,6 +38,9 @@ _ONNXRUNTIME_WEB = "onnxruntime-web"
 #: What a whole installation has: the packages of package.json, and those of @tensorflow/tfjs that Node loads.
 _PACKAGES = (_CORE, _CONVERTER, _CPU, _WASM, "@tensorflow/tfjs", _ONNXRUNTIME_WEB, "playwright-core")
 
+#: Multiplications a second, about, where they are fewer than elsewhere (a convolutional network, on one core).
+SPEEDS = {"tfjs-cpu": 1e8, "onnxruntime-web": 3e8}
+
 _STDERR_LINES = 8
 
 
@@ -179,7 +182,12 @@ def _command(name: str) -> list[str]:
 
 
 def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Runtime:
-    return Runtime(name, (format_,), partial(_find, name, packages, how), partial(_command, name), install_packages)
+    find, command = partial(_find, name, packages, how), partial(_command, name)
+    return Runtime(
+        *(name, (format_,), find, command, install_packages),
+        sessions_alike=format_ == "onnx",
+        products_per_second=SPEEDS.get(name, 1e9),
+    )
 
 
 RUNTIMES = (

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from exporter.verify.checks.draws import DRAWS, likely
+from exporter.verify.checks.seeds import REPEATED, repeated
+from exporter.verify.difference import wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant
 from exporter.verify.statistics import same_distribution
@@ -30,13 +32,25 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     case = trial.cases[0]
     runs = (trial.reference.model.run, participant.run)
     cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
-    feeds = _rows(trial, case, DRAWS if cameras else DENSITY_DRAWS)
+    count = DRAWS if cameras else DENSITY_DRAWS
+    if not trial.allowance(participant, "draws").takes(count, f"{count} draws of numbers"):
+        return
+    feeds = _rows(trial, case, count)
     samples = [run(feeds, names) for run in runs]
     if any((s[n] == s[n][:1]).all() for s in samples for n in names):
         # One draw for the whole batch, or none: as many runs as draws.
         each = [[run(_rows(trial, case, 1, i), names) for i in range(DRAWS)] for run in runs]
         samples = [{n: np.concatenate([one[n] for one in every]) for n in names} for every in each]
+    # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
+    alike = {
+        n
+        for n in repeated(trial, participant, lambda run: run(feeds, names))
+        if (samples[1][n] != samples[1][n][:1]).any()
+    }
     for name in names:
+        if name in alike:
+            yield trial.finding(Draws, participant, name, wrong(REPEATED), case.name)
+            continue
         tolerance = trial.tolerance(name, participant)
         columns = (s[name].reshape(len(s[name]), -1).T for s in samples)
         p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in zip(*columns, strict=True)]

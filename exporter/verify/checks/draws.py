@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import combinations
 
 import numpy as np
 
-from exporter.verify.difference import Difference
+from exporter.verify.checks.seeds import REPEATED, repeated
+from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
-from exporter.verify.participants import Feeds, Participant
+from exporter.verify.participants import Feeds, Participant, Run
 from exporter.verify.statistics import FALSE_ALARM, fit, fit_all
 from exporter.verify.trial import Trial
 from signatures.roles import Role
@@ -17,6 +18,8 @@ from signatures.roles import Role
 #: Draws for one input; all draws together, where a run takes long.
 DRAWS = 512
 FEW = 2 * DRAWS
+#: Draws that two starts are compared by, where a run takes long.
+STARTS = 48
 #: Where float32 has few digits left, a runtime's probabilities may be others within rounding.
 _LEFT_OUT = frozenset(("1e3", "denormals"))
 #: How often a runtime's uniform number is exactly 0, which draws the first class that has any probability at all.
@@ -42,6 +45,10 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     log_probs = np.stack([scores for _, scores in known])
     if participant.runtime in _ZEROS:
         log_probs = with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
+    for branch, row in _started_alike(trial, participant, action, rows, log_probs).items():
+        which = f" (branch {branch} of {len(trial.signature.branches)})" if len(trial.signature.branches) > 1 else ""
+        yield trial.finding(Draws, participant, action, wrong(REPEATED + which), cases[row].name)
+        return
     drawn = _drawn(trial, participant, action, rows)
     p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
     difference = likely(p_value)
@@ -49,18 +56,57 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
 
 
+def _started_alike(
+    trial: Trial, participant: Participant, action: str, rows: Sequence[Feeds], log_probs: np.ndarray
+) -> dict[int, int]:
+    """The branches that two starts draw alike → the row that shows it, whose draws can be told least."""
+    single = _one_row_at_a_time(participant)
+    count = STARTS if single or any(s.role is Role.VISUAL for s in trial.signature.inputs) else DRAWS
+    shown: dict[int, int] = {}
+    for branch, part in enumerate(np.split(np.exp(log_probs.astype(np.float64)), _edges(trial), axis=1)):
+        same = np.square(part / part.sum(axis=1, keepdims=True)).sum(axis=1)
+        if same.min() ** count < FALSE_ALARM:
+            shown[branch] = int(same.argmin())
+    if not shown or not trial.allowance(participant, "draws").takes(
+        2 * count * len({*shown.values()}), "two starts' draws"
+    ):
+        return {}
+
+    def ask(run: Run) -> dict[str, np.ndarray]:
+        drawn = {row: _of_one_row(run, action, rows[row], count, single=single) for row in {*shown.values()}}
+        return {str(branch): drawn[row][:, branch] for branch, row in shown.items()}
+
+    alike = repeated(trial, participant, ask)
+    return {branch: row for branch, row in shown.items() if str(branch) in alike}
+
+
+def _of_one_row(run: Run, action: str, row: Feeds, count: int, *, single: bool) -> np.ndarray:
+    """[draws, branches]: classes drawn for one row."""
+    feeds = row if single else {n: np.repeat(a, count, axis=0) for n, a in row.items()}
+    runs = [run(feeds, [action])[action] for _ in range(count if single else 1)]
+    return np.concatenate(runs).reshape(count, -1)
+
+
+def _edges(trial: Trial) -> np.ndarray:
+    return np.cumsum(trial.signature.branches)[:-1]
+
+
+def _one_row_at_a_time(participant: Participant) -> bool:
+    """In Node and in Chromium TensorFlow.js' cpu Multinomial restarts its generator for every row of a batch."""
+    return participant.runtime.startswith("tfjs-cpu")
+
+
 def _drawn(trial: Trial, participant: Participant, action: str, rows: Sequence[Feeds]) -> np.ndarray:
     """[inputs, draws, branches]: classes drawn for each of ``rows``."""
-    # In Node and in Chromium its Multinomial restarts its generator for every row of a batch: one row at a time.
-    single = participant.runtime.startswith("tfjs-cpu")
+    single = _one_row_at_a_time(participant)
     cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
     count = max(1, FEW // len(rows)) if single or cameras else DRAWS
-    drawn = []
-    for row in rows:
-        feeds = row if single else {n: np.repeat(a, count, axis=0) for n, a in row.items()}
-        runs = [participant.run(feeds, [action])[action] for _ in range(count if single else 1)]
-        drawn.append(np.concatenate(runs).reshape(count, -1))
-    return np.stack(drawn)
+    allowance = trial.allowance(participant, "draws")
+    if not allowance.takes(count * len(rows), f"{count * len(rows)} draws for {len(rows)} inputs"):
+        few = max(1, allowance.left // len(rows))
+        allowance.left_out[-1] += f" but for {few * len(rows)}"
+        count, allowance.left = few, 0
+    return np.stack([_of_one_row(participant.run, action, row, count, single=single) for row in rows])
 
 
 def with_zeros(log_probs: np.ndarray, branches: Sequence[int], rate: float) -> np.ndarray:
@@ -78,17 +124,17 @@ def with_zeros(log_probs: np.ndarray, branches: Sequence[int], rate: float) -> n
 def least_likely(drawn: np.ndarray, log_probs: np.ndarray, branches: Sequence[int]) -> tuple[float, int, int]:
     """(the p-value, the branch and the input that it is of) of classes [inputs, draws, branches] that were drawn.
 
-    Each input by itself, all of them together, two branches at once; the smallest p counts as often as it was looked
-    for. Together, a class that is rare everywhere is expected often enough, and a temperature shows; two branches that
-    are drawn from one seed are right each, and not together.
+    Each input by itself, all of them together, every two branches at once; the smallest p counts as often as it was
+    looked for. Together, a class that is rare everywhere is expected often enough, and a temperature shows; two
+    branches that are drawn from one seed are right each, and not together.
     """
     parts = np.split(log_probs, np.cumsum(branches)[:-1], axis=1)
     found = [(fit(drawn[i, :, b], part[i]), b, i) for b, part in enumerate(parts) for i in range(len(drawn))]
     found += [(fit_all(drawn[:, :, b], part), b, 0) for b, part in enumerate(parts)]
-    for b, (first, second) in enumerate(pairwise(parts)):
-        joint = drawn[:, :, b] * branches[b + 1] + drawn[:, :, b + 1]
+    for (a, first), (b, second) in combinations(enumerate(parts), 2):
+        joint = drawn[:, :, a] * branches[b] + drawn[:, :, b]
         both = (first[:, :, None] + second[:, None, :]).reshape(len(first), -1)
-        found.append((fit_all(joint, both), b + 1, 0))
+        found.append((fit_all(joint, both), b, 0))
     p_value, branch, worst = min(found)
     return min(1.0, p_value * len(found)), branch, worst
 

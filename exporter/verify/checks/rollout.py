@@ -19,6 +19,8 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
     memory = trial.signature.memory
     if not trial.steps or memory is None or memory.output not in participant.outputs:
         return
+    if not trial.allowance(participant).takes(2 * len(trial.steps), f"{len(trial.steps)} steps with memory"):
+        return
     fed: list[Feeds] = []
 
     def step(feeds: Feeds) -> dict[str, np.ndarray]:

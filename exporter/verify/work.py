@@ -1,0 +1,64 @@
+"""How much of a verification a slow runtime is given: what a row of a policy costs, and how many rows that leaves."""
+
+from __future__ import annotations
+
+import math
+
+from converters.graph.nodes import Graph, ref
+from converters.graph.ops.table import traits
+from converters.graph.shapes import infer_types
+from converters.graph.types import TensorType
+from converters.runtimes.registry import RUNTIMES
+
+#: What one policy may take in one runtime, about.
+SECONDS = 20
+#: A free axis behind the batch is about that long (signatures/sampling.py).
+_FREE_AXIS = 8
+_SPEEDS = {r.name: r.products_per_second for r in RUNTIMES}
+
+
+class Allowance:
+    """The rows that a runtime may still be given of one policy, and what was left out for want of them."""
+
+    def __init__(self, cost: int, runtime: str) -> None:
+        self.cost = cost
+        self.left = int(SECONDS * _SPEEDS.get(runtime, max(_SPEEDS.values())) / cost)
+        self.left_out: list[str] = []
+
+    def takes(self, rows: int, what: str) -> bool:
+        """Whether there is time for this many; they are taken then, else ``what`` is left out."""
+        if rows > self.left:
+            self.left_out.append(what)
+            return False
+        self.left -= rows
+        return True
+
+    def note(self, who: str) -> str | None:
+        """What was left out, for a report."""
+        if not self.left_out:
+            return None
+        shown = ", ".join(self.left_out)
+        return f"{who} is slow ({self.cost / 1e6:.3g} million products for a row); left out there: {shown}"
+
+
+def products(graph: Graph) -> int:
+    """Multiplications that one row of a policy's inputs costs, about; whatever else an op computes counts as one."""
+    types = infer_types(graph)
+    total = 0
+    for node in graph.nodes:
+        if node.op in ("Placeholder", "Const"):
+            continue
+        result = _elements(types[ref(node.name, 0)])
+        terms = 1.0
+        if traits(node).layer and traits(node).precision == "summed":
+            kernel, shape = types[node.inputs[1]], types[ref(node.name, 0)].shape
+            width = shape[-1] if shape and isinstance(shape[-1], int) else 1
+            terms = _elements(kernel) / max(1, width)
+        total += round(result * max(1.0, terms))
+    return max(1, total)
+
+
+def _elements(kind: TensorType) -> int:
+    """Elements that belong to one row: the first free axis is the batch."""
+    sizes = kind.shape or ()
+    return math.prod(n if isinstance(n, int) else 1 if i == 0 else _FREE_AXIS for i, n in enumerate(sizes))
