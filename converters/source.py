@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from converters import schema
+from converters.folders import scratch_folder
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph
 from converters.understand.facts import SourceFacts
@@ -44,8 +44,8 @@ class OriginalRun:
         if self.definition is None:
             yield str(self.path), self.options
             return
-        with tempfile.TemporaryDirectory(prefix="export-model-") as folder:
-            file = Path(folder, "source.pb")
+        with scratch_folder() as folder:
+            file = folder / "source.pb"
             file.write_bytes(schema.serialise(self.definition))
             yield str(file), {"kind": "graph"}
 

@@ -1,7 +1,7 @@
 """Folders that are written beside their place and exchanged with what was there, so that a killed run leaves no half.
 
-What is written lies in a folder of its own, ``.export-model-<name>-<random>`` beside the place, with a file in it that
-says whose it is: nothing else is ever swept or put back. Within it, ``new`` is what is being written; on a system
+What is written lies in a folder of its own (converters/folders.py), ``.export-model-<name>-<random>`` beside the place:
+no other is ever swept or put back. Within it, ``new`` is what is being written; on a system
 without an exchange, ``old`` is what has been moved out of its place.
 """
 
@@ -12,33 +12,27 @@ import ctypes
 import os
 import shutil
 import sys
-import tempfile
 import threading
-import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-_STALE_SECONDS = 24 * 3600.0
+from converters.folders import LeftoverWarning, OwnFolder, is_held, left_in, sweep
+
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _PREFIX = ".export-model-"
-#: The file that says whose a folder is, and what it says.
-_MARKER, _OURS = "stage.txt", b"export-model writes here, and removes this folder when it is done\n"
 
 
 @contextlib.contextmanager
 def stage(place: Path) -> Iterator[Path]:
     """A new folder to fill, beside ``place``; what is left of it afterwards is removed. Raises OSError."""
     place.parent.mkdir(parents=True, exist_ok=True)
-    sweep(place.parent)
-    outer = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{place.name}-", dir=place.parent))
-    try:
-        (outer / _MARKER).write_bytes(_OURS)
+    sweep(place.parent, _PREFIX)
+    with OwnFolder(place.parent, f"{_PREFIX}{place.name}-") as outer:
         new = outer / "new"
         new.mkdir()
         new.chmod(0o755)
         yield new
-    finally:
-        shutil.rmtree(outer, ignore_errors=True)
 
 
 def exchange(new: Path, place: Path) -> None:
@@ -48,32 +42,19 @@ def exchange(new: Path, place: Path) -> None:
         new.rename(place)
     elif not _exchanged(new, place):
         _two_renames(new, place)
-    _sync(place.parent)
+    try:
+        _sync(place.parent)
+    except OSError as error:  # it is in its place: that is no failure any more
+        warnings.warn(f"{place} may be lost in a power cut: {error}", LeftoverWarning, stacklevel=2)
 
 
 def recover(place: Path) -> None:
     """Put back what a run that was killed between two renames had moved out of ``place``. Raises OSError."""
     if place.parent.is_dir() and not place.exists():
-        for left in _stages(place.parent):
-            if (left / "old" / place.name).is_dir() and not place.exists():
+        for left in left_in(place.parent, _PREFIX):
+            if (left / "old" / place.name).is_dir() and not place.exists() and not is_held(left):
                 (left / "old" / place.name).rename(place)
                 shutil.rmtree(left, ignore_errors=True)
-
-
-def sweep(parent: Path) -> None:
-    """Remove what killed runs left in ``parent``, a day later: before that, it may be a run that is still going."""
-    for left in _stages(parent):
-        with contextlib.suppress(OSError):  # its own process may just have renamed or removed it
-            if time.time() - left.stat().st_mtime > _STALE_SECONDS and not any((left / "old").glob("*")):
-                shutil.rmtree(left)
-
-
-def _stages(parent: Path) -> Iterator[Path]:
-    """The folders of ours that runs have left in ``parent``, or still write to."""
-    for found in sorted(parent.glob(f"{_PREFIX}*")):
-        with contextlib.suppress(OSError):
-            if not found.is_symlink() and (found / _MARKER).read_bytes() == _OURS:
-                yield found
 
 
 def _two_renames(new: Path, place: Path) -> None:

@@ -7,8 +7,8 @@ no core is dumped, files and their number are bounded. Memory is bounded while a
 (converters/runtimes/process.py), because what is fair depends on it. All of it is Linux; elsewhere, and where a kernel
 lacks a part, that part is not in force, and ``export-model runtimes`` says so.
 
-This file is a program, too: ``python confinement.py FOLDER COMMAND…`` gives up the same and becomes the command. It
-imports the standard library only.
+This file is a program, too: ``python confinement.py FOLDER PARENT COMMAND…`` gives up the same and becomes the command.
+It imports the standard library only. On Linux the process is killed when PARENT is (0: it is not, but looks by itself).
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ _REFER, _TRUNCATE, _IOCTL = 1 << 13, 1 << 14, 1 << 15
 _TCP = 0b11  # bind, connect
 _SCOPES = 0b11  # abstract sockets, signals
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2
+_SET_PDEATHSIG, _SIGKILL = 1, 9
 
 #: Machine → (its number in audit.h, the system calls that make sockets or look into other processes).
 _CALLS = {
@@ -149,8 +150,12 @@ def _seccomp() -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """``FOLDER COMMAND…``: confined to the folder, become the command."""
-    scratch, *command = arguments
+    """``FOLDER PARENT COMMAND…``: confined to the folder, become the command."""
+    scratch, parent, *command = arguments
+    if int(parent) and sys.platform == "linux":
+        _libc().prctl(_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
+        if os.getppid() != int(parent):  # it was killed before this line
+            os._exit(1)
     confine(scratch)
     os.execvp(command[0], command)
 

@@ -14,6 +14,7 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
+from converters.folders import OwnFolder, scratch_folder
 from converters.runtimes.memory import Memory
 from converters.runtimes.python import confined
 from converters.runtimes.wire import FramingError, Tensors, read_frame, write_frame
@@ -40,7 +41,9 @@ class RuntimeProcess:
         self.version: str | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch: OwnFolder | None = None
+        #: it has been asked and has not answered
+        self._busy = False
         self._memory: Memory | None = None
         self._loaded = 0
 
@@ -52,11 +55,11 @@ class RuntimeProcess:
         if self._process is not None:
             return
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
-        self._scratch = tempfile.TemporaryDirectory(prefix="export-model-", ignore_cleanup_errors=True)
+        self._scratch = scratch_folder()
         # What is not confined (a browser) has its own folders where the user's are, and sweeps them by itself.
-        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), self._scratch.name) if self.confined else {}
+        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(self._scratch.path)) if self.confined else {}
         try:
-            command = confined(self.command, self._scratch.name) if self.confined else self.command
+            command = confined(self.command, str(self._scratch.path)) if self.confined else self.command
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
@@ -133,9 +136,11 @@ class RuntimeProcess:
         watchdog.daemon = True  # one that an interrupt leaves behind must not keep this process for TIMEOUT
         try:
             watchdog.start()
+            self._busy = True
             if send is not None:
                 send(to)
             answer, results = read_frame(back)
+            self._busy = False
         except (OSError, EOFError, FramingError) as error:
             status = _ended(process)
             said = self._last_errors()
@@ -167,10 +172,10 @@ class RuntimeProcess:
                 self._process.stdin.close()
 
     def close(self) -> None:
-        """End the process; one that is not ready yet is not waited for."""
+        """End the process; one that is not ready yet, or computes (an interrupt came), is not waited for."""
         self.hang_up()
-        process, ready = self._process, self.version is not None
-        self._process, self.version = None, None
+        process, ready = self._process, self.version is not None and not self._busy
+        self._process, self.version, self._busy = None, None, False
         if process is not None:
             if not ready:
                 process.terminate()  # not kill: one that has started a browser ends that first
@@ -181,7 +186,7 @@ class RuntimeProcess:
             self._errors.close()
             self._errors = None
         if self._scratch is not None:
-            self._scratch.cleanup()
+            self._scratch.close()
             self._scratch = None
         self._memory = None
 

@@ -7,6 +7,7 @@ import importlib.util
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -43,7 +44,9 @@ def confined(command: Sequence[str], scratch: str) -> list[str]:
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
     program = str(Path(converters.__file__).resolve().parent / "runtimes" / "confinement.py")
-    return [sys.executable, "-I", "-S", program, scratch, *command]
+    # The kernel takes the thread that starts a process for its parent: only the main one lives as long as all.
+    parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
+    return [sys.executable, "-I", "-S", program, scratch, str(parent), *command]
 
 
 def module_origin(name: str) -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -357,6 +356,7 @@ def load_policy(
 
 def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     from converters.bundle.bundle import Bundle
+    from converters.folders import scratch_folder
     from converters.formats import WRITTEN
     from exporter.export.sources import naming
 
@@ -380,11 +380,11 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     found.verify_hashes(WRITTEN[_TAKES[chosen]])
     source = found.contract.source
     kept = source.noise_kept and bool(source.noise)
-    with tempfile.TemporaryDirectory(prefix="export-model-") as scratch, naming(files[chosen]):
+    with scratch_folder() as folder_of_copy, naming(files[chosen]):
         vetted = WRITTEN[_TAKES[chosen]].vetted
         assert vetted is not None
         signature = found.signature
-        copy = vetted(files[chosen], [s.name for s in (*signature.inputs, *signature.outputs)], Path(scratch))
+        copy = vetted(files[chosen], [s.name for s in (*signature.inputs, *signature.outputs)], folder_of_copy)
         run, declared = _RUNS[chosen](copy.read_bytes())
     found.check_fits(files[chosen], declared)
     return LoadedPolicy(found.name, found.signature, run, chosen, seed, draws_itself=kept)

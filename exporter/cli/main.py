@@ -5,21 +5,69 @@ What it needs is imported when it is entered, so that an interrupt is answered f
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line ``args``, this process's own where there are none. Raises SystemExit unless all is well."""
+    told: list[int] = []
     try:
-        _run(sys.argv[1:] if args is None else list(args))
-    except KeyboardInterrupt:
+        with _stoppable(told):
+            try:
+                _run(sys.argv[1:] if args is None else list(args))
+            except BaseException:
+                if told:
+                    _clean_up()
+                raise
+    except BaseException as error:
+        # Whatever an interrupt was turned into on its way (an import that failed, say): it is what happened.
+        if not told and not isinstance(error, KeyboardInterrupt):
+            raise
         sys.stderr.write("\nstopped\n")
-        sys.exit(130)
+        sys.exit(128 + (told or [2])[0])
+
+
+@contextlib.contextmanager
+def _stoppable(told: list[int]) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and a terminal that is closed are an interrupt inside, so that folders and processes are ended; a
+    second one ends at once. ``told`` gets the signals. What was ignored from outside (nohup) stays so.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: object) -> None:
+        told.append(number)
+        if len(told) > 1:
+            _clean_up()
+            os._exit(128 + number)
+        raise KeyboardInterrupt
+
+    numbers = [n for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
+    wanted = [n for n in (getattr(signal, name) for name in numbers) if signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, stop) for number in wanted}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _clean_up() -> None:
+    """Remove the folders of this process, if it came as far as to make any."""
+    folders = sys.modules.get("converters.folders")
+    if folders is not None:
+        folders.remove_all()
 
 
 def _run(args: list[str]) -> None:
     import io
+    import warnings
 
     import click
 
@@ -31,12 +79,13 @@ def _run(args: list[str]) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a Windows console, or a pipe there, has no Δ
     try:
-        app.main(args=args, prog_name="export-model", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *rest: say(f"warning: {message}", err=True)
+            app.main(args=args, prog_name="export-model", standalone_mode=False)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
-    except click.Abort:
-        say("stopped", err=True)
-        sys.exit(130)
+    except click.Abort as error:
+        raise KeyboardInterrupt from error
     except click.ClickException as error:
         if wants_json:
             say_json(UsageError(error.format_message(), fix="export-model --help").to_dict())

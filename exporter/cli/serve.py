@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -75,10 +74,11 @@ def _bundle_of(place: Path) -> Iterator[Path]:
     if found is not None or not place.exists():
         yield found or place
         return
+    from converters.folders import scratch_folder
     from exporter.export.pipeline import ExportOptions, export
 
-    with tempfile.TemporaryDirectory(prefix="export-model-") as folder:
-        results = list(export([place], ExportOptions(Path(folder), ("bytes", "tfjs"), verify="none")))
+    with scratch_folder() as folder:
+        results = list(export([place], ExportOptions(folder, ("bytes", "tfjs"), verify="none")))
         if len(results) > 1:
             raise UsageError(
                 f"{place} holds {len(results)} policies",

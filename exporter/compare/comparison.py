@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import difflib
 import logging
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.bundle.bundle import Bundle
+from converters.folders import scratch_folder
 from converters.format import Format, Port, Ports
 from converters.frozen_graph.writer import frozen
 from converters.graph.options import CompileOptions
@@ -135,7 +135,7 @@ def compare_artefacts(
         check_budget(options.budget, {m.label: 0 for m in matched})
         outputs = {policy.name: [s.name for s in policy.signature.outputs]}
         check_rules(options.rules, outputs, {m.format.key: m.format.runtimes for m in matched}, used)
-    with tempfile.TemporaryDirectory(prefix="export-model-") as folder, _opened(pool) as pool:
+    with scratch_folder() as folder, _opened(pool) as pool:
         reference_file = Path(folder, "reference.bytes")
         reference_file.write_bytes(frozen(policy))
         copies = [_vetted(m, Path(folder, str(number))) for number, m in enumerate(matched)]

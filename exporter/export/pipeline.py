@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from converters.bundle import bundle
 from converters.bundle.bundle import Bundle
 from converters.bundle.embed import runnable
+from converters.folders import scratch_folder
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
 from converters.frozen_graph.writer import frozen
@@ -206,15 +206,15 @@ class Exporter:
         options, policy = self.options, job.policy
         with (
             bundle.staged(options.out / policy.name, contract, artifacts) as stage,
-            tempfile.TemporaryDirectory() as scratch,
+            scratch_folder() as folder,
         ):
             report = None
             if self.runtimes:
-                tested = _tested(job, stage, artifacts, Path(scratch))
+                tested = _tested(job, stage, artifacts, folder)
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     plain = replace(job, policy=job.own, profile=None)
-                    under = _tested_in(plain, self._formats, Path(scratch) / "own")
+                    under = _tested_in(plain, self._formats, folder / "own")
                     rules = replace(options.parity, rules=(), golden=None, budget={})
                     report = _joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
                 with bundle.writing(options.out):
@@ -455,10 +455,10 @@ def verify_folder(
     used, known = chosen_runtimes(runtimes, formats)
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     sizes = {f.key: found.size(f) for f in formats}
-    with tempfile.TemporaryDirectory(prefix="export-model-") as scratch, RuntimePool() as pool:
-        copies = _vetted(artefacts, names, list(keys), Path(scratch))
+    with scratch_folder() as folder, RuntimePool() as pool:
+        copies = _vetted(artefacts, names, list(keys), folder)
         if again is not None:
-            reference = Path(scratch) / "reference.bytes"
+            reference = folder / "reference.bytes"
             reference.write_bytes(frozen(again.policy))
         tested = PolicyUnderTest(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
@@ -466,7 +466,7 @@ def verify_folder(
         )  # fmt: skip
         report = verify(tested, () if asked else used or ("numpy",), known, pool, options, progress)
         if again is not None and again.own is not None:
-            under = _tested_in(replace(again, policy=again.own, profile=None), formats, Path(scratch) / "own")
+            under = _tested_in(replace(again, policy=again.own, profile=None), formats, folder / "own")
             report = _joined(report, verify(under, used or ("numpy",), known, pool, None, progress))
     if asked:
         note = (

@@ -96,11 +96,10 @@ def live_source(kind: str, given: object) -> Iterator[Source]:
     It lasts as long as the context: what TensorFlow runs the original from lies in a temporary folder. Raises
     UsageError, and what ``read_source`` raises.
     """
-    import tempfile
-
+    from converters.folders import scratch_folder
     from converters.live.source import label, read_live
 
-    with tempfile.TemporaryDirectory(prefix="export-model-", ignore_cleanup_errors=True) as folder:
+    with scratch_folder() as folder:
         place = Path(label(kind))
         with naming(place):
             live = read_live(kind, given, Path(folder))

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from converters import schema
+from converters.folders import scratch_folder
 from converters.frozen_graph.reader import read_graph
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph, normal_ref, ref, split_ref
@@ -154,8 +154,8 @@ def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[InnerTensors]
                 values.update(opened.run({n: a for n, a in feeds.items() if n in fed}, wanted))
         return values
 
-    with tempfile.TemporaryDirectory() as scratch:
-        file = Path(scratch) / path.name
+    with scratch_folder() as folder:
+        file = folder / path.name
         yield InnerTensors(view, run)
 
 
