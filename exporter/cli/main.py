@@ -28,7 +28,7 @@ def main(args: Sequence[str] | None = None) -> None:
         # Whatever an interrupt was turned into on its way (an import that failed, say): it is what happened.
         if not told and not isinstance(error, KeyboardInterrupt):
             raise
-        sys.stderr.write("\nstopped\n")
+        sys.stderr.write("stopped\n" if isinstance(error, KeyboardInterrupt) and error.args else "\nstopped\n")
         sys.exit(128 + (told or [2])[0])
 
 
@@ -80,12 +80,13 @@ def _run(args: list[str]) -> None:
         sys.stdout.reconfigure(errors="replace")  # a Windows console, or a pipe there, has no Δ
     try:
         with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
             warnings.showwarning = lambda message, *rest: say(f"warning: {message}", err=True)
             app.main(args=args, prog_name="export-model", standalone_mode=False)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     except click.Abort as error:
-        raise KeyboardInterrupt from error
+        raise KeyboardInterrupt("click has ended the line") from error
     except click.ClickException as error:
         if wants_json:
             say_json(UsageError(error.format_message(), fix="export-model --help").to_dict())

@@ -206,7 +206,7 @@ class Exporter:
         options, policy = self.options, job.policy
         with (
             bundle.staged(options.out / policy.name, contract, artifacts) as stage,
-            scratch_folder() as folder,
+            scratch_folder() if self.runtimes else nullcontext(Path()) as folder,
         ):
             report = None
             if self.runtimes:

@@ -11,12 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from converters import folders
 from converters.bundle import bundle, exchange
 from converters.bundle.bundle import Bundle
 from fixtures import path as fixture
 from signatures.contract import safe_name
 from signatures.errors import BundleError, UsageError
 from tests.commands import Ran, export_model, files_in, python
+from tests.hostile.kills import kill
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")
 
@@ -66,7 +68,7 @@ else:  # a system without an exchange
     if kind == "rename":
         Path.rename = dying_rename
     else:
-        shutil.rmtree = lambda *a, **k: die()
+        shutil.rmtree = lambda path, *a, **k: die() if ".export-model-" in str(path) else remove(path, *a, **k)
 main(arguments)
 """
 #: Files that an export of one policy to all formats writes.
@@ -219,14 +221,96 @@ def test_what_is_called_like_a_stage_but_is_not_ours_stays(out: Path) -> None:
         assert (folder / "old" / "continuous").is_dir()
 
 
-def test_what_a_killed_run_left_is_removed_a_day_later(out: Path) -> None:
+def test_what_a_killed_run_left_is_removed_by_the_next_and_what_lives_is_not(out: Path) -> None:
     killed("write:1", out)
     (left,) = [p for p in out.iterdir() if p.name.startswith(".")]
+    unmarked, torn = (out / f".export-model-continuous-{digit * 16}" for digit in "ab")
+    unmarked.mkdir()
+    torn.mkdir()
+    (torn / "stage.txt").write_bytes(folders.OURS[:9])
+    with exchange.stage(out / "continuous") as new:
+        os.utime(new.parent, (0, 0))
+        assert exported(out).status == 0
+        assert new.is_dir()
+    assert not [p for p in (left, unmarked, torn, new) if p.exists()]
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_without_locks_a_folder_is_swept_a_day_later(locks: bool, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    killed("write:1", out)
+    (left,) = [p for p in out.iterdir() if p.name.startswith(".")]
+    if not locks:
+        monkeypatch.setattr(folders, "_held", lambda path: None)
     assert exported(out).status == 0
-    assert left.is_dir()
-    os.utime(left, (0, 0))
-    assert exported(out).status == 0
-    assert not left.exists()
+    assert left.is_dir() is not locks
+    if not locks:
+        os.utime(left, (0, 0))
+        assert exported(out).status == 0
+        assert not left.exists()
+
+
+def test_a_cleaning_that_fails_is_a_warning(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bundle is in its place: it was "cannot be written"."""
+    monkeypatch.setattr(shutil, "rmtree", lambda path, **how: None)
+    ran = exported(out, "--deterministic")
+    assert ran.status == 0
+    assert ran.err.startswith("warning: ")
+    assert "could not be removed" in ran.err
+    assert is_deterministic(out / "continuous")
+    synced = exchange._sync
+
+    def failing(path: Path) -> None:
+        if path == out:
+            raise OSError(5, "Input/output error")
+        synced(path)
+
+    monkeypatch.undo()
+    monkeypatch.setattr(exchange, "_sync", failing)
+    ran = exported(out)
+    assert ran.status == 0
+    assert "may be lost in a power cut" in ran.err
+    assert not is_deterministic(out / "continuous")
+
+
+#: Stops itself by a signal once its runtimes run, then once more in the middle of cleaning up.
+STOPPED = """
+import os, shutil, sys
+from converters.runtimes import pool
+from exporter.cli.main import main
+
+number, again, *arguments = sys.argv[1:]
+start, remove = pool.RuntimePool.start, shutil.rmtree
+def stopping(self, names):
+    start(self, names)
+    os.kill(os.getpid(), int(number))
+def removing(path, *rest, **more):
+    if again == "again":
+        shutil.rmtree = remove
+        os.kill(os.getpid(), int(number))
+    return remove(path, *rest, **more)
+pool.RuntimePool.start = stopping
+shutil.rmtree = removing
+main(arguments)
+"""
+
+
+@pytest.mark.parametrize("again", ["once", "again"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_folder_and_no_traceback(number: signal.Signals, again: str, tmp_path: Path) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    arguments = (fixture("continuous"), "-o", tmp_path / "out", "--verify", "numpy")
+    ran = python("-c", STOPPED, int(number), again, *arguments, environment={"TMPDIR": str(temporary)})
+    assert ran.status == 128 + number
+    assert "Traceback" not in ran.err
+    assert again == "again" or ran.err == "\nstopped\n"
+    assert files_in(tmp_path) == {"out", "temporary"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_exports_that_are_killed_at_random_tear_nothing_and_leave_nobody(tmp_path: Path) -> None:
+    assert kill(6, 3, tmp_path).faults == []
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc which file it is")
