@@ -6,6 +6,7 @@ import click
 
 from exporter.cli.compare import compare_command
 from exporter.cli.completion import completion_command
+from exporter.cli.demo import demo_command
 from exporter.cli.export import export_command
 from exporter.cli.group import SourceGroup, show_version
 from exporter.cli.inspect import inspect_command
@@ -34,7 +35,15 @@ def app() -> None:
 
 
 for _command in (
-    *(completion_command, export_command, inspect_command, verify_command, compare_command, runtimes_command),
+    *(
+        completion_command,
+        demo_command,
+        export_command,
+        inspect_command,
+        verify_command,
+        compare_command,
+        runtimes_command,
+    ),
     *(serve_command, snippets_command),
 ):
     app.add_command(_command)

@@ -149,8 +149,8 @@ def export_command(
     console.whole([r.report for r in results if r.report is not None])
     told = {"refused": [e.to_dict() for e in refused]} if refused else {}
     console.json({"policies": [r.to_dict() for r in results], **told})
-    console.next_step(results, compiling.names, profile)
     console.write_reports(lambda: _entries(results, options.steps))
+    console.next_step(results, compiling.names, profile)
     if refused:
         sys.exit(2)
     if any(r.passed is False for r in results):

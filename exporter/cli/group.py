@@ -35,7 +35,7 @@ GROUPS = {
         *("runtimes", "allow_unverified", "samples", "seed", "steps", "atol", "rtol", "tolerances", "golden", "sizes"),
     ),
     "Many sources": ("jobs", "again", "fail_fast"),
-    "The server": ("host", "port", "opens"),
+    "The server": ("host", "port", "opens", "no_open"),
     "Output": ("verbose", "quiet", "as_json", "html", "markdown", "junit", "help"),
 }
 

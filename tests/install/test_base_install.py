@@ -26,6 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("exporter", "converters", "signatures")
 #: Suffixes of what is in the packages beside modules: pages, scripts, schemas, templates of snippets.
 DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl", ".typed"}
+#: The trained policy that comes along, for ``export-model demo``.
+DEMO = "exporter/demo/3DBall.bytes"
 #: What the packages of a base install may take together, in 10^6 bytes.
 LARGEST = 150
 #: Python's own, in every environment that has pip.
@@ -104,8 +106,14 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     assert data >= {"exporter/serve/page/index.html", "exporter/reports/parity.schema.json"}
     assert data >= {f"{templates}/agent.cs.tmpl", "converters/tfjs/js/policy.mjs"}
     assert {n for n in names if Path(n).suffix in DATA} == data
-    strays = [n for n in names if "node_modules" in n or "__pycache__" in n or "/test" in n or n.endswith(".bytes")]
+    strays = [
+        n
+        for n in names
+        if "node_modules" in n or "__pycache__" in n or "/test" in n or (n.endswith(".bytes") and n != DEMO)
+    ]
     assert not strays
+    with zipfile.ZipFile(wheel) as archive:
+        assert archive.getinfo(DEMO).file_size <= 44_000
     code = {p.relative_to(ROOT).as_posix() for t in PACKAGES for p in files(t, "*.py")}
     assert {n for n in names if n.endswith(".py")} == code
     required = [line for line in metadata.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
@@ -195,6 +203,18 @@ def test_what_can_be_verified_alone_is_called_not_verified(installed: Installed)
     assert done.returncode == 0, done.stderr
     assert "NOT VERIFIED" in done.stdout
     assert "pip install" in done.stdout
+
+
+def test_the_demo_has_everything_with_it(installed: Installed) -> None:
+    done = installed.run("export-model", "demo", "--no-open")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("$ export-model demo/3DBall.bytes -o demo --html demo/parity.html\n")
+    *_, verdict, wrote, note, step = done.stdout.splitlines()
+    assert verdict == "NOT VERIFIED: no independent runtime ran"
+    assert note.startswith("note: Unity")
+    assert step.startswith("next: pip install 'export-model[onnxruntime]'")
+    assert wrote.endswith("demo/parity.html")
+    assert {"3DBall", "3DBall.bytes", "parity.html"} == {p.name for p in (installed.scratch / "demo").iterdir()}
 
 
 def test_a_module_starts_it_too(installed: Installed) -> None:

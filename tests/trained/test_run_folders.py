@@ -129,3 +129,7 @@ def test_numpy_weights_and_the_exported_policy_decide_alike(stage: Stage, name: 
             assert a.shape == b.shape
             np.testing.assert_allclose(b, a, atol=1e-5)
         observation, *_ = environment.step(got)
+
+
+def test_the_demo_is_the_policy_that_was_trained() -> None:
+    assert BALL.read_bytes() == (FOLDER / "3DBall" / "frozen_graph_def.pb").read_bytes()

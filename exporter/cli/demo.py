@@ -1,0 +1,56 @@
+"""The command ``demo``: the other commands, on a policy that comes with the package. Imports click only."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from pathlib import Path
+
+import click
+
+from exporter.cli.export import export_command
+from exporter.cli.group import PROGRAM, Command
+from exporter.cli.serve import serve_command
+from signatures.errors import RuntimeUnavailableError
+
+
+@click.command(
+    "demo",
+    cls=Command,
+    short_help="Try it: export a trained policy, compare it, see it act.",
+    examples=(
+        ("export-model demo", "everything, and the page in your browser"),
+        ("export-model demo --no-open", "without the page"),
+    ),
+)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder for it all."
+)
+@click.option("--no-open", is_flag=True, help="Open nothing; end when all is written.")
+def demo_command(out: Path, no_open: bool) -> None:
+    """Export a trained 3DBall that comes with the package, compare the formats in the runtimes that are here, and open
+    the page on which it acts.
+    """
+    from converters.bundle.bundle import writing
+    from exporter.demo import BALL
+
+    source, report = out / BALL.name, out / "parity.html"
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(BALL, source)
+    _typed(export_command, str(source), "-o", str(out), "--html", str(report))
+    if no_open:
+        return
+    try:
+        _typed(serve_command, "serve", str(out / BALL.stem), "--port", "0", "--open")
+    except RuntimeUnavailableError as error:
+        import webbrowser
+
+        click.echo(f"the page needs TensorFlow.js, so this is the report: {report}\n  to see it act: {error.fix}")
+        webbrowser.open(report.resolve().as_uri())
+
+
+def _typed(command: click.Command, *words: str) -> None:
+    """Run a command, shown as a user would type it."""
+    click.secho(f"$ {PROGRAM} {shlex.join(words)}", bold=True)
+    command.main([w for w in words if w != command.name], PROGRAM, standalone_mode=False)
