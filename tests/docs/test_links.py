@@ -34,7 +34,7 @@ def anchors(page: Path) -> Iterator[str]:
         seen[slug] += 1
 
 
-@pytest.mark.parametrize("page", pages(), ids=name_of)
+@pytest.mark.parametrize("page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=name_of)
 def test_links_resolve(page: Path) -> None:
     for link in links(page):
         address = urlparse(link)
@@ -62,3 +62,12 @@ def test_every_page_can_be_reached() -> None:
 def test_headings_are_found() -> None:
     assert "pytorch-checkpoints" in set(anchors(ROOT / "docs/sources.md"))
     assert "sources.md#pytorch-checkpoints" in links(ROOT / "docs/index.md")
+
+
+def test_the_messages_of_the_faq_are_ones_that_are_said() -> None:
+    code = "".join(
+        p.read_text(encoding="utf-8") for top in ("exporter", "converters") for p in (ROOT / top).rglob("*.py")
+    )
+    asked = re.findall(r"^## `(.*)`$", (ROOT / "docs/faq.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(asked) > 8
+    assert [message for message in asked if message not in code] == []

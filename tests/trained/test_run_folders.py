@@ -13,11 +13,12 @@ import pytest
 from converters.frozen_graph.reader import read_graph
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model, inspect_model
+from exporter.demo import BALL
 from fixtures import trained
 from fixtures.environments import ENVIRONMENTS
 from fixtures.evaluate import play
 from fixtures.goldens import read_npz
-from fixtures.trained import TRAINED, run_folder, weights_file
+from fixtures.trained import FOLDER, TRAINED, run_folder, weights_file
 from fixtures.trained.scores import README, decide, in_readme
 from tests.commands import ROOT
 from tests.trained.conftest import Stage
