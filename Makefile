@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 JS := converters/runtimes/javascript/js
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: install browser demo check test lint types docs figures bench train clean help
+.PHONY: install browser demo check test lint types docs figures bench fuzz train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
@@ -16,6 +16,7 @@ help:
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
+	@echo "make fuzz      damaged files of every kind, N=20000 of each (hours); what came of them, counted"
 	@echo "make train     the policies of fixtures/trained anew, in an environment of its own (minutes)"
 
 install: $(STAMP)
@@ -70,6 +71,11 @@ figures: install
 bench: install
 	$(BIN)/python -m tests.bench
 	$(BIN)/python -m tests.bench.verification
+
+# A mutant has a number and is the same every time: python -m tests.fuzz --reader ONNX --keep 1234 writes it.
+N := 20000
+fuzz: install
+	$(BIN)/python -m tests.fuzz --count $(N)
 
 train: install .venv-train/.installed
 	OMP_NUM_THREADS=1 PYTHONPATH=. .venv-train/bin/python -m fixtures.train

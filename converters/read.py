@@ -13,7 +13,7 @@ from converters.formats import FORMATS
 from converters.recognise import not_readable, recognised
 from converters.source import ReadOptions, SourceModel
 from signatures.contract import POLICY
-from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
+from signatures.errors import BundleError, ExportModelError, SourceError, UsageError, naming
 
 #: What only some sources have a use for: option, flag, and what to give to have one.
 _TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"), ("activation", "a state dictionary"))
@@ -95,7 +95,7 @@ def ports_of(path: Path) -> list[tuple[Format, Ports]]:
     found = recognised(Fetched(path))
     if found is BUNDLE:
         bundle = Bundle.open(path)
-        artefacts = [(f, f.ports(bundle.path(f))) for f in FORMATS if f.ports is not None and bundle.has(f)]
+        artefacts = [(f, _ports(f, bundle.path(f))) for f in FORMATS if f.ports is not None and bundle.has(f)]
         if not artefacts:
             raise SourceError("the bundle holds no model", where=str(path), fix="export the policy again")
         return artefacts
@@ -107,4 +107,10 @@ def ports_of(path: Path) -> list[tuple[Format, Ports]]:
             why=f"no runtime loads it by itself; what can be compared: {able}",
             fix="export it, and compare the bundle",
         )
-    return [(found, found.ports(path))]
+    return [(found, _ports(found, path))]
+
+
+def _ports(found: Format, path: Path) -> Ports:
+    assert found.ports is not None
+    with naming(path):
+        return found.ports(path)

@@ -15,7 +15,10 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
-from signatures.errors import DamagedFileError
+from signatures.errors import DamagedFileError, NotAPolicyError
+
+#: Nodes of a file, training part and functions included.
+MAX_NODES = 1 << 17
 
 _SCALARS = {
     "string": 9,
@@ -139,7 +142,27 @@ def parse(message_class: Any, data: bytes, what: str) -> Any:
             why=f"protobuf cannot decode it ({str(error) or 'truncated message'})",
             fix="copy the file again (binary, not through a text filter), or fetch it from where it was trained",
         ) from error
+    for graph in _graphs(message):
+        check_nodes(len(graph.node) + sum(1 + len(f.node_def) for f in graph.library.function))
     return message
+
+
+def _graphs(message: Any) -> list[Any]:
+    """The GraphDefs in a message."""
+    kind = message.DESCRIPTOR.name
+    if kind == "SavedModel":
+        return [meta.graph_def for meta in message.meta_graphs]
+    return [message] if kind == "GraphDef" else [message.graph_def] if kind == "MetaGraphDef" else []
+
+
+def check_nodes(count: int) -> None:
+    """Raise NotAPolicyError where a file has more nodes than any is read with."""
+    if count > MAX_NODES:
+        raise NotAPolicyError(
+            f"the graph has {count} nodes",
+            why=f"no more than {MAX_NODES} are read; the training graphs of ML-Agents have some thousands",
+            fix="freeze the policy's own outputs",
+        )
 
 
 def serialise(message: Any) -> bytes:

@@ -20,7 +20,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from signatures.fields import printable
@@ -53,7 +54,8 @@ class ExportModelError(Exception):
 
     def at(self, where: str) -> ExportModelError:
         """The same error with a place in front of the one it names already; for callers that know the file."""
-        self.where = where if self.where is None else f"{where}: {self.where}"
+        if self.where is None or not self.where.startswith(where):
+            self.where = where if self.where is None else f"{where}: {self.where}"
         self.args = (self.message,)
         return self
 
@@ -152,3 +154,35 @@ class RuntimeUnavailableError(ExportModelError):
     """A runtime that was asked for is not installed, or its process did not start."""
 
     exit_status = 3
+
+
+#: What Python and numpy raise where a damaged graph breaks something that a step takes for granted.
+_BROKEN = (
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError),
+    RecursionError,
+)
+
+
+@contextmanager
+def naming(path: object) -> Iterator[None]:
+    """Errors inside name the file. It is untrusted input: what nobody foresaw is an error of the file, too."""
+    try:
+        yield
+    except ExportModelError as error:
+        raise error.at(str(path)) from error.__cause__
+    except OSError as error:
+        raise SourceError("cannot be read", where=str(path), why=str(error), fix="check its files") from error
+    except MemoryError as error:
+        raise GraphError(
+            "needs more memory than there is",
+            where=str(path),
+            why=str(error) or "the system gave no more",
+            fix="if it is no larger than other policies, it is damaged: freeze it again from its checkpoint",
+        ) from error
+    except _BROKEN as error:
+        raise GraphError(
+            "the graph cannot be understood",
+            where=str(path),
+            why=f"a step failed on something it did not expect ({type(error).__name__}: {error})",
+            fix="if the runtime it was made for loads it, please open an issue with it; else freeze it again",
+        ) from error

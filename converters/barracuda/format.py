@@ -34,6 +34,7 @@ EIGHT_AXES, METADATA, ALIGNED, TYPED_WEIGHTS = 17, 18, 19, 20
 ALIGNMENT = 16
 _FLOAT, _HALF = 0, 1
 _MAX_AXES = 8
+MAX_LAYERS = 1 << 14
 
 Ints = tuple[int, ...]
 _Item = TypeVar("_Item")
@@ -175,7 +176,7 @@ class _Parser:
         inputs = self._list("inputs", 8, lambda: NnInput(self._text(), self._shape()))
         outputs = self._list("outputs", 4, self._text)
         memories = self._list("memories", 12, lambda: NnMemory(self._shape(), self._text(), self._text()))
-        layers = self._list("layers", 56, self._layer)
+        layers = self._list("layers", 56, self._layer, MAX_LAYERS)
         half, padding = False, 0
         if version >= TYPED_WEIGHTS:
             self._what = "the type of the weights"
@@ -299,10 +300,13 @@ class _Parser:
                 raise self._error(f"{self._what}: a name is not text", str(error)) from error
         return "".join(characters)
 
-    def _list(self, what: str, smallest: int, read: Callable[[], _Item]) -> tuple[_Item, ...]:
+    def _list(self, what: str, smallest: int, read: Callable[[], _Item], most: int = 1 << 31) -> tuple[_Item, ...]:
         self._what = f"the {what}"
         items = []
-        for number in range(self._count(smallest)):
+        count = self._count(smallest)
+        if count > most:
+            raise self._error(f"it has {count} {what}", f"no more than {most} are read; a policy has some hundreds")
+        for number in range(count):
             self._what = f"number {number + 1} of the {what}"
             items.append(read())
         return tuple(items)

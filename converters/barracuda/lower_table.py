@@ -12,6 +12,7 @@ from converters.barracuda import lower_elementwise as elementwise
 from converters.barracuda import lower_linear as linear
 from converters.barracuda.lower_base import NnBuilder, Value
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
+from converters.graph.ops.base import MISFIT, misfit
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
 from converters.graph.types import BATCH
@@ -158,7 +159,10 @@ def _lowered(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value,
     if args and node.op not in _REPEAT and all(a.array is not None for a in args):
         return _computed(b, node, values)
     flattens = node.op in ("MatMul", "_FusedMatMul")
-    result = function(b, [a if flattens else b.settled(a) for a in args])
+    try:
+        result = function(b, [a if flattens else b.settled(a) for a in args])
+    except MISFIT as error:
+        raise misfit(node, error) from error
     return result if isinstance(result, tuple) else (result,)
 
 

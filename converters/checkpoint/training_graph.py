@@ -91,11 +91,12 @@ def saved_places(graph_def: Any) -> dict[str, Saved]:
     """Variable's node → its place in a checkpoint, by the first saver that restores it."""
     nodes = {proto.name: proto for proto in graph_def.node}
     found: dict[str, Saved] = {}
+    producers: dict[str, tuple[Any, int]] = {}
     for proto in graph_def.node:
         inputs = _inputs(proto)
         if proto.op not in ASSIGNS or len(inputs) != 2:
             continue
-        restore, index = _producer(nodes, inputs[1])
+        restore, index = _producer(nodes, inputs[1], producers)
         if restore is None or restore.op not in RESTORES:
             continue
         names, slices = (_strings(nodes, restore, position) for position in (1, 2))
@@ -105,15 +106,18 @@ def saved_places(graph_def: Any) -> dict[str, Saved]:
     return found
 
 
-def _producer(nodes: Mapping[str, Any], reference: str) -> tuple[Any, int]:
-    """The node behind a reference, through Identity, and the output it is."""
-    seen: set[str] = set()
+def _producer(nodes: Mapping[str, Any], reference: str, known: dict[str, tuple[Any, int]]) -> tuple[Any, int]:
+    """The node behind a reference, through Identity, and the output it is; ``known`` keeps what was found."""
+    passed: dict[str, None] = {}
     while True:
         name, index = split_ref(reference)
         proto = nodes.get(name)
-        if proto is None or proto.op != "Identity" or name in seen or not _inputs(proto):
-            return proto, index
-        seen.add(name)
+        ends = proto is None or proto.op != "Identity" or name in passed or not _inputs(proto)
+        if ends or name in known:
+            found = (proto, index) if ends else known[name]
+            known.update(dict.fromkeys(passed, found))
+            return found
+        passed[name] = None
         reference = _inputs(proto)[0]
 
 

@@ -19,8 +19,6 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).
 SCALAR_SHAPE_PRODUCER = 24
-#: Nodes of a file, training part included.
-MAX_NODES = 1 << 17
 
 
 def read_graph(data: bytes) -> Graph:
@@ -36,12 +34,7 @@ def from_graph_def(graph_def: Any) -> Graph:
     """A Graph of a GraphDef message (ours, or any object with the same fields)."""
     if not graph_def.node:
         raise NotAPolicyError("the graph has no nodes", fix="give the frozen graph that training wrote")
-    if len(graph_def.node) > MAX_NODES:
-        raise NotAPolicyError(
-            f"the graph has {len(graph_def.node)} nodes",
-            why=f"no more than {MAX_NODES} are read; the training graphs of ML-Agents have some thousands",
-            fix="freeze the policy's own outputs",
-        )
+    schema.check_nodes(len(graph_def.node))
     calls = {f.signature.name for f in graph_def.library.function}
     allowance = Allowance()
     nodes = [_node(n, graph_def.versions.producer, allowance) for n in graph_def.node]

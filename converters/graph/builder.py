@@ -192,7 +192,7 @@ class Builder:
 
     def length(self, reference: str, axis: int) -> int:
         """The length of an axis that must be a number; raises UnsupportedOpError."""
-        size = self.shape(reference)[axis]
+        size = self.shape(reference)[self.axis(reference, axis)]
         if not isinstance(size, int):
             raise UnsupportedOpError(
                 f"the length of axis {axis} is not known", why="it must be a number before the graph runs"
@@ -266,6 +266,9 @@ class Builder:
 
     def transpose(self, reference: str, permutation: Sequence[int]) -> str:
         """Axes in another order; the result itself where the order is the same."""
+        if sorted(permutation) != list(range(self.rank(reference))):
+            why = f"a tensor has {self.rank(reference)} axes, and {len(permutation)} are put in another order"
+            raise UnsupportedOpError("the axes of a transpose are not those of its input", why=why)
         if list(permutation) == sorted(permutation):
             return reference
         value = self.constant(reference)

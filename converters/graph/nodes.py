@@ -6,7 +6,7 @@ Graphs are immutable by convention: passes make new ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -175,33 +175,34 @@ def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
         by_name(nodes)
         return tuple(nodes)
     index = by_name(nodes)
-    state: dict[str, int] = {}  # 1 = being visited, 2 = done
+    done: dict[str, bool] = {}  # False = being visited
     ordered: list[Node] = []
+
+    def visited(node: Node) -> tuple[Node, Iterator[str]]:
+        """A node, and the names of those that it reads and that are still to be looked at."""
+        done[node.name] = False
+        sources = (node_of(r) for r in node.inputs)
+        return node, (s for s in sources if node.op != "Merge" or index[s].op != "NextIteration")
+
     for root in nodes:
-        if root.name in state:
+        if root.name in done:
             continue
-        stack: list[tuple[str, int]] = [(root.name, 0)]
-        state[root.name] = 1
+        stack = [visited(root)]
         while stack:
-            name, position = stack.pop()
-            node = index[name]
-            sources = [node_of(r) for r in node.inputs]
-            if node.op == "Merge":
-                sources = [s for s in sources if index[s].op != "NextIteration"]
-            if position < len(sources):
-                stack.append((name, position + 1))
-                source = sources[position]
-                if source not in state:
-                    state[source] = 1
-                    stack.append((source, 0))
-                elif state[source] == 1:
+            node, sources = stack[-1]
+            for source in sources:
+                if source not in done:
+                    stack.append(visited(index[source]))
+                    break
+                if not done[source]:
                     raise GraphError(
                         f"node {source!r} depends on itself",
                         why="the graph has a cycle that is not a while loop",
                         fix="freeze the graph again; this file is damaged",
                     )
             else:
-                state[name] = 2
+                stack.pop()
+                done[node.name] = True
                 ordered.append(node)
     return tuple(ordered)
 

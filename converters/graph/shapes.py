@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from converters.graph.nodes import Graph, Node, ref
-from converters.graph.ops.base import OpDef
+from converters.graph.ops.base import MISFIT, OpDef, misfit
 from converters.graph.ops.table import CONTROL_FLOW, op_of
 from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, product
 from signatures.errors import ExportModelError, GraphError
@@ -71,12 +71,8 @@ def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols
         results = op.infer(node, args, symbols)
     except ExportModelError:
         raise
-    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise GraphError(
-            f"node {node.name!r} ({node.op}) has inputs or attributes that its op does not allow",
-            why=f"{type(error).__name__}: {error}",
-            fix="the graph is damaged; freeze it again from its checkpoint",
-        ) from error
+    except MISFIT as error:
+        raise misfit(node, error) from error
     _check_size(node, args, results)
     if op.kernel is None or not op.foldable or results[0].value is not None or not args:
         return results
@@ -118,7 +114,7 @@ def run_kernel(op: OpDef, node: Node, arrays: Sequence[np.ndarray]) -> tuple[np.
     assert op.kernel is not None
     try:
         result = op.kernel(node, *arrays)
-    except (IndexError, KeyError, TypeError, ValueError) as error:
+    except MISFIT as error:
         raise GraphError(
             f"node {node.name!r} ({node.op}) cannot be computed",
             why=f"{type(error).__name__}: {error}",

@@ -110,7 +110,7 @@ def refuse_code(config: Any) -> None:
     for named in _objects(config):
         name = named.get("class_name")
         module, registered = named.get("module"), named.get("registered_name")
-        if name in _VALUES:
+        if isinstance(name, str) and name in _VALUES:
             continue
         whole = ".".join(str(part) for part in (module, name) if part)
         if not isinstance(name, str) or name in _CODE or "lambda" in name.lower() or not name[:1].isupper():

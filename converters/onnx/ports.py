@@ -7,21 +7,12 @@ from typing import Any
 
 from converters.fetch import read_bytes
 from converters.format import Port, Ports
-from converters.onnx.proto import dtype_name
-from signatures.errors import DamagedFileError
+from converters.onnx.proto import decoded, dtype_name
 
 
 def ports(path: Path) -> Ports:
     """The ports of a file. Raises SourceError, DamagedFileError."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
-    try:
-        graph = onnx.ModelProto.FromString(read_bytes(path)).graph
-    except DecodeError as error:
-        raise DamagedFileError(
-            "cannot be decoded as ONNX", where=str(path), why="the file is cut off or damaged", fix="export it again"
-        ) from error
+    graph = decoded(read_bytes(path)).graph
     stored = {t.name for t in graph.initializer}
     inputs = tuple(_port(v) for v in graph.input if v.name not in stored)
     return Ports(path, inputs, tuple(_port(v) for v in graph.output))

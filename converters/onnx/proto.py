@@ -15,6 +15,7 @@ import numpy as np
 
 from converters.fetch import MAX_BYTES, read_bytes
 from converters.graph.types import FLOAT32
+from converters.schema import check_nodes
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 _MAX_AXES = 32
@@ -22,6 +23,7 @@ _EXTERNAL = 1  # TensorProto.DataLocation
 #: How often all bytes of the files beside a model may be named as weights: layers share some.
 _MAX_TIMES = 4
 _DOUBLE, _STRING = 11, 8
+_TEXT = 9  # FieldDescriptor.TYPE_STRING
 #: TensorProto.DataType → (dtype, field of values that are not raw bytes)
 _STORED = {
     1: (np.float32, "float_data"),
@@ -38,6 +40,50 @@ _STORED = {
 }
 #: AttributeProto.AttributeType → field, for the kinds that are read
 _FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "strings"}
+
+
+def decoded(data: bytes) -> Any:
+    """The ModelProto in ``data``, all of whose names are text. Raises DamagedFileError."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.ModelProto.FromString(data)
+    except DecodeError as error:
+        raise DamagedFileError(
+            "cannot be decoded as ONNX", why="the file is cut off or damaged", fix="export or download it again"
+        ) from error
+    _check_texts(model)
+    return model
+
+
+def _check_texts(model: Any) -> None:
+    """Raise DamagedFileError where a text is none: protobuf gives its bytes then, as ONNX is written in proto2.
+
+    NotAPolicyError where there are more nodes than any file is read with.
+    """
+    stack, nodes = [model], 0
+    while stack:
+        message = stack.pop()
+        if message.DESCRIPTOR.name == "GraphProto":
+            nodes += len(message.node) + len(message.initializer)
+            check_nodes(nodes)
+        tensor = message.DESCRIPTOR.name == "TensorProto"
+        fields = [(f, getattr(message, f)) for f in ("name", "doc_string", "external_data")] if tensor else ()
+        for field, value in fields or ((f.name, v) for f, v in message.ListFields()):
+            items = value if hasattr(value, "append") or hasattr(value, "add") else (value,)
+            if not items:
+                continue
+            if hasattr(items[0], "ListFields"):
+                stack.extend(items)
+            elif isinstance(items[0], str | bytes) and message.DESCRIPTOR.fields_by_name[field].type == _TEXT:
+                broken = next((i for i in items if isinstance(i, bytes)), None)
+                if broken is not None:
+                    raise DamagedFileError(
+                        f"the {field} of a {message.DESCRIPTOR.name.removesuffix('Proto')} is {broken[:40]!r}",
+                        why="that is no text (UTF-8)",
+                        fix="export or download it again",
+                    )
 
 
 def array_of(tensor: Any) -> np.ndarray:

@@ -19,7 +19,7 @@ from converters.onnx.importer.node import DTYPES, STANDARD
 from converters.onnx.importer.table import TABLE
 from converters.onnx.memories import OnnxMemory, separate_memories
 from converters.onnx.one_row import check_rows
-from converters.onnx.proto import array_of, load_external, tensors
+from converters.onnx.proto import array_of, decoded, load_external, tensors
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
@@ -124,15 +124,7 @@ def _baked(importer: Importer, outputs: Sequence[Any]) -> bool:
 
 def parse(given: Fetched) -> tuple[Any, list[Path]]:
     """(ModelProto without functions and with all its data, the files of that data). Raises DamagedFileError."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
-    try:
-        model = onnx.ModelProto.FromString(given.data)
-    except DecodeError as error:
-        raise DamagedFileError(
-            "cannot be decoded as ONNX", why="the file is cut off or damaged", fix="export or download it again"
-        ) from error
+    model = decoded(given.data)
     if not model.graph.node and not model.graph.output:
         raise NotAPolicyError("the model has no nodes", fix="give the model that training exported")
     if model.graph.sparse_initializer:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from converters.fetch import read_bytes
-from converters.onnx.proto import load_external
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from converters.onnx.proto import decoded, load_external
+from signatures.errors import UnsupportedOpError
 
 #: Domains whose operators compute, of ONNX and of onnxruntime.
 _DOMAINS = frozenset(("", "ai.onnx", "ai.onnx.ml", "com.microsoft", "com.ms.internal.nhwc"))
@@ -33,15 +33,7 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
 
 def contained(path: Path) -> Any:
     """The ModelProto with the data of all its files. Raises what ``vetted`` raises."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
-    try:
-        model = onnx.ModelProto.FromString(read_bytes(path))
-    except DecodeError as error:
-        raise DamagedFileError(
-            "cannot be decoded as ONNX", where=str(path), why="the file is cut off or damaged", fix="export it again"
-        ) from error
+    model = decoded(read_bytes(path))
     model.ClearField("training_info")
     own = {(f.domain, f.name) for f in model.functions}
     for part in (model.graph, *model.functions):

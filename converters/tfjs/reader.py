@@ -64,8 +64,13 @@ def model_file(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    named = [p for p in sorted(path.glob("*.json"))[:_MAX_FILES] if b'"modelTopology"' in p.read_bytes()[:_HEAD]]
+    named = [p for p in sorted(path.glob("*.json"))[:_MAX_FILES] if p.is_file() and b'"modelTopology"' in _head(p)]
     return named[0] if len(named) == 1 and not (path / MODEL).exists() else path / MODEL
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_HEAD)
 
 
 def content_of(given: Fetched) -> dict[str, Any]:
@@ -76,6 +81,8 @@ def content_of(given: Fetched) -> dict[str, Any]:
         raise _damaged("model.json is not JSON", str(error)[:200]) from error
     if not isinstance(model, dict) or not isinstance(model.get("modelTopology"), dict):
         raise _damaged("model.json has no modelTopology")
+    nodes = model["modelTopology"].get("node")
+    schema.check_nodes(len(nodes) if isinstance(nodes, list) else 0)
     return model
 
 

@@ -44,11 +44,12 @@ def _prelu(editor: Editor, node: Node) -> str:
 
 
 def _product(editor: Editor, node: Node) -> str:
-    steps = node.attrs.get("fused_ops") or ()
+    given = node.attrs.get("fused_ops")
+    steps = given if isinstance(given, tuple) else (given,) if given else ()
     wanted = 2 + sum(s in ("BiasAdd", "Prelu") for s in steps)
     if any(s != "BiasAdd" and s not in _ACTIVATIONS for s in steps) or len(node.inputs) != wanted:
         raise UnsupportedOpError(
-            f"cannot convert {node.op} (node {node.name!r}) with {', '.join(steps) or 'nothing'} fused into it",
+            f"cannot convert {node.op} (node {node.name!r}) with {', '.join(map(str, steps)) or 'nothing'} fused to it",
             issues=[(node.name, node.op)],
             why=f"it has {len(node.inputs)} inputs, and what is fused is not known here, or takes {wanted}",
             fix="give the SavedModel that the TensorFlow.js model was converted from",

@@ -77,6 +77,12 @@ def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, s
     told = (n for n in compiled.facts.notes if (lifted := LIFTED.fullmatch(n)) is None or lifted[1] in feeds)
     notes = [*told, *notes]
     outputs, named = _outputs(compiled, types)
+    for spec in (*inputs, *outputs):
+        if not spec.dtype.startswith(("bool", "int", "uint", "float")):
+            raise SignatureError(
+                f"{spec.name!r} is of {spec.dtype}, and a policy takes and gives numbers",
+                fix="name the policy's own inputs and outputs: --input NODE=ROLE, --output NODE=ROLE",
+            )
     meanings = compiled.meanings.values()
     kinds = {m.role is Role.CONTINUOUS for m in meanings}
     brain, facts = compiled.brain, compiled.facts

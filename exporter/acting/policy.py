@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from exporter.acting.generator import Generator, likeliest
 from signatures.contract import POLICY
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
+from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
 
@@ -358,7 +358,6 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     from converters.bundle.bundle import Bundle
     from converters.folders import scratch_folder
     from converters.formats import WRITTEN
-    from exporter.export.sources import naming
 
     found = Bundle.open(folder)
     named = {r: found.path(WRITTEN[key]) for r, key in _TAKES.items() if found.has(WRITTEN[key])}
@@ -395,7 +394,7 @@ def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) ->
     from converters.format import WriteOptions
     from converters.formats import WRITTEN
     from converters.graph.options import CompileOptions
-    from exporter.export.sources import naming, read_source
+    from exporter.export.sources import read_source
 
     policies = read_source(path).policies(CompileOptions(brain=brain))
     if len(policies) != 1:

@@ -28,7 +28,7 @@ from converters.read import ports_of
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun, ReadOptions
-from exporter.export.sources import naming, read_source
+from exporter.export.sources import read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
@@ -38,7 +38,7 @@ from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import verify
 from signatures.contract import POLICY
-from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
+from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, naming
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 from signatures.spec import TensorSpec

@@ -24,7 +24,7 @@ from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from exporter.export.labels import Labels, check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
-from exporter.export.sources import Source, naming, read_source
+from exporter.export.sources import Source, read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
@@ -42,6 +42,7 @@ from signatures.errors import (
     RuntimeUnavailableError,
     SignatureError,
     UsageError,
+    naming,
 )
 from signatures.fields import FieldError, printable
 from signatures.spec import PolicySignature

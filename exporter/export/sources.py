@@ -13,41 +13,10 @@ from converters.graph.options import CompileOptions
 from converters.policy import Policy
 from converters.read import check_options, fetched, read_models
 from converters.source import ReadOptions, SourceModel
-from signatures.errors import ExportModelError, GraphError, SourceError
+from signatures.errors import naming
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
-
-#: What Python and numpy raise where a damaged graph breaks something that a step takes for granted.
-_BROKEN = (
-    *(ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError),
-    RecursionError,
-)
-
-
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Errors inside name the source. It is untrusted input: what nobody foresaw is an error of the source, too."""
-    try:
-        yield
-    except ExportModelError as error:
-        raise error.at(str(path)) from error.__cause__
-    except OSError as error:
-        raise SourceError("cannot be read", where=str(path), why=str(error), fix="check its files") from error
-    except MemoryError as error:
-        raise GraphError(
-            "needs more memory than there is",
-            where=str(path),
-            why=str(error) or "the system gave no more",
-            fix="if it is no larger than other policies, it is damaged: freeze it again from its checkpoint",
-        ) from error
-    except _BROKEN as error:
-        raise GraphError(
-            "the graph cannot be understood",
-            where=str(path),
-            why=f"a step failed on something it did not expect ({type(error).__name__}: {error})",
-            fix="if the runtime it was made for loads it, please open an issue with it; else freeze it again",
-        ) from error
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from converters.graph.options import CompileOptions
 from converters.policy import Policy
 from converters.source import ReadOptions
 from exporter.cli.tables import paragraph, size_text, table
-from exporter.export.sources import naming, read_source
+from exporter.export.sources import read_source
 from signatures.contract import safe_name
-from signatures.errors import ExportModelError
+from signatures.errors import ExportModelError, naming
 from signatures.fields import printable
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec

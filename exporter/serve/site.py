@@ -14,13 +14,12 @@ from converters.bundle.embed import runnable
 from converters.bundle.exchange import exchange, stage
 from converters.formats import WRITTEN
 from converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
-from exporter.export.sources import naming
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, TYPES
 from exporter.version import __version__
 from signatures.contract import POLICY
-from signatures.errors import BundleError, RuntimeUnavailableError
+from signatures.errors import BundleError, RuntimeUnavailableError, naming
 
 PAGE = Path(__file__).resolve().parent / "page"
 POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"

@@ -11,6 +11,7 @@ from pathlib import Path
 from converters.bundle import bundle
 from converters.formats import WRITTEN
 from converters.frozen_graph.reader import read_graph
+from signatures.errors import naming
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -87,7 +88,8 @@ def read_bundle(folder: Path) -> Bundle:
     nodes: frozenset[str] = frozenset()
     if found.has(frozen):
         found.verify_hashes(frozen)
-        nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
+        with naming(found.path(frozen)):
+            nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
     made_for = found.contract.tool.get("profile")
     return Bundle(folder, found.name, found.signature, frozenset(found.contract.files), nodes, made_for)
 

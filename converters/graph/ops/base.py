@@ -223,6 +223,19 @@ def shape_error(node: Node, args: Sequence[TensorType], why: str) -> GraphError:
     )
 
 
+#: What Python and numpy raise where a node has fewer inputs, other ranks or other attributes than its op.
+MISFIT = (IndexError, KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
+
+
+def misfit(node: Node, error: Exception) -> GraphError:
+    """The GraphError of a node that one of ``MISFIT`` came of."""
+    return GraphError(
+        f"node {node.name!r} ({node.op}) has inputs or attributes that its op does not allow",
+        why=f"{type(error).__name__}: {error}",
+        fix="the graph is damaged; freeze it again from its checkpoint",
+    )
+
+
 def require_constant(node: Node, args: Sequence[TensorType], position: int, meaning: str) -> np.ndarray:
     """The constant value of an input, or UnsupportedOpError."""
     value = args[position].constant

@@ -7,6 +7,7 @@ flow), attributes are complete with their defaults, no attribute that TF 1.4 lac
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.base import REQUIRED
+from converters.graph.ops.base import MISFIT, REQUIRED, Attr, AttrKind, misfit
 from converters.graph.ops.older import TO_NCHW, TO_NHWC
 from converters.graph.ops.table import CONTROL_FLOW, SPELLINGS, TABLE, op_of, unsupported
 from converters.graph.types import FLOAT32, INT64
@@ -32,7 +33,10 @@ def normalise(graph: Graph) -> Graph:
         if node.op in CONTROL_FLOW:
             editor.keep(node)
         elif older := op_of(node).older:
-            editor.redirect(node.name, older(editor, given))
+            try:
+                editor.redirect(node.name, older(editor, given))
+            except MISFIT as error:
+                raise misfit(given, error) from error
         else:
             _take(editor, _completed(node))
     return editor.graph()
@@ -54,11 +58,7 @@ def _completed(node: Node) -> Node:
                     fix="the graph is damaged; freeze it again from its checkpoint",
                 )
             given = attr.default
-        if attr.kind == "type" and not isinstance(given, np.dtype):
-            raise GraphError(
-                f"node {node.name!r} ({node.op}) has {name}={given!r}, which is no dtype",
-                fix="the graph is damaged; freeze it again from its checkpoint",
-            )
+        _check_kind(node, attr, given)
         if not attr.supported and given != attr.default and not (name == "explicit_paddings" and not any(given)):
             if name == "explicit_paddings" and node.attrs.get("padding") == "EXPLICIT":
                 attrs[name] = given
@@ -71,6 +71,31 @@ def _completed(node: Node) -> Node:
             )
         attrs[name] = given if attr.supported else attr.default
     return replace(node, attrs=attrs)
+
+
+#: What an attribute of each kind is, or each item of a list of them.
+_KINDS: Mapping[AttrKind, tuple[type, ...]] = {
+    "type": (np.dtype,),
+    "int": (int, np.integer),
+    "float": (float, int, np.number),
+    "bool": (bool, np.bool_),
+    "str": (str,),
+    "shape": (TensorShape,),
+}
+
+_WORDS = {"type": "dtype", "int": "integer", "float": "number", "bool": "truth value", "str": "text", "shape": "shape"}
+
+
+def _check_kind(node: Node, attr: Attr, given: Any) -> None:
+    """Raise GraphError where an attribute is of another kind than its op has it."""
+    items = given if isinstance(given, tuple) else (given,)
+    single = not isinstance(attr.default, tuple) and attr.default is not REQUIRED
+    if (single and isinstance(given, tuple)) or not all(isinstance(i, _KINDS[attr.kind]) for i in items):
+        raise GraphError(
+            f"node {node.name!r} ({node.op}) has {attr.name}={str(given)[:80]}, which is no {_WORDS[attr.kind]}",
+            why="the op cannot be computed without it",
+            fix="the graph is damaged; freeze it again from its checkpoint",
+        )
 
 
 def _take(editor: Editor, node: Node) -> None:

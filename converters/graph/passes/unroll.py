@@ -21,9 +21,18 @@ from converters.graph.nodes import Graph, Node, ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
 from converters.graph.shapes import Types, infer_types, run_kernel
 from converters.graph.types import INT32
-from signatures.errors import UnsupportedOpError
+from signatures.errors import GraphError, UnsupportedOpError
 
 MAX_TURNS = 64
+
+
+#: How many inputs each has; a Merge has any number.
+_INPUTS = {
+    **dict.fromkeys(("enter", "exit", "next_iteration", "loop_cond", "array"), 1),
+    **dict.fromkeys(("switch", "size"), 2),
+    **dict.fromkeys(("gather", "read"), 3),
+    **dict.fromkeys(("scatter", "write"), 4),
+}
 
 
 @dataclass(frozen=True)
@@ -33,8 +42,11 @@ class _Flow:
     size: int | None
     items: tuple[tuple[int, str], ...] = ()
 
-    def get(self, index: int) -> str:
-        return dict(self.items)[index]
+    def get(self, node: Node, index: int) -> str:
+        for at, tensor in self.items:
+            if at == index:
+                return tensor
+        raise _broken(node, f"element {index} of its tensor array was never written")
 
 
 class _DeadError(Exception):
@@ -43,9 +55,12 @@ class _DeadError(Exception):
 
 def unroll(graph: Graph) -> Graph:
     """See the module."""
-    if not any(n.op in CONTROL_FLOW for n in graph.nodes):
-        return graph
-    return _Unroller(graph).run()
+    flow = [n for n in graph.nodes if n.op in CONTROL_FLOW]
+    for node in flow:
+        wanted = _INPUTS.get(CONTROL_FLOW[node.op])
+        if not node.inputs or (wanted is not None and len(node.inputs) != wanted):
+            raise _broken(node, f"it has {len(node.inputs)} inputs")
+    return _Unroller(graph).run() if flow else graph
 
 
 class _Unroller:
@@ -194,6 +209,12 @@ class _Unroller:
             raise _undecided(node, "the indices of a tensor array")
         return [int(i) for i in np.atleast_1d(value)]
 
+    def _index(self, node: Node, turn: int | None) -> int:
+        found = self._indices(node, node.inputs[1], turn)
+        if len(found) != 1:
+            raise _broken(node, f"its index is {len(found)} numbers")
+        return found[0]
+
     def _scatter(self, node: Node, index: int, turn: int | None) -> _Flow:
         _, indices, value, flow_in = node.inputs
         flow, source = self._flow(flow_in, turn), self.plain(value, turn)
@@ -210,18 +231,17 @@ class _Unroller:
         return self._add("StridedSlice", [source, *bounds], name, shrink_axis_mask=1)
 
     def _read(self, node: Node, index: int, turn: int | None) -> str:
-        (position,) = self._indices(node, node.inputs[1], turn)
-        return self._flow(node.inputs[2], turn).get(position)
+        return self._flow(node.inputs[2], turn).get(node, self._index(node, turn))
 
     def _write(self, node: Node, index: int, turn: int | None) -> _Flow:
-        (position,) = self._indices(node, node.inputs[1], turn)
+        position = self._index(node, turn)
         flow = self._flow(node.inputs[3], turn)
         value = self.plain(node.inputs[2], turn)
         return _Flow(flow.size, tuple({**dict(flow.items), position: value}.items()))
 
     def _gather(self, node: Node, index: int, turn: int | None) -> str:
         flow = self._flow(node.inputs[2], turn)
-        parts = [flow.get(i) for i in self._indices(node, node.inputs[1], turn)]
+        parts = [flow.get(node, i) for i in self._indices(node, node.inputs[1], turn)]
         return self._add("Pack", parts, f"{node.name}/pack", axis=0)
 
     def _size(self, node: Node, index: int, turn: int | None) -> str:
@@ -284,6 +304,14 @@ def _frames(graph: Graph) -> dict[str, str]:
         elif inside and CONTROL_FLOW.get(node.op) != "exit":
             frames[node.name] = inside[0]
     return frames
+
+
+def _broken(node: Node, why: str) -> GraphError:
+    return GraphError(
+        f"node {node.name!r} ({node.op}) does not belong to a loop or branch as TensorFlow writes them",
+        why=why,
+        fix="the graph is damaged; freeze it again from its checkpoint",
+    )
 
 
 def _undecided(node: Node, meaning: str) -> UnsupportedOpError:

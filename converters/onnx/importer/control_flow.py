@@ -16,7 +16,7 @@ def _if(op: Op, net: Importer) -> list[str | None]:
             "which branch is taken would differ from run to run",
             "if an input decides it, give it a value: --set NAME=VALUE; else export the model with fixed shapes",
         )
-    body = op.attrs["then_branch" if bool(condition.reshape(-1)[0]) else "else_branch"]
+    body = op.body("then_branch" if bool(condition.reshape(-1)[0]) else "else_branch")
     return [*net.inline(op, body, {})]
 
 
@@ -25,7 +25,7 @@ def _scan(op: Op, net: Importer) -> list[str | None]:
 
     Opset 8 had a batch axis and sequence lengths of its own; nobody writes that.
     """
-    body = op.attrs["body"]
+    body = op.body("body")
     walked = op.integer("num_scan_inputs", 0)
     states = len(op.inputs) - walked
     if op.opset < 9 or walked < 1 or states < 0 or len(body.input) != len(op.inputs):

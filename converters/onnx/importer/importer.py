@@ -11,6 +11,7 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.ops.base import MISFIT
 from converters.graph.ops.table import op_of
 from converters.graph.types import FLOAT32, TensorType
 from converters.onnx.importer.fixed_batch import FixedBatch
@@ -102,6 +103,10 @@ class Importer(Builder):
             results = function(op, self)
         except UnsupportedOpError as error:
             self._break(op, error if error.issues else op.refused(error.what, error.why, error.fix))
+            return
+        except MISFIT as error:
+            why = f"{type(error).__name__}: {error}"
+            self._break(op, op.refused("it has inputs or attributes that its operator does not allow", why))
             return
         made = [results] if isinstance(results, str) else list(results)
         bound = [(v, m) for v, m in zip(op.outputs, made, strict=False) if v and m is not None]

@@ -60,24 +60,42 @@ class Op:
 
     def integer(self, name: str, default: int) -> int:
         """An integer attribute."""
-        return int(self.attrs.get(name, default))
+        return int(self._given(name, default, int))
 
     def integer_or_none(self, name: str) -> int | None:
         """An integer attribute that may be left out."""
-        return int(self.attrs[name]) if name in self.attrs else None
+        return self.integer(name, 0) if name in self.attrs else None
 
     def number(self, name: str, default: float) -> float:
         """A float attribute."""
-        return float(self.attrs.get(name, default))
+        return float(self._given(name, default, (int, float)))
 
     def text(self, name: str, default: str) -> str:
         """A string attribute."""
-        return str(self.attrs.get(name, default))
+        return str(self._given(name, default, str))
+
+    def body(self, name: str) -> Any:
+        """A subgraph."""
+        found = self.attrs.get(name)
+        if not hasattr(found, "initializer"):
+            raise self.refused(f"its attribute {name} is no graph", "the op cannot be computed without it")
+        return found
+
+    def _given(self, name: str, default: Any, kind: type | tuple[type, ...]) -> Any:
+        """An attribute as the file has it; raises UnsupportedOpError where it is of another kind than ``kind``."""
+        value = self.attrs.get(name, default)
+        if not isinstance(value, kind):
+            raise self.refused(f"its attribute {name} is {str(value)[:80]!r}", "the operator has it of another kind")
+        return value
 
     def integers(self, name: str, default: Sequence[int] | None = None) -> tuple[int, ...] | None:
         """A list of integers, ``default`` where the attribute is left out."""
         value = self.attrs.get(name, default)
-        return None if value is None else tuple(int(v) for v in value)
+        if value is None:
+            return None
+        if not isinstance(value, Sequence) or not all(isinstance(v, int) for v in value):
+            raise self.refused(f"its attribute {name} is {str(value)[:80]!r}", "the operator has it of another kind")
+        return tuple(value)
 
     def dtype(self, name: str, default: int) -> np.dtype:
         """A data type attribute; raises UnsupportedOpError for types that no target has."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from converters.fetch import read_bytes
-from converters.onnx.proto import load_external
+from converters.onnx.proto import decoded, load_external
 from converters.targets.unity.onnx_constants import RANDOM_OPS, value_of
 from converters.targets.unity.onnx_shapes import inferred_shapes
 from signatures.errors import DamagedFileError
@@ -124,18 +124,10 @@ class OnnxFile:
 
 def read_onnx_file(path: Path) -> OnnxFile:
     """Read the messages of a model. Raises SourceError, DamagedFileError."""
-    import onnx
-    from google.protobuf.message import DecodeError
-
     try:
-        model = onnx.ModelProto.FromString(read_bytes(path))
-    except DecodeError as error:
-        raise DamagedFileError(
-            "cannot be decoded as ONNX",
-            where=str(path),
-            why="the file is cut off or damaged",
-            fix="export or download it again",
-        ) from error
+        model = decoded(read_bytes(path))
+    except DamagedFileError as error:
+        raise error.at(str(path)) from error.__cause__
     load_external(model.graph, path.parent)
     for tensor in model.graph.initializer:
         if min(tensor.dims, default=0) < 0:
