@@ -12,6 +12,8 @@ from exporter.verify.tolerances import Tolerance
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
 NARROWED = {("int64", "int32")}
+#: What an output may be off of how far it varies.
+SHARE = 1e-3
 #: Logarithm of the smallest float32 that has all its digits.
 _UNDERFLOW = float(np.log(np.finfo(np.float32).tiny))
 
@@ -42,10 +44,12 @@ def compare(
     free: np.ndarray | None = None,
     narrowed: bool = False,
     rounding: np.ndarray | None = None,
+    most: np.ndarray | None = None,
 ) -> Difference:
     """Compare by |a − b| ≤ atol + rtol·|b|, element by element.
 
     ``free`` marks integer elements where another answer is right too (a tie). ``narrowed`` allows int32 for int64.
+    ``most`` are bounds per column that go before larger ones.
     ``rounding`` is an absolute difference per element that float32 itself explains; where it is larger than the
     tolerance it takes its place. A NaN or infinity must stand at the same place on both sides.
     """
@@ -70,6 +74,8 @@ def compare(
         # Beside a reference of nearly zero the tolerance is what a difference is relative to.
         relative = difference / np.maximum(np.abs(b), tolerance.atol)
     bound = tolerance.atol + tolerance.rtol * np.abs(b) if reference.dtype.kind == "f" else np.zeros_like(b)
+    if most is not None:
+        bound = np.minimum(bound, most)
     if rounding is not None:
         bound = np.maximum(bound, rounding)
     passed = bool((difference <= bound).all())
@@ -96,6 +102,23 @@ def row_steps(exact: np.ndarray, moved: np.ndarray) -> np.ndarray:
         step = np.abs(moved.astype(np.float64) - exact)
     row = step.max(axis=tuple(range(1, step.ndim)), keepdims=True)
     return np.broadcast_to(np.where(np.isfinite(row), row, 0.0), step.shape)
+
+
+def spread(answers: Sequence[np.ndarray]) -> np.ndarray | None:
+    """``SHARE`` of how far each column varies over float ``answers`` of one shape but for the rows: [1, ...].
+
+    Infinite where it does not vary at all; None where nothing can be told.
+    """
+    if (
+        not answers
+        or answers[0].dtype.kind != "f"
+        or any(a.ndim < 2 or a.shape[1:] != answers[0].shape[1:] for a in answers)
+    ):
+        return None
+    rows = np.concatenate(answers).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        varies = SHARE * (rows.max(axis=0, keepdims=True) - rows.min(axis=0, keepdims=True))
+    return np.where(np.isfinite(varies) & (varies > 0), varies, np.inf)
 
 
 def floored(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:

@@ -12,7 +12,7 @@ from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
-from exporter.verify.difference import Difference, compare, floored, ties
+from exporter.verify.difference import SHARE, Difference, compare, floored, spread, ties
 from exporter.verify.findings import Bisection, Finding
 from exporter.verify.golden import Golden, read_golden
 from exporter.verify.options import VerifyOptions
@@ -52,6 +52,7 @@ class Trial:
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
         self.rounding = Rounding(self.options.seed, numbers, self._settled)
         self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
+        self._spreads: dict[str, np.ndarray | None] = {}
         self._flushed: dict[str, Arrays] = {}
 
     def allowance(self, participant: Participant, purpose: str = "inputs") -> Allowance:
@@ -109,7 +110,24 @@ class Trial:
             free=self._ties(name, expected, participant, rounding or {}),
             narrowed=narrows(participant.format),
             rounding=None if rounding is None or got.dtype.kind != "f" else rounding.get(name),
+            most=self._most(name, participant),
         )
+
+    def _most(self, name: str, participant: Participant) -> np.ndarray | None:
+        """What an output that hardly varies may be off, column by column: a share of how far it varies.
+
+        A tolerance that a user or the table gave stays as it is, and so does that of a column that is always the same.
+        """
+        if self.tolerance(name, participant) != Tolerance():
+            return None
+        if name not in self._spreads:
+            made = [
+                self._settled(answers)[name]
+                for case, answers in zip(self.cases, self.expected, strict=True)
+                if name in answers and case.name.startswith("typical")
+            ]
+            self._spreads[name] = spread(made)
+        return self._spreads[name]
 
     def bisected(
         self, participant: Participant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
@@ -117,7 +135,7 @@ class Trial:
         """Where a difference begins; None where there is none, or its reason says all there is to say."""
         if difference.passed:
             return None
-        found = self.bisector.find(participant, output, feeds, self.tolerance(output, participant), branch)
+        found = self.bisector.find(participant, output, feeds, self._judged_by(output, participant, difference), branch)
         return None if found.tensor is None and difference.reason else found
 
     def finding(
@@ -137,7 +155,7 @@ class Trial:
             output,
             difference.max_abs,
             difference.max_rel,
-            self.tolerance(output, participant),
+            self._judged_by(output, participant, difference),
             difference.passed,
             where,
             difference.reason,
@@ -147,6 +165,15 @@ class Trial:
             None if difference.passed else difference.smallest_tolerance,
             bisection,
         )
+
+    def _judged_by(self, output: str, participant: Participant, difference: Difference) -> Tolerance:
+        """The tolerance, or what went before it: a share of how far the output varies."""
+        tolerance, most = self.tolerance(output, participant), self._most(output, participant)
+        least = difference.smallest_tolerance
+        if most is None or difference.passed or difference.reason or least is None or least > tolerance.atol:
+            return tolerance
+        share = float(most.min())
+        return Tolerance(share, 0.0, f"a thousandth of how far it varies (a column by {share / SHARE:.2g} only)")
 
     def rolled(self, run: Callable[[Feeds], Arrays]) -> list[Arrays]:
         """Outputs of each step, the memory fed back."""

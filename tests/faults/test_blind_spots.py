@@ -11,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from converters import schema
 from converters.formats import DEFAULTS
+from converters.frozen_graph.tensors import from_array, to_array
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import RuntimeInfo
-from exporter.export.pipeline import ExportOptions, export
+from exporter.export.pipeline import ExportOptions, export, verify_folder
 from exporter.verify import work
 from exporter.verify.checks.draws import least_likely, with_zeros
 from exporter.verify.options import VerifyOptions
@@ -228,22 +230,41 @@ def test_branches_that_are_drawn_from_one_seed_are_seen() -> None:
 # ------------------------------------------------------------------ weights
 
 
+def nearly_flat(tmp_path: Path, scale: float = 1e-3) -> Path:
+    """A policy whose outputs hardly vary: all its matrices are a fraction."""
+    graph = schema.parse(schema.GraphDef, fixture("continuous").read_bytes(), "GraphDef")
+    for each in graph.node:
+        value = each.attr["value"].tensor
+        if each.op == "Const" and len(value.tensor_shape.dim) == 2:
+            value.CopyFrom(from_array((to_array(value) * np.float32(scale)).astype(np.float32)))
+    source = tmp_path / "small.bytes"
+    source.write_bytes(schema.serialise(graph))
+    return source
+
+
+def test_an_output_that_hardly_varies_is_judged_by_how_far_it_does(tmp_path: Path, processes: RuntimePool) -> None:
+    def flatter(feeds: Feeds, answers: Arrays) -> Arrays:
+        if "value_estimate" in answers:
+            mean = answers["value_estimate"].mean()
+            answers["value_estimate"] = mean + (answers["value_estimate"] - mean) * np.float32(0.95)
+        return answers
+
+    source = nearly_flat(tmp_path, 0.03)  # the value varies by 6e-5
+    assert verified(source, tmp_path, processes, honest).passed is True
+    report = verified(source, tmp_path, processes, flatter)
+    (found,) = {f.output: f for f in report.failures if f.kind == "numbers"}.values()
+    assert found.max_abs_diff < 1e-5
+    assert "how far it varies" in found.tolerance.reason
+    loose = VerifyOptions(tolerance=Tolerance(1.1e-5, 1e-5))  # what was asked for is not made narrower
+    assert verified(source, tmp_path, processes, flatter, options=loose).passed is True
+
+
 @pytest.mark.parametrize("kind", FORMATS)
 def test_weights_that_were_rounded_are_met_where_outputs_hardly_vary(
     kind: str, tmp_path: Path, pool: RuntimePool
 ) -> None:
     """Half precision moves these outputs by less than the tolerance: only the weights themselves tell."""
-    from converters import schema
-    from converters.frozen_graph.tensors import from_array, to_array
-    from exporter.export.pipeline import verify_folder
-
-    graph = schema.parse(schema.GraphDef, fixture("continuous").read_bytes(), "GraphDef")
-    for each in graph.node:
-        value = each.attr["value"].tensor
-        if each.op == "Const" and len(value.tensor_shape.dim) == 2:
-            value.CopyFrom(from_array((to_array(value) * np.float32(1e-3)).astype(np.float32)))
-    source = tmp_path / "small.bytes"
-    source.write_bytes(schema.serialise(graph))
+    source = nearly_flat(tmp_path)
     (result,) = export([source], ExportOptions(tmp_path / "out", targets=DEFAULTS, verify="none"))
     artefact = opened(kind, result.folder)
     value = artefact.constant("dense/kernel/read")
