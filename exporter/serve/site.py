@@ -13,7 +13,7 @@ from converters.bundle.bundle import Bundle, dumps, writing
 from converters.bundle.embed import runnable
 from converters.bundle.exchange import exchange, stage
 from converters.formats import WRITTEN
-from converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
+from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, TYPES
@@ -172,6 +172,7 @@ def _vendor() -> tuple[dict[str, bytes], list[dict[str, Any]], list[dict[str, st
     missing = [name for name in _REQUIRED if package_version(home, name) is None]
     if missing:
         raise RuntimeUnavailableError(f"the npm package {missing[0]} is not installed", fix=INSTALL_TFJS)
+    check_packages(home)
     files, backends, absent = {"vendor/tf.es2017.min.js": _dist(home, _TFJS, "tf.es2017.min.js")}, [], []
     for backend in _BACKENDS:
         if package_version(home, backend.package) is None:

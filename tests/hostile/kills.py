@@ -117,7 +117,9 @@ def kill(count: int, seed: int, home: Path) -> Kills:
     done = Kills(home, [], Counter(), {})
     rng = random.Random(seed)
     for number in range(count):
+        known = len(done.faults)
         done.one(number, rng)
+        print("\n".join(done.faults[known:]), end="\n" if done.faults[known:] else "", file=sys.stderr, flush=True)
         if (number + 1) % 25 == 0:
             print(f"{number + 1} of {count}, {len(done.faults)} faults", file=sys.stderr, flush=True)
     return done

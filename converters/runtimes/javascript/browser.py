@@ -20,6 +20,7 @@ from converters.runtimes.javascript.node import (
     INSTALL_TFJS,
     JS_SOURCE,
     SPEEDS,
+    check_packages,
     install_packages,
     js_home,
     node_executable,
@@ -94,6 +95,7 @@ def _command(name: str) -> list[str]:
             f"{what} is not installed",
             fix=INSTALL_NODE if node is None else f"{INSTALL_CHROMIUM}, or let {CHROMIUM_VARIABLE} name it",
         )
+    check_packages(js_home())
     script = str(JS_SOURCE / "browser.mjs")
     return [node, script, "--runtime", name, "--modules", str(js_home()), "--chromium", chromium]
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
 from converters.runtimes.cache import built_beside, cache_folder
+from converters.runtimes.checked import check
 from converters.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
@@ -153,6 +154,16 @@ def _has_packages(home: Path) -> bool:
     return all(package_version(home, name) is not None for name in _PACKAGES)
 
 
+def check_packages(home: Path) -> None:
+    """Hold the files that are loaded of the npm packages against ``js/installed.json``, which belongs to the lock.
+
+    A folder that the user names (``EXPORT_MODEL_JS``) is the user's own. Raises RuntimeUnavailableError.
+    """
+    if not os.environ.get(JS_VARIABLE):
+        known: dict[str, str] = json.loads((JS_SOURCE / "installed.json").read_text(encoding="utf-8"))
+        check(home / "node_modules", known, INSTALL_TFJS)
+
+
 def package_version(home: Path, package: str) -> str | None:
     """What an installed npm package calls its version; None where it is not there or not readable."""
     try:
@@ -178,6 +189,7 @@ def _command(name: str) -> list[str]:
     node = node_executable()
     if node is None:
         raise RuntimeUnavailableError("Node is not installed", fix=INSTALL_NODE)
+    check_packages(js_home())
     return [node, str(JS_SOURCE / "runner.mjs"), "--runtime", name, "--modules", str(js_home())]
 
 

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
+from converters.runtimes.checked import check
 from converters.runtimes.python import child_command
 from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
@@ -31,6 +32,7 @@ def _command(release: Release) -> list[str]:
     folder = library_folder(release)
     if not is_whole(folder):
         raise RuntimeUnavailableError(f"the runtime {release.runtime} is not installed", fix=how(release))
+    check(folder, release.libraries, how(release))
     return child_command("converters.runtimes.tensorflow1.child", release.runtime, str(folder / API_LIBRARY))
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,11 +29,31 @@ class Release:
     version: str
     sha256: str
     megabytes: int  # to download
+    #: sha256 of the libraries as they lie in the cache folder (install.py changes one of them)
+    libraries: Mapping[str, str]
 
 
 RELEASES = (
-    Release("tf1.4", "1.4.0", "972724621a25d136799959cd03ef77b0cca6e1799cd3448f05514bc519b735ad", 41),
-    Release("tf1.7", "1.7.1", "6f18752f79f0e037e0e4298d375dabb233394d5dcbf513b35cfb544e5d78b479", 48),
+    Release(
+        "tf1.4",
+        "1.4.0",
+        "972724621a25d136799959cd03ef77b0cca6e1799cd3448f05514bc519b735ad",
+        41,
+        {
+            LIBRARIES[0]: "8e022d7ca068923a6eeaab1b2cffcbfc45abcbd2972d78fb9e5e580de73fdf84",
+            LIBRARIES[1]: "cfedf3c73d4f3c4048ff481b4a744bf9211021468ac93f23b203872b4631200d",
+        },
+    ),
+    Release(
+        "tf1.7",
+        "1.7.1",
+        "6f18752f79f0e037e0e4298d375dabb233394d5dcbf513b35cfb544e5d78b479",
+        48,
+        {
+            LIBRARIES[0]: "7513aba1c20f9f7ad943bf8134bc1af3bb6533a905e916c416c33f3957668609",
+            LIBRARIES[1]: "6a613925c23ad36cbb8706e725c07c29bfd5d5e578aa1d4a139402d3f97d69a4",
+        },
+    ),
 )
 
 
