@@ -1,9 +1,9 @@
 """Installed parts are what was known when this version was made, each time that they are used.
 
-What is looked at is the sha256 of every file that is loaded. It is not computed again for a file that has not changed since
-it was found right: its size, its inode, and the times of its last change, of which ``ctime`` is the system's own. A folder
-that a cache brought back, or somebody wrote to, is read again. It is no help against who can write as the user: that one
-needs no part of ours.
+What is looked at is the sha256 of every file that is loaded. It is not computed again for a file that has not changed
+since it was found right: its size, its inode, and the times of its last change, of which ``ctime`` is the system's own.
+A folder that a cache brought back, or somebody wrote to, is read again. It is no help against who can write as the
+user: that one needs no part of ours.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STAMP = ".export-model-checked.json"
 
 
 def check(folder: Path, known: Mapping[str, str], fix: str) -> None:
-    """Hold the files of ``folder`` against ``known``, their sha256 by their names; what is not there is not loaded either.
+    """Hold the files of ``folder`` against ``known``, their sha256 by their names; what is not there is not loaded.
 
     Raises RuntimeUnavailableError that names the first which is another.
     """

@@ -101,7 +101,8 @@ def _like(value: Any, number: int) -> Any:
     """Another value of the same kind, which a check that looks at one field alone lets pass."""
     groups = (ROLES, DTYPES[:8], ("normal", "uniform", "integer", "mask"), ("continuous", "discrete", "hybrid"))
     if isinstance(value, str):
-        (group,) = [g for g in groups if value in g] or [("a", "b c", "</script>", "it's", "😀", "*/", "`x`", "${x}")]
+        other = ("a", "b c", "</script>", "it's", "😀", "*/", "`x`", "${x}")
+        group = next((g for g in groups if value in g), other)
         return group[number % len(group)]
     if isinstance(value, bool):
         return not value

@@ -77,7 +77,9 @@ class Kills:
             time.sleep(0.05)
         if left:
             self.faults.append(f"{draw}: alive after {PATIENCE:g} s: {left}")
-        if b"Traceback" in said or b"Exception" in said:
+        if b"Traceback" in said and b"/exporter/" not in said:
+            self.seen["interrupted before this program's first line, by Python itself"] += 1
+        elif b"Traceback" in said or b"Exception" in said:
             self.faults.append(f"{draw}: {said.decode(errors='replace')[-800:]}")
         self._look(draw, out, temporary, killed=how is signal.SIGKILL)
         if how is signal.SIGKILL and self._start(out, temporary, "numpy", "next").wait(600) != 0:

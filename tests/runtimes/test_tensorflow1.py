@@ -103,7 +103,9 @@ def known(tmp_path: Path) -> legacy.Release:
 
 
 @pytest.mark.parametrize(("runtime", "release"), list(zip(RUNTIMES, RELEASES, strict=True)))
-def test_what_lies_in_the_cache_is_installed(cache: Path, runtime: Runtime, release: legacy.Release) -> None:
+def test_what_lies_in_the_cache_is_installed(
+    cache: Path, runtime: Runtime, release: legacy.Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
     how = f"export-model runtimes install {release.runtime}"
     assert runtime.find() == RuntimeInfo(release.runtime, False, None, how)
     with pytest.raises(RuntimeUnavailableError) as caught:
@@ -115,6 +117,9 @@ def test_what_lies_in_the_cache_is_installed(cache: Path, runtime: Runtime, rele
     assert not runtime.find().installed  # half of it is none
     (folder / LIBRARIES[1]).write_bytes(b"")
     assert runtime.find() == RuntimeInfo(release.runtime, True, release.version, how)
+    with pytest.raises(RuntimeUnavailableError, match="is not the file that was installed"):
+        runtime.command()
+    monkeypatch.setattr("converters.runtimes.tensorflow1.found.check", lambda *known: None)
     assert runtime.command()[-2:] == [release.runtime, str(folder / API_LIBRARY)]
 
 

@@ -1,4 +1,4 @@
-"""``python -m tests.runtimes.write_installed``: the sha256 of the npm packages' files that are loaded, for the lock as it is.
+"""``python -m tests.runtimes.write_installed``: the sha256 of what is loaded of the npm packages in the lock.
 
 After a change of ``package-lock.json``, in a checkout whose node_modules were just installed from it.
 """

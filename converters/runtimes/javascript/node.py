@@ -154,14 +154,17 @@ def _has_packages(home: Path) -> bool:
     return all(package_version(home, name) is not None for name in _PACKAGES)
 
 
-def check_packages(home: Path) -> None:
+def check_packages(home: Path) -> bool:
     """Hold the files that are loaded of the npm packages against ``js/installed.json``, which belongs to the lock.
 
-    A folder that the user names (``EXPORT_MODEL_JS``) is the user's own. Raises RuntimeUnavailableError.
+    False, and not held against anything, is a folder that the user names (``EXPORT_MODEL_JS``): its packages are the
+    user's own. Raises RuntimeUnavailableError.
     """
-    if not os.environ.get(JS_VARIABLE):
-        known: dict[str, str] = json.loads((JS_SOURCE / "installed.json").read_text(encoding="utf-8"))
-        check(home / "node_modules", known, INSTALL_TFJS)
+    if os.environ.get(JS_VARIABLE):
+        return False
+    known: dict[str, str] = json.loads((JS_SOURCE / "installed.json").read_text(encoding="utf-8"))
+    check(home / "node_modules", known, INSTALL_TFJS)
+    return True
 
 
 def package_version(home: Path, package: str) -> str | None:
@@ -189,8 +192,8 @@ def _command(name: str) -> list[str]:
     node = node_executable()
     if node is None:
         raise RuntimeUnavailableError("Node is not installed", fix=INSTALL_NODE)
-    check_packages(js_home())
-    return [node, str(JS_SOURCE / "runner.mjs"), "--runtime", name, "--modules", str(js_home())]
+    known = ["--known"] if check_packages(js_home()) else []
+    return [node, str(JS_SOURCE / "runner.mjs"), "--runtime", name, "--modules", str(js_home()), *known]
 
 
 def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Runtime:

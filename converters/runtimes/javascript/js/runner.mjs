@@ -1,9 +1,10 @@
 /**
  * Runs models in a JavaScript runtime for a parent process, over frames on stdin and stdout (serve.mjs, frames.mjs).
  *
- *     node runner.mjs --runtime tfjs-cpu|tfjs-wasm|onnxruntime-web --modules DIR
+ *     node runner.mjs --runtime tfjs-cpu|tfjs-wasm|onnxruntime-web --modules DIR [--known]
  *
- * DIR holds node_modules with the packages of package.json; this file may lie elsewhere, as in site-packages. Ends with
+ * DIR holds node_modules with the packages of package.json; this file may lie elsewhere, as in site-packages. With
+ * --known nothing else of them is run than what installed.json lists. Ends with
  * status 0 at the end of stdin, 1 where the frames cannot be followed any more (a last answer says so), 2 on a bad
  * command line.
  */
@@ -13,6 +14,7 @@ import { parseArgs } from "node:util";
 import { Worker } from "node:worker_threads";
 
 import { FramingError, takeStdout } from "./frames.mjs";
+import { onlyKnown } from "./installed.mjs";
 import { serve } from "./serve.mjs";
 
 /** Each is imported by the first request: a process holds one runtime and needs no other's code. */
@@ -23,11 +25,12 @@ const RUNTIMES = {
 };
 
 function commandLine() {
-  const { values } = parseArgs({ options: { runtime: { type: "string" }, modules: { type: "string" } } });
-  const { runtime = "", modules } = values;
+  const text = { type: "string" };
+  const { values } = parseArgs({ options: { runtime: text, modules: text, known: { type: "boolean" } } });
+  const { runtime = "", modules, known = false } = values;
   if (!Object.hasOwn(RUNTIMES, runtime)) throw new Error(`--runtime must be one of ${Object.keys(RUNTIMES)}`);
   if (modules === undefined) throw new Error("--modules DIR is missing: the folder that holds node_modules");
-  return { runtime, modules };
+  return { runtime, modules, known };
 }
 
 /**
@@ -49,7 +52,11 @@ async function main() {
     return 2;
   }
   try {
-    await serve(() => RUNTIMES[options.runtime](options.modules), write);
+    const start = async () => {
+      if (options.known) onlyKnown(options.modules);
+      return RUNTIMES[options.runtime](options.modules);
+    };
+    await serve(start, write);
     return 0;
   } catch (error) {
     console.error(`runner.mjs: ${error instanceof FramingError ? error.message : error.stack}`);
