@@ -139,7 +139,7 @@ def test_another_machine_is_told_so(
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr("platform.machine", lambda: machine)
     monkeypatch.setattr("os.confstr", lambda name: libc, raising=False)
-    assert RUNTIMES[0].find() == RuntimeInfo("tf1.4", False, None, NOT_HERE)
+    assert RUNTIMES[0].find() == RuntimeInfo("tf1.4", False, None, NOT_HERE, supported=False)
     with pytest.raises(RuntimeUnavailableError, match="does not run here") as caught:
         install(RELEASE, quiet)
     assert caught.value.why == NOT_HERE
