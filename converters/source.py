@@ -55,7 +55,8 @@ class SourceModel:
     """One model of a source (a run folder has one per behavior; a graph may still hold several brains).
 
     ``name`` is the policy's name where the path does not give it; ``files`` are the files that were read, for the
-    hash of the source. ``original`` is None where no runtime reads the source (a ``.nn``).
+    hash of the source. ``original`` is None where no runtime reads the source (a ``.nn``). ``producer`` is what the
+    file says of the tool that wrote it, and in which version of the format.
     """
 
     graph: Graph
@@ -63,6 +64,7 @@ class SourceModel:
     facts: SourceFacts = field(default_factory=SourceFacts)
     name: str | None = None
     original: OriginalRun | None = None
+    producer: str = ""
 
 
 @dataclass(frozen=True, slots=True)

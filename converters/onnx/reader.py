@@ -48,6 +48,7 @@ class OnnxModel:
     producer: str
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
+    opset: int
     draws: tuple[str, ...] = ()
     batch: int | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
@@ -87,6 +88,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
         f"{model.producer_name} {model.producer_version}".strip(),
         {v.name: importer.values[v.name] for v in declared},
         outputs,
+        opsets[""],
         tuple(importer.draws),
         batch,
         {p.key: p.value for p in model.metadata_props},

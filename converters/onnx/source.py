@@ -16,4 +16,5 @@ def read(given: Fetched) -> list[SourceModel]:
     model = read_onnx(given)
     graph, facts = understood(model)
     original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)})
-    return [SourceModel(graph, model.files, facts, original=original)]
+    producer = f"{model.producer}, opset {model.opset}" if model.producer else f"opset {model.opset}"
+    return [SourceModel(graph, model.files, facts, original=original, producer=producer)]

@@ -11,6 +11,7 @@ import click
 from exporter.cli.export import export_command
 from exporter.cli.group import PROGRAM, Command
 from exporter.cli.serve import serve_command
+from exporter.cli.terminal import say
 from signatures.errors import RuntimeUnavailableError
 
 
@@ -46,11 +47,12 @@ def demo_command(out: Path, no_open: bool) -> None:
     except RuntimeUnavailableError as error:
         import webbrowser
 
-        click.echo(f"the page needs TensorFlow.js, so this is the report: {report}\n  to see it act: {error.fix}")
+        say(f"the page needs TensorFlow.js, so this is the report: {report}")
+        say(f"next: {error.fix}    (then: {PROGRAM} serve {out / BALL.stem} --open)")
         webbrowser.open(report.resolve().as_uri())
 
 
 def _typed(command: click.Command, *words: str) -> None:
     """Run a command, shown as a user would type it."""
-    click.secho(f"$ {PROGRAM} {shlex.join(words)}", bold=True)
+    say(f" {PROGRAM} {shlex.join(words)}", mark="$", colour="cyan")
     command.main([w for w in words if w != command.name], PROGRAM, standalone_mode=False)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from exporter.cli.group import Command
 from exporter.cli.options import activating, read_options, trusting, understanding
 from exporter.cli.terminal import say, say_json, say_lines
-from signatures.errors import UsageError
+from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
+    from converters.source import ReadOptions
 
 
 @click.command(
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
         ("export-model inspect 3DBall.nn --svg 3DBall.svg", "a picture"),
     ),
 )
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SOURCE...")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 )
 @understanding
 def inspect_command(
-    source: Path,
+    sources: tuple[Path, ...],
     step: int | None,
     sensors: str,
     activation: str | None,
@@ -65,30 +66,56 @@ def inspect_command(
     svg: Path | None,
     compiling: CompileOptions,
 ) -> None:
-    """Show what is in a file: generation, brains, inputs and what to feed, outputs, ops, targets.
+    """Show what is in a file: generation, brains, inputs and what to feed, outputs, layers, targets.
 
     With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
     """
-    if releases:
-        sys.exit(_unity(source, releases, sensors, actions, brain_parameters, as_json, svg))
-    if actions or brain_parameters is not None:
+    if len(sources) > 1 and (logdir is not None or svg is not None):
+        raise UsageError("--logdir and --svg are for one source", fix="name one")
+    if not releases and (actions or brain_parameters is not None):
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
+    status, found = 0, list[dict[str, Any]]()
+    for source in sources:
+        try:
+            if releases:
+                answer, report = _unity(source, releases, sensors, actions, brain_parameters, as_json, svg)
+                found.append(report)
+                status = max(status, answer)
+            else:
+                given = read_options(step, sensors, trust_source, activation)
+                found.append(_inspected(source, compiling, given, logdir, svg, as_json))
+        except ExportModelError as error:
+            if len(sources) == 1:
+                raise
+            say(f"error: {error.message}", err=True)
+            found.append({"path": str(source), **error.to_dict()})
+            status = 2
+    if as_json:
+        say_json(found[0] if len(sources) == 1 else {"sources": found})
+    elif not releases and status == 0:
+        step_given = "" if step is None else f" --step {step}"
+        say(f"next: export-model {' '.join(map(str, sources))}{step_given} -o exported")
+    if status:
+        sys.exit(status)
+
+
+def _inspected(
+    source: Path, compiling: CompileOptions, read: ReadOptions, logdir: Path | None, svg: Path | None, as_json: bool
+) -> dict[str, Any]:
+    """Say what is in a source, unless it is all for a program, which gets what is returned."""
     from exporter.inspect.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, compiling, read_options(step, sensors, trust_source, activation))
+    found = inspect_source(source, compiling, read)
     written: list[Path] = []
     if logdir is not None or svg is not None:
         from exporter.inspect.pictures import write_pictures
 
         written = write_pictures(found, logdir, svg)
-    if as_json:
-        shown = {"written": [str(path) for path in written]} if written else {}
-        say_json({**found.to_dict(), **shown})
-        return
-    say_lines(inspection_text(found))
-    for path in written:
-        say(f"wrote {path}")
-    say(f"next: export-model {source}{'' if step is None else f' --step {step}'} -o exported")
+    if not as_json:
+        say_lines(inspection_text(found))
+        for path in written:
+            say(f"wrote {path}")
+    return {**found.to_dict(), **({"written": [str(path) for path in written]} if written else {})}
 
 
 def _unity(
@@ -99,7 +126,7 @@ def _unity(
     parameters: Path | None,
     as_json: bool,
     svg: Path | None,
-) -> int:
+) -> tuple[int, dict[str, Any]]:
     from exporter.inspect.unity import accepted, check_for_unity, unity_report, unity_text
 
     verdicts = check_for_unity(source, releases, sensors, actions, parameters)
@@ -111,8 +138,6 @@ def _unity(
 
         with writing(svg):
             svg.write_text(behavior_parameters(verdicts[0]), encoding="utf-8")
-    if as_json:
-        say_json(unity_report(verdicts))
-    else:
+    if not as_json:
         say_lines(unity_text(verdicts))
-    return 0 if accepted(verdicts) else 1
+    return 0 if accepted(verdicts) else 1, unity_report(verdicts)

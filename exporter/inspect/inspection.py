@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from converters.format import Format, WriteOptions
 from converters.formats import WRITTEN
 from converters.graph.nodes import Graph
@@ -16,6 +18,7 @@ from converters.policy import Policy
 from converters.source import ReadOptions
 from exporter.cli.tables import paragraph, size_text, table
 from exporter.export.sources import read_source
+from exporter.reports.layers import blocks_of, chain
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError, naming
 from signatures.fields import printable
@@ -45,6 +48,12 @@ _MEANING = {
 }
 
 
+#: More nodes than this are no chain of layers that anybody would read.
+_MOST_NODES = 600
+#: Numbers of an observation whose statistics are shown.
+_MOST_STATISTICS = 12
+
+
 @dataclass(frozen=True, slots=True)
 class PolicyInspection:
     """One policy of a source."""
@@ -53,6 +62,10 @@ class PolicyInspection:
     ops: Mapping[str, int]
     #: target → None where it can be written, else why not
     targets: Mapping[str, str | None]
+    #: numbers that it holds: weights, and the statistics of its normaliser
+    parameters: int = 0
+    #: action → the layers from an observation to it, in words
+    layers: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         able = [target for target, reason in self.targets.items() if reason is None]
@@ -63,6 +76,8 @@ class PolicyInspection:
         return {
             "name": self.policy.name,
             **self.policy.signature.to_dict(),
+            "parameters": self.parameters,
+            "layers": dict(self.layers),
             "ops": dict(self.ops),
             "targets": {t: {"ok": reason is None, "reason": reason} for t, reason in self.targets.items()},
         }
@@ -80,6 +95,8 @@ class Inspection:
     policies: Sequence[PolicyInspection]
     #: (name, graph) of every model in it, as it was read
     graphs: Sequence[tuple[str, Graph]] = field(default_factory=tuple, repr=False)
+    #: what the file says of the tool that wrote it
+    producer: str = ""
 
     def __repr__(self) -> str:
         names = ", ".join(repr(p.policy.name) for p in self.policies[:4])
@@ -101,6 +118,7 @@ class Inspection:
             "sha256": self.sha256,
             "bytes": self.size,
             "nodes": self.nodes,
+            "producer": self.producer,
             "policies": [p.to_dict() for p in self.policies],
         }
 
@@ -113,9 +131,10 @@ def inspect_source(
     found = []
     for policy in source.policies(options):
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
-        found.append(
-            PolicyInspection(policy, ops, {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()})
-        )
+        targets = {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()}
+        with naming(source.path):
+            layers = _layers(policy)
+        found.append(PolicyInspection(policy, ops, targets, _parameters(policy.graph), layers))
     return Inspection(
         source.path,
         source.format.label,
@@ -124,7 +143,24 @@ def inspect_source(
         sum(len(m.graph.nodes) for m in source.models),
         found,
         [(safe_name(source.stem(m)), m.graph) for m in source.models],
+        "; ".join(dict.fromkeys(m.producer for m in source.models if m.producer)),
     )
+
+
+def _parameters(graph: Graph) -> int:
+    values = [n.value for n in graph.nodes if n.value is not None]
+    return sum(v.size for v in values if v.ndim and v.dtype.kind == "f")
+
+
+def _layers(policy: Policy) -> dict[str, str]:
+    """Action → ``8 → normalise → 32 swish → 2``; nothing of a graph that is too large to be drawn."""
+    signature, graph = policy.signature, policy.graph
+    if sum(n.value is None for n in graph.nodes) > _MOST_NODES:
+        return {}
+    sizes = {s.name: "×".join("?" if n is None else str(n) for n in s.shape[1:]) or "1" for s in signature.inputs}
+    blocks = blocks_of(graph, sizes, [head.name for head in signature.heads])
+    ways = {head.name: chain(blocks, head.name) for head in signature.heads}
+    return {name: " → ".join(sizes.get(word, word) for word in way) for name, way in ways.items()}
 
 
 def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
@@ -142,6 +178,7 @@ def inspection_text(inspection: Inspection) -> str:
     head = (
         f"{inspection.path}: {inspection.kind}, {size_text(inspection.size)}, {inspection.nodes} nodes, "
         f"{len(inspection.policies)} {'policy' if len(inspection.policies) == 1 else 'policies'}"
+        + (f"; {inspection.producer}" if inspection.producer else "")
     )
     return "\n\n".join([printable(head), *(_policy_text(p) for p in inspection.policies)])
 
@@ -158,6 +195,10 @@ def _policy_text(inspected: PolicyInspection) -> str:
         facts.append(f"memory {signature.memory.size}{layout}")
     head = f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}"
     lines = [printable(head), "", "\n\n".join(table(head, rows) for head, rows in _tables(signature))]
+    lines += ["", f"parameters: {inspected.parameters:,}"]
+    for name, way in inspected.layers.items():
+        lines.append(paragraph(way, "layers: " if len(inspected.layers) == 1 else f"layers to {name}: ", "  "))
+    lines += [paragraph(text, f"{name} is normalised by: ", "  ") for name, text in _normalised(signature)]
     lines += map(printable, _label_lines(signature.labels))
     if signature.constants:
         lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
@@ -176,6 +217,19 @@ def _tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[list
     meant = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
     middle = ("dtype", "shape", "in the source")
     return [(("input", *middle, "what to feed"), fed), (("output", *middle, "meaning"), meant)]
+
+
+def _normalised(signature: PolicySignature) -> list[tuple[str, str]]:
+    """Observation → the mean and the deviation that the policy normalises its numbers with."""
+    found = []
+    for spec in signature.observations:
+        known = spec.distribution or {}
+        if "std" in known:
+            pairs = zip(np.atleast_1d(known["mean"]), np.atleast_1d(known["std"]), strict=True)
+            shown = [f"{mean:.3g} ± {std:.3g}" for mean, std in list(pairs)[:_MOST_STATISTICS]]
+            more = np.size(known["std"]) - len(shown)
+            found.append((spec.name, ", ".join(shown) + (f", and {more} more (--json has all)" if more > 0 else "")))
+    return found
 
 
 def _label_lines(labels: Mapping[str, Any]) -> list[str]:

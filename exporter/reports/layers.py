@@ -63,6 +63,25 @@ def blocks_of(graph: Graph, inputs: Iterable[str], outputs: Iterable[str]) -> li
     return _ordered(blocks)
 
 
+def chain(blocks: Sequence[Block], output: str) -> list[str]:
+    """The way with the most layers from an input to ``output``, in a few words each: "normalise", "32 swish", "2"."""
+    best: list[tuple[int, int | None]] = []
+    for block in blocks:
+        before = max(block.before, key=lambda i: best[i][0], default=None)
+        best.append(((0 if before is None else best[before][0]) + _starts(block), before))
+    place = next((i for i, b in enumerate(blocks) if b.kind == "output" and b.title == output), None)
+    words: list[str] = []
+    while place is not None:
+        block = blocks[place]
+        if block.kind == "input":
+            words.append(block.title)
+        elif _starts(block) or block.title.startswith(("normalise", "draw")):
+            title, *rest = block.title.split(", ")
+            words.append(" ".join([title.removeprefix("dense "), *(w for w in rest if w != "clip")]))
+        place = best[place][1]
+    return words[::-1]
+
+
 def _joined(blocks: list[Block], graph: Graph) -> bool:
     """Join one pair of boxes that say little apart; False where there is none left.
 

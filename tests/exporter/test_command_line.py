@@ -24,6 +24,7 @@ from exporter.cli.app import app
 from exporter.cli.console import Console
 from exporter.cli.group import GROUPS, Command
 from fixtures import path as fixture
+from fixtures.trained import run_folder as trained_run
 from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder, sampled_policy
 
@@ -273,12 +274,34 @@ def test_inspection_says_what_to_feed_and_what_comes_out() -> None:
 def test_inspection_as_json_has_the_contract_of_each_policy() -> None:
     ran = export_model("inspect", fixture("recurrent"), "--json")
     assert (ran.status, ran.err) == (0, "")
-    assert set(ran.json) == {"schema", "path", "kind", "sha256", "bytes", "nodes", "policies"}
+    assert set(ran.json) == {"schema", "path", "kind", "sha256", "bytes", "nodes", "producer", "policies"}
     policy = ran.json["policies"][0]
     assert policy["memory"] == {"size": 32, "input": "recurrent_in", "output": "recurrent_out", "layout": ["c", "h"]}
     assert policy["branches"] == [3, 2]
     assert policy["targets"] == {t: {"ok": True, "reason": None} for t in WRITTEN}
     assert policy["ops"]["Placeholder"] == 4
+
+
+def test_inspection_tells_the_layers_the_parameters_and_the_normaliser() -> None:
+    ran = export_model("inspect", trained_run("3DBall"), ROOT / "fixtures/sb3/torch_actor.onnx")
+    assert ran.status == 0
+    assert "layers: 8 → normalise → 32 swish → 32 swish → 2\n" in ran.out
+    assert "parameters: 2,809\n" in ran.out
+    assert "state is normalised by: 0.00314 ± 0.0613, " in ran.out
+    assert "; pytorch 2.13.0+cpu, opset 20\n" in ran.out
+    assert ran.out.count("next: ") == 1
+    policy = export_model("inspect", fixture("recurrent"), "--json").json["policies"][0]
+    assert policy["layers"] == {"action": "6 → 32 swish → LSTM 16 → 2"}
+
+
+def test_of_several_sources_one_that_is_refused_does_not_stop_the_others(tmp_path: Path) -> None:
+    ran = export_model("inspect", "nothing.bytes", BALL)
+    assert ran.status == 2
+    assert "policy continuous" in ran.out
+    assert "nothing.bytes: no such file" in ran.err
+    first, second = export_model("inspect", "nothing.bytes", BALL, "--json").json["sources"]
+    assert (first["error"], second["policies"][0]["name"]) == ("SourceError", "continuous")
+    is_refused(export_model("inspect", BALL, BALL, "--svg", tmp_path / "a.svg"), "for one source")
 
 
 def test_inspection_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
