@@ -16,6 +16,7 @@ from converters import schema
 from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph
+from converters.graph.ops.base import MISFIT
 from converters.keras.config import config_of, refuse_code
 from converters.keras.frozen import frozen_by_tensorflow
 from converters.keras.hdf5 import stored_in
@@ -81,7 +82,10 @@ def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str
         net = Network(version)
         signature = net.whole(model_of(config), weights)
         graph, roles = expose(net.graph(), signature)
-    except (AttributeError, KeyError, IndexError, StopIteration, TypeError, ValueError, RecursionError) as error:
+    except UnknownLayerError as error:
+        error.fix = error.fix or "save the model without that layer, or give a SavedModel or an ONNX of it"
+        raise
+    except (*MISFIT, StopIteration, RecursionError) as error:
         raise DamagedFileError(
             "its layers are not in Keras' form", why=f"{type(error).__name__}: {error}"[:200], fix=_SAVE_AGAIN
         ) from error
@@ -99,7 +103,11 @@ def of_web_model(files: tuple[Path, ...], topology: Mapping[str, Any], weights: 
     """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``. Raises what ``layered`` raises."""
     config = topology.get("model_config") or topology
     version = str(topology.get("keras_version") or "tfjs-layers")
-    return layered(files, json.loads(config) if isinstance(config, str) else config, weights, version)
+    try:
+        config = json.loads(config) if isinstance(config, str) else config
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
+    return layered(files, config, weights, version)
 
 
 def _beside_keras(model: SourceModel, path: Path) -> SourceModel:

@@ -100,7 +100,7 @@ def _whole(value: Any, name: str) -> tuple[int, ...]:
     found = value if isinstance(value, list) else re.findall(r"-?\d+", str(value))
     try:
         numbers = tuple(int(n) for n in found)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DamagedFileError(f"the shape of its {name} is none", why=str(error)[:80], fix=_SAVE_AGAIN) from error
     if len(numbers) > 1000 or any(not 0 <= n < 1 << 31 for n in numbers):
         raise DamagedFileError(f"the shape of its {name} is none", why=str(numbers)[:80], fix=_SAVE_AGAIN)

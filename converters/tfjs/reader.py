@@ -134,13 +134,27 @@ def _refuse_functions(topology: Mapping[str, Any]) -> None:
 
 
 def weights_of(model: Mapping[str, Any], given: Fetched) -> tuple[dict[str, np.ndarray], list[Path]]:
-    """(name → value, the shards)."""
-    folder = model_file(given.path).parent
-    manifest: Sequence[Mapping[str, Any]] = model.get("weightsManifest") or []
+    """(name → value, the shards). Raises DamagedFileError, SourceError."""
+    try:
+        return _weights(model.get("weightsManifest") or [], given, model_file(given.path).parent)
+    except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError) as error:
+        raise _damaged(f"{MODEL}: its weightsManifest is none", f"{type(error).__name__}: {error}"[:200]) from error
+
+
+def _weights(
+    manifest: Sequence[Mapping[str, Any]], given: Fetched, folder: Path
+) -> tuple[dict[str, np.ndarray], list[Path]]:
     found: dict[str, np.ndarray] = {}
     files: list[Path] = []
+    known: set[Path] = set()
     for group in manifest:
-        paths = [shard(folder, name) for name in group["paths"]]
+        paths = []
+        for name in group["paths"]:
+            paths.append(shard(folder, name))
+            place = paths[-1].resolve()
+            if place in known:  # a file that is named again and again would be any amount of memory
+                raise _damaged(f"the weights {name[:120]!r} are named twice")
+            known.add(place)
         files.extend(paths)
         data = b"".join(_bytes(given, p) for p in paths)
         at = 0

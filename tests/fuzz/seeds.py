@@ -182,6 +182,57 @@ def _keras() -> list[Files]:
     return [{"config.json": config, "metadata.json": b"{}", "model.weights.h5": b""}]
 
 
+def _web_layers() -> list[Files]:
+    """TensorFlow.js layers models: a chain, and a model of several inputs."""
+
+    def layer(kind: str, **config: Any) -> dict[str, Any]:
+        return {"class_name": kind, "config": {"name": kind.lower(), "trainable": True, "dtype": "float32", **config}}
+
+    def weight(name: str, *shape: int) -> dict[str, Any]:
+        return {"name": name, "shape": list(shape), "dtype": "float32"}
+
+    def model(kind: str, config: dict[str, Any], weights: list[dict[str, Any]]) -> Files:
+        count = sum(int(np.prod(w["shape"])) for w in weights)
+        topology = {"keras_version": "tfjs-layers 4.22.0", "backend": "tensor_flow.js", "model_config": None}
+        topology["model_config"] = {"class_name": kind, "config": config}  # type: ignore[assignment]
+        manifest = [{"paths": ["weights.bin"], "weights": weights}]
+        content = {"format": "layers-model", "modelTopology": topology, "weightsManifest": manifest}
+        data = np.linspace(-1, 1, count, dtype=np.float32).tobytes()
+        return {"model.json": json.dumps(content).encode(), "weights.bin": data}
+
+    dense = layer("Dense", units=2, activation="tanh", use_bias=True)
+    chain = [
+        layer("Conv2D", filters=2, kernel_size=[2, 2], strides=[1, 1], padding="same", data_format="channels_last",
+              activation="relu", use_bias=True, batch_input_shape=[None, 4, 4, 1]),
+        layer("MaxPooling2D", pool_size=[2, 2], strides=[2, 2], padding="valid", data_format="channels_last"),
+        layer("Flatten"),
+        dense,
+    ]  # fmt: skip
+    steps = [
+        layer("LSTM", units=2, activation="tanh", recurrent_activation="sigmoid", use_bias=True, return_sequences=False,
+              batch_input_shape=[None, 3, 2]),
+        dense,
+    ]  # fmt: skip
+    given = layer("InputLayer", batch_input_shape=[None, 3], sparse=False)
+    add = layer("Add")
+    nodes = [(given, []), (dense, [["inputlayer", 0, 0, {}]]), (add, [["dense", 0, 0, {}], ["dense", 0, 0, {}]])]
+    layers = [{**x, "name": x["config"]["name"], "inbound_nodes": [i] if i else []} for x, i in nodes]
+    ends = {"input_layers": [["inputlayer", 0, 0]], "output_layers": [["add", 0, 0]]}
+    kernel = [weight("dense/kernel", 8, 2), weight("dense/bias", 2)]
+    recurrent = [weight("lstm/kernel", 2, 8), weight("lstm/recurrent_kernel", 2, 8), weight("lstm/bias", 8)]
+    return [
+        model("Sequential", {"name": "s", "layers": chain},
+              [weight("conv2d/kernel", 2, 2, 1, 2), weight("conv2d/bias", 2), *kernel]),
+        model("Sequential", {"name": "s", "layers": steps},
+              [*recurrent, weight("dense/kernel", 2, 2), weight("dense/bias", 2)]),
+        model("Model", {"name": "m", "layers": layers, **ends}, [weight("dense/kernel", 3, 2), kernel[1]]),
+    ]  # fmt: skip
+
+
+def _saved_zips() -> list[Files]:
+    return [{"policy.zip": f.read_bytes()} for f in sorted((FOLDER / "sb3_zip").glob("*.zip"))]
+
+
 # ------------------------------------------------------------------ changes
 
 
@@ -381,6 +432,16 @@ def _opcodes_of_row(data: bytes) -> list[bytes]:
     return found
 
 
+def _saved_zip(files: Files, random: Random) -> Files:
+    with zipfile.ZipFile(io.BytesIO(files["policy.zip"])) as archive:
+        entries = {e.filename: archive.read(e) for e in archive.infolist()}
+    if random.random() < 0.6:
+        entries["data"] = _json(entries["data"], random)
+    else:
+        entries["policy.pth"] = _pickled({"policy.pt": entries["policy.pth"]}, random)["policy.pt"]
+    return {"policy.zip": zipped(entries)}
+
+
 def zipped(entries: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     """A ZIP archive, the same bytes for the same entries."""
     made = io.BytesIO()
@@ -467,8 +528,10 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "checkpoint", Reader(_checkpoints, _checkpoint)
     yield "PyTorch", Reader(_torch, _pickled, "policy.pt")
     yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), _tfjs)
+    yield "layers model", Reader(_web_layers, _tfjs)
+    yield "Stable-Baselines3", Reader(_saved_zips, _saved_zip, "policy.zip")
     yield "bundle", Reader(_bundles, _bundle, takes="bundle")
-    yield "Keras", Reader(_keras, _keras_config, "policy.keras")
+    yield "Keras", Reader(_keras, _keras_config, "policy.keras", takes="configuration")
     yield "recording", Reader(_recordings, _recording, takes="recording")
 
 
@@ -484,7 +547,10 @@ def mutant(reader: str, number: int) -> Files:
     random = Random(f"{reader} {number}")
     seeds = _seeds(reader)
     (seed,) = random.choices(seeds, [1 / sum(map(len, files.values())) for files in seeds])
-    return READERS[reader].change(seed, random)
+    try:
+        return READERS[reader].change(seed, random)
+    except RecursionError:  # JSON that was nested again and again
+        return READERS[reader].change(seed, Random(f"{reader} {number} again"))
 
 
 @cache

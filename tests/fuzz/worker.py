@@ -22,6 +22,9 @@ from typing import Any
 
 from converters.bundle.bundle import Bundle
 from converters.formats import WRITTEN
+from converters.keras.config import config_of, refuse_code
+from converters.keras.source import layered
+from converters.keras.weights import Groups
 from converters.read import ports_of
 from exporter import load_policy
 from exporter.export.pipeline import ExportOptions, export
@@ -88,10 +91,19 @@ def _signature(data: bytes) -> PolicySignature:
         return inspect_source(file).policies[0].policy.signature
 
 
+def _configuration(path: Path, out: Path) -> None:
+    """What is asked of a ``.keras`` before a process reads its weights, and of its layers without any."""
+    with naming(path):
+        config = config_of(path)
+        refuse_code(config)
+        layered((path,), config, Groups({}), "3.0.0")
+
+
 COMMANDS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {
     "source": (_source, _candidate, _exported),
     "bundle": (_source, _bundle, _candidate),
     "recording": (_recording,),
+    "configuration": (_configuration,),
 }
 
 

@@ -38,7 +38,7 @@ def _cell(step: Step, kind: str, width: int) -> _Cell:
     kernel, inner = step.take(width, gates * units), step.take(units, gates * units)
     bias = step.take() if step.get("use_bias", True) else None
     if bias is not None and bias.shape[-1:] != (gates * units,):
-        raise DamagedFileError(f"the bias of the layer {step.path!r} has the shape {list(bias.shape)}")
+        raise DamagedFileError(f"the bias of the layer {step.path!r} has the shape {list(bias.shape)}", fix=_SAVE_AGAIN)
     activation = activation_of(step, step.get("activation", "tanh"))
     older = "hard_sigmoid" if step.is_tfjs else "sigmoid"
     gate = activation_of(step, step.get("recurrent_activation", older))
@@ -87,6 +87,7 @@ def _gru(
 
 
 #: Gates of each cell.
+_SAVE_AGAIN = "save the model again"
 _CELLS = {"LSTM": 4, "LSTMCell": 4, "GRU": 3, "GRUCell": 3, "SimpleRNN": 1, "SimpleRNNCell": 1}
 
 
@@ -106,7 +107,7 @@ def _cells(step: Step, width: int) -> list[_Cell]:
 def _recurrent(step: Step) -> list[str]:
     b, x = step.net, step.x
     if step.rank != 3:
-        raise DamagedFileError(f"the layer {step.path!r} is given {step.rank} axes, not [B, T, n]")
+        raise DamagedFileError(f"the layer {step.path!r} is given {step.rank} axes, not [B, T, n]", fix=_SAVE_AGAIN)
     if step.kwargs.get("mask") is not None:
         raise UnsupportedOpError("it is given a mask")
     step.refuse_unless("time_major", False, None)
@@ -122,7 +123,9 @@ def _recurrent(step: Step) -> list[str]:
     elif not given:
         states = [b.add("Fill", [b.vector([rows, w]), b.const(np.zeros((), FLOAT32), "zero")]) for w in widths]
     if [b.length(s, -1) for s in states] != widths:
-        raise DamagedFileError(f"the layer {step.path!r} has states of {widths} numbers, and is given others")
+        raise DamagedFileError(
+            f"the layer {step.path!r} has states of {widths} numbers, and is given others", fix=_SAVE_AGAIN
+        )
     turns = range(steps - 1, -1, -1) if step.get("go_backwards") else range(steps)
     outputs = []
     for turn in turns:
