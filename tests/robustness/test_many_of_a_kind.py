@@ -1,0 +1,121 @@
+"""Files of more nodes than any policy has, and of one node with very many inputs: refused or read, at once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from converters import schema
+from converters.barracuda import format as nn
+from converters.frozen_graph.reader import read_graph
+from exporter.export.sources import read_source
+from signatures.errors import DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
+from tests.barracuda.nn_files import write_nn
+from tests.handmade import constant, continuous_policy, graph_bytes, node
+from tests.hostile import zoo
+
+MANY = 60
+
+
+def frozen(folder: Path) -> Path:
+    return zoo.frozen(folder, [*continuous_policy(), *(constant(f"c{i}", 1.0) for i in range(MANY))])
+
+
+def functions(folder: Path) -> Path:
+    return zoo.saved(folder, zoo.calling([constant(f"c{i}", 1.0) for i in range(MANY)], ()), "called:0")
+
+
+def onnx(folder: Path) -> Path:
+    from onnx import helper
+
+    path = folder / "policy.onnx"
+    path.write_bytes(zoo.onnx_policy([helper.make_node("Relu", ["obs_0"], [f"o{i}"]) for i in range(MANY)]))
+    return path
+
+
+def web(folder: Path) -> Path:
+    nodes = [{"name": f"n{i}", "op": "Placeholder"} for i in range(MANY)]
+    (folder / "model.json").write_text(json.dumps({"modelTopology": {"node": nodes}, "weightsManifest": []}))
+    return folder
+
+
+@pytest.mark.parametrize("make", [frozen, functions, onnx, web])
+def test_more_nodes_than_any_file_has_are_refused(
+    make: Callable[[Path], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make(tmp_path)
+    monkeypatch.setattr(schema, "MAX_NODES", MANY - 1)
+    with pytest.raises(NotAPolicyError, match=f"no more than {MANY - 1} are read"):
+        read_source(path)
+
+
+def test_more_layers_than_any_nn_has_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    import numpy as np
+
+    layers = tuple(nn.Layer(f"l{i}", 50) for i in range(MANY))
+    data = write_nn(nn.NnModel(16, (), (), (), layers, np.zeros(0, np.float32)))
+    assert len(nn.parse(data).layers) == MANY
+    monkeypatch.setattr(nn, "MAX_LAYERS", MANY - 1)
+    with pytest.raises(DamagedFileError, match=f"no more than {MANY - 1} are read"):
+        nn.parse(data)
+
+
+def test_a_node_of_many_inputs_is_put_in_order_once() -> None:
+    """What was looked through again at every input took minutes for these."""
+    count = 60_000
+    graph = read_graph(graph_bytes([*continuous_policy(), node("sum", "AddN", *["mu"] * count)]))
+    assert len(graph["sum"].inputs) == count
+
+
+def test_a_name_of_an_onnx_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(zoo.onnx_policy().replace(b"obs_0", b"ob\xff_0"))
+    with pytest.raises(DamagedFileError, match="no text"):
+        read_source(path)
+
+
+def test_a_shard_that_is_named_twice_is_refused(tmp_path: Path) -> None:
+    manifest = [{"paths": ["w.bin", "./w.bin"], "weights": []}]
+    (tmp_path / "w.bin").write_bytes(b"1234")
+    (tmp_path / "model.json").write_text(json.dumps({"modelTopology": {"node": []}, "weightsManifest": manifest}))
+    with pytest.raises(DamagedFileError, match="named twice"):
+        read_source(tmp_path)
+
+
+@pytest.mark.parametrize("manifest", [7, [None], [{"paths": 7, "weights": []}], [{"paths": ["w.bin"], "weights": [1]}]])
+def test_a_manifest_of_another_form_is_refused(manifest: object, tmp_path: Path) -> None:
+    (tmp_path / "w.bin").write_bytes(b"1234")
+    for topology in ({"node": []}, {"model_config": {}}):
+        (tmp_path / "model.json").write_text(json.dumps({"modelTopology": topology, "weightsManifest": manifest}))
+        with pytest.raises(DamagedFileError, match="weightsManifest"):
+            read_source(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (node("odd", "Switch", "mu"), "does not belong to a loop"),
+        (node("odd", "Mean", "mu", "mu", keep_dims="yes"), "which is no truth value"),
+        (node("odd", "Squeeze", "mu", squeeze_dims=1.5), "which is no integer"),
+        (node("odd", "LeakyRelu", "mu", alpha="x"), "which is no number|does not allow"),
+    ],
+)
+def test_a_node_that_is_not_as_its_op_has_it_is_named(made: object, said: str, tmp_path: Path) -> None:
+    nodes = continuous_policy()
+    nodes[-1].input[0] = "odd"
+    path = zoo.frozen(tmp_path, [*nodes, made])
+    with pytest.raises(GraphError, match=said) as caught:
+        read_source(path).policies()
+    assert "odd" in str(caught.value)
+
+
+def test_an_attribute_of_an_onnx_node_of_another_kind_is_named(tmp_path: Path) -> None:
+    from onnx import helper
+
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(zoo.onnx_policy([helper.make_node("LeakyRelu", ["obs_0"], ["continuous_actions"], alpha="much")]))
+    with pytest.raises(UnsupportedOpError, match="its attribute alpha is 'much'"):
+        read_source(path)
