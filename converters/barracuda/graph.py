@@ -87,7 +87,8 @@ class _Reader:
     def _check_action(self) -> None:
         """Raise DamagedFileError where the action is not as wide as the file says that it is.
 
-        The converter of some 0.7 previews bypassed slices: every branch then holds the numbers of all branches.
+        The converter of some 0.7 previews bypassed slices: every branch then holds the numbers of all branches. Where
+        they could be put back (``slices.py``), it is.
         """
         wanted, action = self.model.number("action_output_shape"), self.values.get("action")
         if not self.model.from_python or wanted is None or action is None or action.size == wanted:

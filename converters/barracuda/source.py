@@ -7,6 +7,7 @@ from dataclasses import replace
 from converters.barracuda.answers import contract_of
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import to_graph
+from converters.barracuda.slices import with_slices
 from converters.barracuda.writer import CONTRACT_KEY, PRODUCER
 from converters.fetch import Fetched
 from converters.source import SourceModel
@@ -22,12 +23,12 @@ _BEFORE_NN = 1
 
 def read(given: Fetched) -> list[SourceModel]:
     """The one model in a file. Raises DamagedFileError, UnsupportedOpError, GraphError or SignatureError."""
-    model = parse(given.data)
+    model, sliced = with_slices(parse(given.data))
     reading = to_graph(model)
     facts = SourceFacts(
         family="ML-Agents 0.7 (preview)" if model.number("version_number") == _BEFORE_NN else None,
         memory_layout=_memory_layout(model),
-        notes=(*_notes(model), *reading.notes),
+        notes=(*_notes(model), *sliced, *reading.notes),
     )
     if model.metadata(CONTRACT_KEY) is not None:
         facts = _told(facts, contract_of(model))

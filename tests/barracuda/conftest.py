@@ -12,9 +12,6 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 #: Written by ML-Agents 0.10.1 under a TensorFlow whose AddV2 its converter did not know.
 BROKEN = "0.10.1tf115-ppo-continuous"
 
-#: A public file of a 0.7 preview, whose converter left out the slices into branches.
-UNSLICED = "zeroblitz36+ml-agents__BananaLearning.nn"
-
 
 def public_files() -> list[Path]:
     """The public ``.nn`` files, and the one that lies under the name .bytes."""

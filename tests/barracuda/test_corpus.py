@@ -13,14 +13,13 @@ from converters.format import WriteOptions
 from converters.formats import WRITTEN
 from converters.graph.run import run_graph
 from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError
 from signatures.roles import Role
-from tests.barracuda.conftest import SHARED, UNSLICED, params, public_files
+from tests.barracuda.conftest import SHARED, params, public_files
 
 pytestmark = pytest.mark.corpus
 
 
-@pytest.mark.parametrize("path", params([p for p in public_files() if p.name != UNSLICED], lambda p: p.name[:70]))
+@pytest.mark.parametrize("path", params(public_files(), lambda p: p.name[:70]))
 def test_a_public_model_compiles_and_is_written_in_four_formats(path: Path, shared: Path) -> None:
     source = read_source(path)
     assert source.format.key == "nn"
@@ -61,13 +60,6 @@ def test_a_public_model_compiles_and_is_written_in_four_formats(path: Path, shar
     for target in WRITTEN:
         artifact = WRITTEN[target].artifact(policy, WriteOptions(json.dumps(signature.to_dict())))
         assert artifact.files
-
-
-def test_the_file_whose_converter_left_out_the_branches_is_refused_with_the_reason(shared: Path) -> None:
-    path = SHARED / "corpus/nn" / UNSLICED
-    with pytest.raises(DamagedFileError, match=r"'action' has 44 numbers, .* says 11") as caught:
-        read_source(path)
-    assert "frozen_graph_def.pb" in (caught.value.fix or "")
 
 
 def test_the_corpus_is_whole(shared: Path) -> None:

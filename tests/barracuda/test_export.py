@@ -15,14 +15,14 @@ from converters.runtimes.pool import RuntimePool
 from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from tests.barracuda.cases import Case, all_cases
-from tests.barracuda.conftest import BROKEN, UNSLICED, genuine_files, params, public_files
+from tests.barracuda.conftest import BROKEN, genuine_files, params, public_files
 from tests.barracuda.test_layers import expected_of, feeds_of, policy_of
 from tests.conftest import NEEDED
 
 pytestmark = pytest.mark.slow
 
 SOURCES = [
-    *(p for p in public_files() if p.name != UNSLICED),
+    *public_files(),
     *(nn for nn, _, case in genuine_files() if nn.parent.name != BROKEN),
 ]
 

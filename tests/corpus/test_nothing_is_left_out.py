@@ -1,4 +1,4 @@
-"""Every public file of ../shared/corpus is exported and verified by one test, or refused for a reason listed here."""
+"""Every public file of ../shared/corpus is exported and verified by one test."""
 
 from __future__ import annotations
 
@@ -6,31 +6,23 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError, ExportModelError
-from tests.barracuda.conftest import UNSLICED, public_files
+from tests.barracuda.conftest import public_files
 from tests.corpus.conftest import SHARED, frozen_corpus
 
 pytestmark = pytest.mark.corpus
 
 CORPUS = SHARED / "corpus"
-#: File → (error, what it says): what holds no policy as it was trained.
-REFUSED: dict[str, tuple[type[ExportModelError], str]] = {
-    UNSLICED: (DamagedFileError, "left out the slices that cut the action into branches"),
-}
 
 
 def covered() -> dict[str, set[Path]]:
     """Who exports and verifies what: the test's module → its files."""
-    refused = {p for p in CORPUS.rglob("*") if p.name in REFUSED}
     return {
         "tests/corpus/test_every_frozen_graph.py": set(frozen_corpus()),
-        "tests/barracuda/test_export.py": set(public_files()) - refused,
+        "tests/barracuda/test_export.py": set(public_files()),
         "tests/onnx_reader/test_every_onnx_model.py": set(CORPUS.glob("onnx/*.onnx")),
         # a run's folder counts as a whole: its checkpoint is exported, what lies beside it is compared with it
         "tests/checkpoint/test_genuine.py": {p for i in CORPUS.glob("ckpt/*/*.index") for p in i.parent.iterdir()},
-        "refused": refused,
     }
 
 
@@ -41,20 +33,10 @@ def test_every_file_is_in_exactly_one_set() -> None:
     assert len(files) > 120
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_is_refused_says_why(name: str, tmp_path: Path) -> None:
-    error, match = REFUSED[name]
-    (path,) = CORPUS.rglob(name)
-    with pytest.raises(error, match=match) as caught:
-        list(export([path], ExportOptions(tmp_path / "out", verify="none")))
-    assert caught.value.fix is not None
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("owner", covered())
 def test_the_sets_hold_policies(owner: str) -> None:
     """A file in a set that no reader takes would make its test fail, but only where all runtimes are installed."""
-    if owner in ("refused", "tests/checkpoint/test_genuine.py"):
+    if owner == "tests/checkpoint/test_genuine.py":
         return
     for path in sorted(covered()[owner]):
         assert read_source(path).models, path

@@ -17,6 +17,7 @@ from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
 from converters.barracuda.layer_builder import node_name
 from converters.graph.nodes import Graph, Node
 from converters.graph.run import run_graph
+from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError
 from tests.unity.conftest import SHARED, lines
 
@@ -112,6 +113,24 @@ def given(model: NnModel, node: Node, recorded: dict[str, np.ndarray], batch: st
     if array.shape[1:3] == (1, 1):
         array = array.reshape(count, -1)
     return array.astype(np.int32) if node.name == "prev_action" else array
+
+
+def test_branches_that_were_cut_again_are_those_that_unity_draws_from(unity_data: Path) -> None:
+    """Of an action without its slices Unity reads the first columns; a branch's draw depends on their ratios alone."""
+    (file,) = (name for name in REFUSED if "BananaLearning" in name)
+    (policy,) = read_source(SHARED / file).policies()
+    assert policy.signature.branches == (3, 3, 3, 2)
+    assert any("put back (3, 3, 3, 2)" in note for note in policy.signature.notes)
+    row = next(r for r in ROWS if r["file"] == file)
+    with np.load(unity_data / "nn_outputs" / row["npz"]) as arrays:
+        inputs = {name: arrays[f"b3/in/{name}"].reshape(3, -1) for name in ("vector_observation", "action_masks")}
+        columns = arrays["b3/out/action"].reshape(3, -1)[:, :11]
+    feeds = {"state": inputs["vector_observation"], "action_masks": inputs["action_masks"]}
+    got = run_graph(policy.graph, feeds, ["action"])["action"]
+    for first, last in ((0, 3), (3, 6), (6, 9), (9, 11)):
+        allowed = inputs["action_masks"][:, first:last]
+        wanted = np.exp(columns[:, first:last]) / np.exp(columns[:, first:last]).sum(axis=1, keepdims=True)
+        np.testing.assert_allclose(np.exp(got[:, first:last]) * allowed, wanted * allowed, atol=1e-6)
 
 
 def test_every_recorded_file_is_there(unity_data: Path) -> None:
