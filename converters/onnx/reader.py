@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -139,31 +140,61 @@ def parse(given: Fetched) -> tuple[Any, list[Path]]:
 
 def _inlined(model: Any) -> Any:
     """The model without functions: its own, and those of ONNX's ops that are defined by others and not in the table."""
-    import onnx.defs
     import onnx.inliner
 
-    known = {kind for domain, kind in TABLE if not domain}
-    used = {n.op_type for n in _all_nodes(model.graph) if n.domain in STANDARD}
-    defined = [
-        ("", kind) for kind in sorted(used - known) if onnx.defs.has(kind) and _is_function(onnx.defs.get_schema(kind))
-    ]
-    if not model.functions and not defined:
-        return model
-    _check_unfolding(model)
-    try:
-        if model.functions:
+    if model.functions:
+        _check_unfolding(model)
+        bodies = (model.graph, *model.functions)
+        own = {(f.domain, f.name): f.attribute_proto for f in model.functions}
+        _complete([n for body in bodies for n in _all_nodes(body)], own)
+        try:
             model = onnx.inliner.inline_local_functions(model)
-        if defined:
-            model = onnx.inliner.inline_selected_functions(model, defined, inline_schema_functions=True)
-    except (RuntimeError, ValueError, onnx.checker.ValidationError) as error:
-        if not model.functions:
-            return model  # an op whose definition needs more than is known stays, and is refused by its name
-        raise DamagedFileError(
-            "the model's functions cannot be inlined",
-            why=str(error).strip().splitlines()[0],
-            fix="export it with functions inlined (onnx.inliner.inline_local_functions)",
-        ) from error
-    return model
+        except (RuntimeError, ValueError, onnx.checker.ValidationError) as error:
+            raise DamagedFileError(
+                "the model's functions cannot be inlined",
+                why=str(error).strip().splitlines()[0],
+                fix="export it with functions inlined (onnx.inliner.inline_local_functions)",
+            ) from error
+    defined = _defined(model)
+    if not defined:
+        return model
+    _complete(_all_nodes(model.graph), {("", kind): _defaults(schema) for kind, schema in defined.items()})
+    try:
+        chosen = [("", kind) for kind in defined]
+        return onnx.inliner.inline_selected_functions(model, chosen, inline_schema_functions=True)
+    except (RuntimeError, ValueError, onnx.checker.ValidationError):
+        return model  # an op whose definition needs more than is known stays, and is refused by its name
+
+
+def _defined(model: Any) -> dict[str, Any]:
+    """Op → schema, of the model's ops that are in no table here and that ONNX defines by others."""
+    import onnx.defs
+
+    known, version = {kind for domain, kind in TABLE if not domain}, _opsets(model)[""]
+    used = {n.op_type for n in _all_nodes(model.graph) if n.domain in STANDARD}
+    found = {}
+    for kind in sorted(used - known):
+        with suppress(onnx.defs.SchemaError):
+            schema: Any = onnx.defs.get_schema(kind, version)
+            if schema.has_function or schema.has_context_dependent_function:
+                found[kind] = schema
+    return found
+
+
+def _defaults(schema: Any) -> list[Any]:
+    return [a.default_value for a in schema.attributes.values() if a.default_value.name]
+
+
+def _complete(nodes: Sequence[Any], defaults: Mapping[tuple[str, str], Sequence[Any]]) -> None:
+    """Write out the attributes that calls of functions, by (domain, name), leave to their defaults.
+
+    onnx's inliner drops an attribute of a function's body that refers to one that is left out: without ``axes``,
+    MeanVarianceNormalization would take the mean of everything.
+    """
+    for node in nodes:
+        given = {a.name for a in node.attribute}
+        known = defaults.get(("" if node.domain in STANDARD else node.domain, node.op_type), ())
+        node.attribute.extend(a for a in known if a.name not in given)
 
 
 def _check_unfolding(model: Any) -> None:
@@ -190,10 +221,6 @@ def _check_unfolding(model: Any) -> None:
         return total
 
     size(_all_nodes(model.graph), frozenset())
-
-
-def _is_function(schema: Any) -> bool:
-    return bool(schema.has_function or schema.has_context_dependent_function)
 
 
 def _all_nodes(graph: Any) -> list[Any]:

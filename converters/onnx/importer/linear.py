@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from converters.graph.nn import reduction
+from converters.graph.nn import shaping as nn
+from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import einsum, matmul
 from converters.graph.types import INT64, product
 from converters.onnx.importer.elementwise import is_bias
@@ -74,26 +76,15 @@ def _arg(kind: str) -> Translate:
     def function(op: Op, net: Importer) -> str:
         x = op.need(0)
         axis = net.axis(x, op.integer("axis", 0))
-        if op.integer("select_last_index", 0):
-            raise op.refused("it takes the last of equal elements", "the targets take the first")
+        last = bool(op.integer("select_last_index", 0))
+        if last:  # the targets take the first of equal elements
+            length = net.length(x, axis)
+            x = nn.taken(net, x, range(length - 1, -1, -1), axis)
         best = net.add(kind, [x, net.ints(axis, "axis")], output_type=INT64)
+        best = net.add("Sub", [net.number(best, length - 1), best]) if last else best
         return net.expand_dims(best, axis) if op.integer("keepdims", 1) else best
 
     return function
-
-
-def _top_k(op: Op, net: Importer) -> list[str | None]:
-    """The one best element. k is an attribute before opset 10."""
-    x = op.need(0)
-    count = op.get(1)
-    k = op.integer("k", 0) if count is None else int(net.needed_constant(count, "k").reshape(-1)[0])
-    if k != 1:
-        raise op.refused(f"k is {k}", "only the one best element is taken in policies")
-    axis = net.axis(x, op.integer("axis", -1))
-    largest = op.integer("largest", 1)
-    best = net.reduce("Max" if largest else "Min", x, [axis], keep=True)
-    place = net.add("ArgMax" if largest else "ArgMin", [x, net.ints(axis, "axis")], output_type=INT64)
-    return [best, net.expand_dims(place, axis)]
 
 
 # ------------------------------------------------------------------ softmax
@@ -124,9 +115,9 @@ def _hardmax(op: Op, net: Importer) -> str:
     """1 at the first largest element; one axis from opset 13 on."""
     x = op.need(0)
     axis = net.axis(x, op.integer("axis", 1 if op.opset < 13 else -1))
-    if axis != net.rank(x) - 1:
-        raise op.refused("it is taken over an axis that is not the last")
-    return reduction.hardmax(net, x)
+    if op.opset < 13 and axis != net.rank(x) - 1:
+        raise op.refused("it is taken over several axes")
+    return moved_back(net, reduction.hardmax(net, last(net, x, axis)), axis)
 
 
 OPS: Mapping[str, Translate] = {
@@ -142,7 +133,6 @@ OPS: Mapping[str, Translate] = {
     "ReduceLogSumExp": _reduction(reduction.log_sum_exp),
     "ArgMax": _arg("ArgMax"),
     "ArgMin": _arg("ArgMin"),
-    "TopK": _top_k,
     "Softmax": _softmax,
     "LogSoftmax": _softmax,
     "Hardmax": _hardmax,

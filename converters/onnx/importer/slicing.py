@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal, cast
 
 import numpy as np
 
-from converters.graph.nn.shaping import padded
-from converters.graph.types import BOOL, INT32, INT64, Dim
+from converters.graph.nn.shaping import padded, taken
+from converters.graph.types import INT32, INT64, Dim
 from converters.onnx.importer.arrays import MAX_ELEMENTS
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
@@ -148,30 +149,9 @@ def _taken(net: Importer, x: str, axis: int, index: int) -> str:
     return net.add("StridedSlice", [x, *operands], begin_mask=mask, end_mask=mask, shrink_axis_mask=1 << axis)
 
 
-def _gather_elements(op: Op, net: Importer) -> str:
-    """y[..., j] = x[..., index[..., j]] along the last axis: each candidate where the index says so, summed."""
-    x, indices = op.need(0), op.need(1)
-    dims = net.shape(x)
-    axis = net.axis(x, op.integer("axis", 0))
-    if axis != len(dims) - 1 or net.dtype(x) == BOOL:
-        raise op.refused("it gathers along an axis that is not the last")
-    depth = net.length(x, axis)
-    others = net.shape(indices)
-    if any(a != b for a, b in zip(dims[:-1], others[:-1], strict=True)):
-        raise op.refused("its indices leave out rows")
-    index = net.add("FloorMod", [net.cast(indices, INT32), net.ints(depth, "depth")])
-    classes = net.const(np.arange(depth, dtype=INT32), "classes")
-    chosen = net.add("Equal", [net.expand_dims(index, len(dims)), classes])
-    candidates = net.expand_dims(x, len(dims) - 1)
-    zero = net.const(np.zeros((), net.dtype(x)), "zero")
-    return net.reduce("Sum", net.where(chosen, candidates, zero), [len(dims)], keep=False)
-
-
 def _pad(op: Op, net: Importer) -> str:
     """Paddings: an attribute before opset 11, inputs from there on (with axes from 18 on)."""
-    x = op.need(0)
-    if op.text("mode", "constant") != "constant":
-        raise op.refused(f"mode {op.text('mode', '')!r}", "only padding with a constant is written for all targets")
+    x, mode = op.need(0), op.text("mode", "constant")
     rank = net.rank(x)
     fill: str | None
     if op.opset < 11:
@@ -189,7 +169,23 @@ def _pad(op: Op, net: Importer) -> str:
     if len(pads) != 2 * len(axes):
         raise op.refused("it does not give two paddings for each axis", "the model is damaged")
     pairs = dict(zip(axes, zip(pads[: len(axes)], pads[len(axes) :], strict=True), strict=True))
+    if mode in ("reflect", "edge", "wrap"):
+        for axis in (a for a in axes if any(pairs[a])):
+            x = taken(net, x, _mirrored(op, net.length(x, axis), pairs[axis], mode), axis)
+        return x
+    if mode != "constant":
+        raise op.refused(f"mode {mode!r}", "the model is damaged")
     return padded(net, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
+
+
+def _mirrored(op: Op, length: int, pair: tuple[int, int], mode: str) -> list[int]:
+    """Which elements of an axis stand where once it is padded with its own; a negative padding cuts off."""
+    before, after = (max(n, 0) for n in pair)
+    if before + after > MAX_ELEMENTS or not length:
+        raise op.refused(f"it pads an axis of {length} with {before + after} elements", "the model is damaged")
+    cut = np.arange(length)[max(-pair[0], 0) : length - max(-pair[1], 0)]
+    padded: list[int] = np.pad(cut, (before, after), mode=cast(Literal["reflect", "edge", "wrap"], mode)).tolist()
+    return padded
 
 
 # ------------------------------------------------------------------ indices
@@ -232,7 +228,6 @@ OPS: Mapping[str, Translate] = {
     "Split": _split,
     "Slice": _slice,
     "Gather": _gather,
-    "GatherElements": _gather_elements,
     "Pad": _pad,
     "OneHot": _one_hot,
     "Trilu": _trilu,

@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 from converters.onnx.importer import (
     arrays,
+    choosing,
     control_flow,
     convolution,
     elementwise,
@@ -22,7 +23,18 @@ from converters.onnx.importer.node import Translate
 def _table() -> Mapping[tuple[str, str], Translate]:
     table: dict[tuple[str, str], Translate] = {}
     for module in (
-        *(elementwise, linear, arrays, slicing, convolution, normalisation, recurrent, samplers, control_flow),
+        *(
+            elementwise,
+            linear,
+            arrays,
+            slicing,
+            choosing,
+            convolution,
+            normalisation,
+            recurrent,
+            samplers,
+            control_flow,
+        ),
     ):
         for kind, function in module.OPS.items():
             if ("", kind) in table:

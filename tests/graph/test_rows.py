@@ -1,0 +1,56 @@
+"""A graph for one agent, made into one for many: each row is what the graph gives for it alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.passes.rows import for_every_row
+from converters.graph.run import run_graph
+from signatures.errors import UnsupportedOpError
+from tests.graph.samples import SAMPLES, Sample
+
+ROWS = 3
+#: Op → what is said, where an agent cannot have an operand of its own.
+REFUSED = dict.fromkeys(("Fill", "Range", "_FusedConv2D", "_FusedMatMul"), "no form")
+
+
+def others(array: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The elements of an operand in another order: what an op allows, it still is."""
+    return rng.permutation(array.reshape(-1)).reshape(array.shape) if array.ndim else array
+
+
+def each(sample: Sample, owned: list[str]) -> None:
+    rng = np.random.default_rng(0)
+    whole = sample.with_shapes(lambda shape, array: TensorShape(array.shape))
+    pins = [Node(f"result{i}", "Identity", (name,)) for i, name in enumerate(sample.fetches)]
+    graph = Graph((*whole.nodes, *pins))
+    alone = [{name: others(a, rng) if name in owned else a for name, a in sample.feeds.items()} for _ in range(ROWS)]
+    many = for_every_row(graph, [p.name for p in pins], dict.fromkeys(owned, False))
+    together = {name: np.stack([f[name] for f in alone]) if name in owned else a for name, a in sample.feeds.items()}
+    got = run_graph(many, together, [p.name for p in pins])
+    for i, feeds in enumerate(alone):
+        wanted = run_graph(whole, feeds, sample.fetches)
+        for pin, name in zip(pins, sample.fetches, strict=True):
+            value = got[pin.name] if got[pin.name].shape == wanted[name].shape else got[pin.name][i]
+            np.testing.assert_allclose(value, wanted[name], 1e-6, 1e-6, err_msg=f"{sample.title}, row {i}")
+
+
+@pytest.mark.parametrize("op", sorted({s.op for s in SAMPLES if not s.drawn and s.op != "Placeholder"}))
+def test_each_row_is_what_it_is_alone(op: str) -> None:
+    """With every operand an agent's own, and with each of them alone."""
+    count = 0
+    for sample in (s for s in SAMPLES if s.op == op and s.feeds and not s.drawn):
+        node = sample.graph["op"]
+        fed = [n for n in sample.feeds if n in sample.graph.ancestors(node.inputs)]
+        for owned in {tuple(fed), *((n,) for n in fed)}:
+            try:
+                each(sample, list(owned))
+                count += 1
+            except UnsupportedOpError as error:
+                assert any(
+                    text in f"{error.what} {error.why}"
+                    for text in ("an operand that says", "its kernel", "must be", REFUSED.get(op, "no such words"))
+                ), (sample.title, owned, str(error))
+    assert count or op in REFUSED or not any(s.feeds for s in SAMPLES if s.op == op)
