@@ -234,12 +234,19 @@ def _notes_of_others(model: OnnxModel) -> tuple[str, ...]:
 
 def _common_notes(model: OnnxModel) -> list[str]:
     notes = [f"the output {name} is left out: {why}" for name, why in model.left_out.items()]
-    if model.batch is not None:
+    if model.alone:
+        notes.append(
+            "the model decides for one agent at a time; an axis for the agents is added: the export takes any number, "
+            "each row computed as the model computes one, and is compared with the source row by row"
+        )
+    elif model.batch is not None:
         rows = "1 row" if model.batch == 1 else f"{model.batch} rows"
         notes.append(
             f"the model was exported for {rows} only; the export takes any number of rows and is compared with the "
             f"source {rows} at a time"
         )
+    if model.halves:
+        notes.append("the source is in half precision (16 bits); it is read, run and compared as float32")
     if model.doubles:
         notes.append("float64 numbers of the source are computed as float32")
     return notes

@@ -7,6 +7,7 @@ rows only is run that many rows at a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -84,10 +85,12 @@ class Original:
         logits = [b for b in self.source.branches if b is not None] if self._has_logits() else []
         parts = {s.name: self.source.parts[s.name] for s in self.signature.outputs if s.name in self.source.parts}
         tensors = [*fetches.values(), *(p.tensor for given in parts.values() for p in given), *logits]
-        values = self.model.run(placed, list(dict.fromkeys(tensors)))
-        results = {name: values[tensor] for name, tensor in fetches.items()}
+        values = dict(self.model.run(placed, list(dict.fromkeys(tensors))))
+        for given in parts.values():
+            values.update({p.tensor: self._row(values[p.tensor], p.shape) for p in given})
+        results = {n: self._row(values[tensor], self.signature.output(n).shape) for n, tensor in fetches.items()}
         results.update({name: joined(given, values) for name, given in parts.items()})
-        scores = [values[b] for b in logits]
+        scores = [self._row(values[b], (None, values[b].size)) for b in logits]
         for spec in self.signature.outputs:
             if spec.name in results or not self._derivable(spec):
                 continue
@@ -96,6 +99,12 @@ class Original:
             else:
                 results[spec.name] = self._deterministic(self.plain[spec.name], feeds, results, scores)
         return results
+
+    def _row(self, value: np.ndarray, shape: Sequence[int | None]) -> np.ndarray:
+        """One row as the policy gives it, of a source that decides for one agent: its own tensor may have no rows."""
+        dims = [1 if d is None else d for d in shape]
+        alone = self.source.rows == 1 and value.ndim != len(dims) and value.size == math.prod(dims)
+        return value.reshape(dims) if alone else value
 
     def _deterministic(
         self, head: TensorSpec, feeds: Arrays, results: Arrays, scores: Sequence[np.ndarray]

@@ -29,7 +29,7 @@ Array = npt.NDArray[Any]
 Dims = Sequence[int | str]
 #: The opsets that are tried: 9 (ML-Agents), 11 and 13 (inputs in place of attributes), 15 (ours), 18 (reductions).
 OPSETS = (9, 11, 13, 15, 18)
-_IR = {9: 4, 11: 6, 13: 7, 15: 8, 17: 8, 18: 8, 20: 9, 21: 10}
+_IR = {7: 3, 9: 4, 11: 6, 13: 7, 15: 8, 17: 8, 16: 8, 18: 8, 19: 9, 20: 9, 21: 10}
 
 
 def node(kind: str, inputs: Sequence[str], outputs: Sequence[str] | str = "y", **attributes: Any) -> Any:
@@ -125,8 +125,17 @@ def imported_graph(path: Path, outputs: Sequence[str]) -> tuple[OnnxModel, Graph
 def imported(path: Path, feeds: Mapping[str, Array], outputs: Sequence[str]) -> list[Array]:
     """The outputs of a model, imported as a graph and run by the numpy kernels; by the model's own names."""
     found, graph, names = imported_graph(path, outputs)
-    results = run_graph(graph, {found.inputs[n]: a for n, a in feeds.items()}, names)
-    return [results[name] for name in names]
+    return answers(found, run_graph(graph, fed(found, feeds), names), names)
+
+
+def fed(found: OnnxModel, feeds: Mapping[str, Array]) -> dict[str, Array]:
+    """The feeds by the graph's names; a model for one agent gets an axis in front."""
+    return {found.inputs[n]: a[None] if found.alone else a for n, a in feeds.items()}
+
+
+def answers(found: OnnxModel, results: Mapping[str, Array], names: Sequence[str]) -> list[Array]:
+    """The results as the model itself gives them."""
+    return [results[name][0] if found.alone else results[name] for name in names]
 
 
 def read(message: Any, folder: Path) -> OnnxModel:
@@ -162,9 +171,9 @@ class Bench:
         file = path.with_suffix(".pb")
         file.write_bytes(schema.serialise(encode(graph.pruned([*names, *found.inputs.values()]))))
         loaded = self.pool.process("tensorflow").load(str(file), kind="graph")
-        results = loaded.run({found.inputs[n]: a for n, a in feeds.items()}, names)
+        results = loaded.run(fed(found, feeds), names)
         loaded.unload()
-        return [results[name] for name in names]
+        return answers(found, results, names)
 
     def onnxruntime(self, path: Path, feeds: Mapping[str, Array], outputs: Sequence[str]) -> list[Array]:
         """What onnxruntime makes of the file itself."""

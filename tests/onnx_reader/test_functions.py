@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
+import onnx.parser
 import pytest
 
 from signatures.errors import DamagedFileError, UnsupportedOpError
@@ -63,8 +65,29 @@ def test_an_op_that_onnx_defines_by_others_is_inlined(bench: Bench) -> None:
     from converters.onnx.importer.table import TABLE
 
     assert ("", "MeanVarianceNormalization") not in TABLE
-    message = model([node("MeanVarianceNormalization", ["x"], axes=[1])], {"x": (np.float32, ["batch", 4])}, opset=13)
-    path = bench.place(message)
+    images = {"x": (np.float32, ["batch", 3, 4, 5])}
+    for axes in ({}, {"axes": [1]}):  # left out: the op's default, all axes but the channels
+        path = bench.place(model([node("MeanVarianceNormalization", ["x"], **axes)], images, opset=13))
+        x = floats(3, 3, 4, 5)
+        (got,), (wanted,) = imported(path, {"x": x}, ["y"]), bench.onnxruntime(path, {"x": x}, ["y"])
+        np.testing.assert_allclose(got, wanted, atol=1e-5)
+
+
+def test_a_function_whose_attribute_is_left_out_has_its_default(bench: Bench) -> None:
+    """Its body has an op that ONNX defines by others, too."""
+    text = """
+        <ir_version: 9, opset_import: ["":18, "own":1]>
+        test (float[batch, 4] x) => (float[batch, 4] y) {
+            h = own.Scale (x)
+            k = own.Scale <alpha = 3.0> (h)
+            y = own.Norm (k)
+        }
+        <domain: "own", opset_import: ["":18]>
+        Scale <alpha: float = 0.25> (a) => (b) { b = LeakyRelu <alpha = @alpha> (a) }
+        <domain: "own", opset_import: ["":18]>
+        Norm (a) => (b) { b = MeanVarianceNormalization <axes = [1]> (a) }
+    """
+    path = bench.place(onnx.parser.parse_model(text))
     x = floats(3, 4)
     (got,), (wanted,) = imported(path, {"x": x}, ["y"]), bench.onnxruntime(path, {"x": x}, ["y"])
     np.testing.assert_allclose(got, wanted, atol=1e-5)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from converters.onnx.importer.table import TABLE
-from tests.onnx_reader.cases import arrays, elementwise, images, layers, linear
+from tests.onnx_reader.cases import arrays, choosing, elementwise, images, layers, linear
 from tests.onnx_reader.models import Array, Bench, Case, imported, referenced
 
 pytestmark = pytest.mark.xdist_group("onnx-ops")
 
-CASES = [*elementwise.CASES, *linear.CASES, *arrays.CASES, *images.CASES, *layers.CASES]
-#: Samplers have tests of their own; a loop is refused; these two came with opsets that onnxruntime has not all of.
+CASES = [*elementwise.CASES, *linear.CASES, *arrays.CASES, *choosing.CASES, *images.CASES, *layers.CASES]
+#: Samplers have tests of their own; a loop is refused; these came with opsets that onnxruntime has not all of.
 ELSEWHERE = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Loop"}
-NEWER = {"RMSNormalization", "Swish"}
+NEWER = {"RMSNormalization", "Swish", "CumProd"}
 
 
 def test_every_op_has_cases() -> None:

@@ -45,6 +45,10 @@ class Window:
         )
         return top, left
 
+    def with_pads(self, lengths: Sequence[int]) -> Window:
+        """The same with its paddings as numbers."""
+        return replace(self, same=False, pads=self.same_pads(lengths)) if self.same else self
+
     def lengths(self, image: Sequence[int]) -> Pair:
         """Height and width of the result on an image of these."""
         height, width = (

@@ -50,7 +50,7 @@ def einsum(b: Builder, equation: str, tensors: Sequence[str]) -> str:
             f"the equation {equation!r} is no plain product",
             why="one or two operands without repeated labels are written as products; no policy uses others",
         )
-    lone = [[c for c in t if c not in result and not any(c in o for o in terms if o is not t)] for t in terms]
+    lone = [[c for c in t if c not in result and left.count(c) == 1] for t in terms]
     for i, labels in enumerate(lone):
         if labels:
             tensors[i] = b.reduce("Sum", tensors[i], [terms[i].index(c) for c in labels], keep=False)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.graph.builder import Builder
+from converters.graph.nn.linear import matmul
 from converters.graph.types import FLOAT32
 from signatures.errors import UnsupportedOpError
 
@@ -79,10 +80,24 @@ def group(b: Builder, x: str, groups: int, scale: str, bias: str, epsilon: float
     return b.add("Add", [b.add("Mul", [b.reshape(value, dims), factor]), shift])
 
 
+def local(b: Builder, x: str, size: int, alpha: float, beta: float, bias: float) -> str:
+    """X/(bias + alpha/size·Σx²)^beta, the squares summed over ``size`` neighbouring channels of x [B, C, …]."""
+    channels, axis = b.length(x, 1), 1
+    number = np.arange(channels)
+    away = number[:, None] - number[None, :]
+    near = (away >= -((size - 1) // 2)) & (away <= size // 2)  # [channel that is summed, channel]
+    squares = b.transpose(b.add("Square", [x]), [*(i for i in range(b.rank(x)) if i != axis), axis])
+    total = matmul(b, squares, b.floats(near, "near"))
+    total = b.transpose(total, [0, b.rank(x) - 1, *range(1, b.rank(x) - 1)])
+    base = b.add("Add", [b.add("Mul", [total, b.number(x, alpha / size)]), b.number(x, bias)])
+    return b.add("RealDiv", [x, b.add("Pow", [base, b.number(x, beta)])])
+
+
 def unit_length(b: Builder, x: str, axis: int, power: int = 2) -> str:
-    """X divided by its norm along an axis: the sum of |x| (``power`` 1), or the root of the sum of squares."""
+    """X divided by its norm along an axis, the sum of |x| (``power`` 1) or the root of that of squares; zeros stay."""
     if power == 1:
         norm = b.reduce("Sum", b.add("Abs", [x]), [axis], keep=True)
     else:
         norm = b.add("Sqrt", [b.reduce("Sum", b.add("Square", [x]), [axis], keep=True)])
-    return b.add("RealDiv", [x, norm])
+    nothing = b.cast(b.add("Equal", [norm, b.number(norm, 0)]), b.dtype(norm))
+    return b.add("RealDiv", [x, b.add("Add", [norm, nothing])])

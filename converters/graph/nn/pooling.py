@@ -13,18 +13,34 @@ from converters.graph.nn.shaping import padded
 from converters.graph.types import FLOAT32
 from signatures.errors import UnsupportedOpError
 
+#: Places of a window with gaps, each of which is a slice.
+_MAX_PLACES = 64
+
 
 def max_pool(b: Builder, image: str, window: Window, lowest: float = -np.inf) -> str:
     """The largest element under each window; ``lowest`` stands where the image is not."""
-    _check(window)
+    if set(window.dilations) != {1}:
+        window = window.with_pads([b.length(image, axis) for axis in (1, 2)])
+        frame = padded(b, image, [(0, 0), *window.pads, (0, 0)], lowest)
+        value, *rest = _under(b, frame, window)
+        for part in rest:
+            value = b.add("Maximum", [value, part])
+        return value
     data, padding = framed(b, image, window, lowest)
     return b.add("MaxPool", [data], **_attrs(window, padding))
 
 
 def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pair] | None = None) -> str:
     """The mean of the image's elements under each window; ``counted`` paddings count as zeros."""
-    _check(window)
     data, padding = image, "VALID"
+    if set(window.dilations) != {1}:
+        lengths = [b.length(image, axis) for axis in (1, 2)]
+        window = window.with_pads(lengths)
+        value, *rest = _under(b, padded(b, image, [(0, 0), *window.pads, (0, 0)]), window)
+        for part in rest:
+            value = b.add("Add", [value, part])
+        count = _counts(lengths, window, counted or ((0, 0), (0, 0))).astype(FLOAT32)
+        return b.add("RealDiv", [value, b.const(count[None, :, :, None], "count")])
     if counted is None or not any(map(any, window.pads)):
         if window.same or not any(map(any, window.pads)):
             return b.add("AvgPool", [image], **_attrs(window, "SAME" if window.same else "VALID"))
@@ -39,9 +55,23 @@ def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pa
     return b.add("Mul", [mean, b.const(factor[None, :, :, None], "share")])
 
 
-def _check(window: Window) -> None:
-    if set(window.dilations) != {1}:
-        raise UnsupportedOpError("its window is dilated", why="no target has dilated pools")
+def _under(b: Builder, frame: str, window: Window) -> list[str]:
+    """The elements under each place of a window with gaps, which no target has: a slice for each place."""
+    places = [(i, j) for i in range(window.size[0]) for j in range(window.size[1])]
+    if len(places) > _MAX_PLACES:
+        raise UnsupportedOpError(
+            f"its window has gaps and {len(places)} places", why=f"up to {_MAX_PLACES} are written"
+        )
+    lengths = [b.length(frame, axis) for axis in (1, 2)]
+    counts = [(n - span) // stride + 1 for n, span, stride in zip(lengths, window.span, window.strides, strict=True)]
+    parts = []
+    for place in places:
+        part = frame
+        for axis in range(2):
+            first, stride = place[axis] * window.dilations[axis], window.strides[axis]
+            part = b.slice(part, axis + 1, first, first + (counts[axis] - 1) * stride + 1, stride)
+        parts.append(part)
+    return parts
 
 
 def _attrs(window: Window, padding: str) -> dict[str, Any]:
@@ -51,10 +81,11 @@ def _attrs(window: Window, padding: str) -> dict[str, Any]:
 def _counts(lengths: Sequence[int], window: Window, counted: tuple[Pair, Pair]) -> np.ndarray:
     """How many elements each window has that count: the image's, and the padding's in ``counted``."""
     sums = []
-    for length, size, stride, (before, after), (first, last) in zip(
-        lengths, window.size, window.strides, window.pads, counted, strict=True
+    for length, size, gap, stride, (before, after), (first, last) in zip(
+        lengths, window.size, window.dilations, window.strides, window.pads, counted, strict=True
     ):
         line = np.zeros(before + length + after)
         line[before - first : before + length + last] = 1
-        sums.append(np.lib.stride_tricks.sliding_window_view(line, size)[::stride].sum(axis=1))
+        windows = np.lib.stride_tricks.sliding_window_view(line, (size - 1) * gap + 1)
+        sums.append(windows[::stride, ::gap].sum(axis=1))
     return np.maximum(np.outer(sums[0], sums[1]), 1)

@@ -51,6 +51,12 @@ class Rows:
             raise refused(node, "an operand that says how it works is computed while the graph runs")
         return value
 
+    def common(self, node: Node, position: int) -> str:
+        """An operand that is the same for all agents; raises UnsupportedOpError where each has its own."""
+        if node.inputs[position] in self.own:
+            raise refused(node, "an operand that says how it works is computed while the graph runs")
+        return self.at[node.inputs[position]]
+
     def rowed(self, reference: str, rank: int | None = None) -> str:
         """A tensor with the agents' axis, repeated for each where it is the same for all, with axes up to ``rank``."""
         dims = self.shape(reference)
@@ -149,7 +155,7 @@ def _split(rows: Rows, node: Node) -> Sequence[str]:
     value, axis = (1, 0) if node.op == "Split" else (0, 2)
     at = rows.b.ints(int(rows.constant(node, axis)) % rows.rank(node.inputs[value]) + 1, "axis")
     x = rows.rowed(node.inputs[value])
-    operands = [at, x] if node.op == "Split" else [x, rows.at[node.inputs[1]], at]
+    operands = [at, x] if node.op == "Split" else [x, rows.common(node, 1), at]
     return _several(rows, node, operands, _attrs(node))
 
 
@@ -215,7 +221,7 @@ def _tile(rows: Rows, node: Node) -> str:
 
 def _pad(rows: Rows, node: Node) -> str:
     pairs = rows.b.ints([[0, 0], *rows.constant(node, 1).tolist()], "paddings")
-    return rows.b.add(node.op, [_first(rows, node), pairs, *(rows.at[r] for r in node.inputs[2:])])
+    return rows.b.add(node.op, [_first(rows, node), pairs, *(rows.common(node, i) for i in range(2, len(node.inputs)))])
 
 
 # ------------------------------------------------------------------ along axes
@@ -238,7 +244,7 @@ def _softmax(rows: Rows, node: Node) -> str:
 
 def _one_hot(rows: Rows, node: Node) -> str:
     axis = int(node.attrs["axis"])
-    operands = [_first(rows, node), *(rows.at[r] for r in node.inputs[1:])]
+    operands = [_first(rows, node), *(rows.common(node, i) for i in (1, 2, 3))]
     return rows.b.add("OneHot", operands, axis=axis if axis < 0 else axis + 1)
 
 
@@ -258,11 +264,10 @@ def _product(rows: Rows, node: Node) -> str:
 
 def _windowed(rows: Rows, node: Node) -> str:
     """An image of each agent as one of as many images; the kernel is the same for all."""
-    if any(r in rows.own for r in node.inputs[1:]):
-        raise refused(node, "its kernel is computed from the agent's observation")
     n, *image = rows.shape(node.inputs[0])
     x = rows.b.reshape(_first(rows, node), _joined(n, image))
-    made = rows.b.add(node.op, [x, *(rows.at[r] for r in node.inputs[1:])], **_attrs(node))
+    kernel = [rows.common(node, i) for i in range(1, len(node.inputs))]
+    made = rows.b.add(node.op, [x, *kernel], **_attrs(node))
     return rows.b.reshape(made, (BATCH, *rows.shape(node.name)))
 
 
@@ -283,7 +288,7 @@ def _draw(rows: Rows, node: Node) -> str:
 def _multinomial(rows: Rows, node: Node) -> str:
     count, classes = rows.shape(node.inputs[0])
     logits = rows.b.reshape(_first(rows, node), _joined(count, [classes]))
-    drawn = rows.b.add("Multinomial", [logits, rows.at[node.inputs[1]]], origin=node.origin, **_attrs(node))
+    drawn = rows.b.add("Multinomial", [logits, rows.common(node, 1)], origin=node.origin, **_attrs(node))
     return rows.b.reshape(drawn, (BATCH, *rows.shape(node.name)))
 
 

@@ -57,8 +57,8 @@ def _scatter_elements(op: Op, net: Importer) -> str:
     """``Scatter`` until opset 10."""
     x, indices, updates = (op.need(i) for i in range(3))
     axis = net.axis(x, op.integer("axis", 0))
-    dims, given = net.shape(x), net.shape(indices)
-    if any(a != b for i, (a, b) in enumerate(zip(dims, given, strict=True)) if i != axis):
+    lengths = zip(net.shape(x), net.shape(indices), strict=True)
+    if any(a != b for i, (a, b) in enumerate(lengths) if i != axis):
         raise op.refused("its indices leave out rows")
     table, places, given = (nn.last(net, r, axis) for r in (x, indices, updates))
     _check_apart(op, net, places)

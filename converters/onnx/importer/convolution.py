@@ -130,6 +130,25 @@ def _average_pool(op: Op, net: Importer) -> str:
     return _back(op, net, pooling.average_pool(net, image, padded, counts if counted else None))
 
 
+def _lp_pool(op: Op, net: Importer) -> str:
+    """(Σ|x|^p)^(1/p) under each window; the padding is zeros, whatever it counts as."""
+    power = float(op.integer("p", 2))
+    window = _window(op, net, op.integers("kernel_shape") or ())
+    image = _image(net, net.add("Abs", [op.need(0)]))
+    raised = net.add("Pow", [image, net.number(image, power)])
+    padded = _resolved(op, net, raised, window, plainly=True)
+    mean = pooling.average_pool(net, raised, padded, padded.pads)
+    total = net.add("Mul", [mean, net.number(mean, window.size[0] * window.size[1])])
+    return _back(op, net, net.add("Pow", [total, net.number(total, 1 / power)]))
+
+
+def _global_lp_pool(op: Op, net: Importer) -> str:
+    x, power = op.need(0), float(op.integer("p", 2))
+    raised = net.add("Pow", [net.add("Abs", [x]), net.number(x, power)])
+    total = net.reduce("Sum", raised, range(2, net.rank(x)), keep=True)
+    return net.add("Pow", [total, net.number(total, 1 / power)])
+
+
 def _global(kind: str) -> Translate:
     def function(op: Op, net: Importer) -> str:
         x = op.need(0)
@@ -143,6 +162,8 @@ OPS: Mapping[str, Translate] = {
     "ConvTranspose": _conv_transpose,
     "MaxPool": _max_pool,
     "AveragePool": _average_pool,
+    "LpPool": _lp_pool,
+    "GlobalLpPool": _global_lp_pool,
     "GlobalAveragePool": _global("Mean"),
     "GlobalMaxPool": _global("Max"),
 }

@@ -103,6 +103,12 @@ def _clip(op: Op, net: Importer) -> str:
         low, high = (net.number(x, op.number(k, 0), k) if k in op.attrs else None for k in ("min", "max"))
     else:
         low, high = op.get(1), op.get(2)
+    if low is not None and high is not None:
+        least, most = net.constant(low), net.constant(high)
+        if least is None or most is None or (least > most).any():
+            return net.add(
+                "Minimum", [net.add("Maximum", [x, low]), high]
+            )  # where they cross, ONNX gives the upper one
     return nn.clip(net, x, low, high)
 
 
@@ -152,6 +158,15 @@ def _gelu(op: Op, net: Importer) -> str:
     return nn.gelu(net, op.need(0), tanh=op.text("approximate", "none") == "tanh")
 
 
+def _shrink(op: Op, net: Importer) -> str:
+    """X moved towards 0 by ``bias`` where it is farther from it than ``lambd``, else 0."""
+    x, bias, bound = op.need(0), op.number("bias", 0.0), op.number("lambd", 0.5)
+    zero = net.number(x, 0)
+    up = net.where(net.add("Less", [x, net.number(x, -bound)]), net.add("Add", [x, net.number(x, bias)]), zero)
+    down = net.where(net.add("Greater", [x, net.number(x, bound)]), net.add("Sub", [x, net.number(x, bias)]), zero)
+    return net.add("Add", [up, down])
+
+
 def _dropout(op: Op, net: Importer) -> list[str | None]:
     """Inference: the input itself. From opset 12 on training is an input; a policy that drops at random is none."""
     mode = op.get(2)
@@ -190,6 +205,7 @@ OPS: Mapping[str, Translate] = {
     "Swish": _with(nn.swish, alpha=1.0),
     "Mish": _plain(nn.mish),
     "Gelu": _gelu,
+    "Shrink": _shrink,
     "Sinh": _plain(trigonometry.sinh),
     "Cosh": _plain(trigonometry.cosh),
     "Asin": _plain(trigonometry.asin),

@@ -52,6 +52,13 @@ def _length(op: Op, net: Importer) -> str:
     return nn.unit_length(net, x, net.axis(x, op.integer("axis", -1)), op.integer("p", 2))
 
 
+def _local(op: Op, net: Importer) -> str:
+    size = op.integer("size", 1)
+    if size < 1 or size % 2 == 0:
+        raise op.refused(f"it sums over {size} channels", "onnxruntime takes odd numbers alone")
+    return nn.local(net, op.need(0), size, op.number("alpha", 1e-4), op.number("beta", 0.75), op.number("bias", 1.0))
+
+
 OPS: Mapping[str, Translate] = {
     "BatchNormalization": _batch,
     "LayerNormalization": _layer,
@@ -59,4 +66,5 @@ OPS: Mapping[str, Translate] = {
     "InstanceNormalization": _instance,
     "GroupNormalization": _group,
     "LpNormalization": _length,
+    "LRN": _local,
 }

@@ -14,28 +14,21 @@ from converters.onnx.importer import (
     linear,
     normalisation,
     recurrent,
+    resizing,
     samplers,
     slicing,
 )
 from converters.onnx.importer.node import Translate
 
+_MODULES = (
+    *(arrays, choosing, control_flow, convolution, elementwise, linear),
+    *(normalisation, recurrent, resizing, samplers, slicing),
+)
+
 
 def _table() -> Mapping[tuple[str, str], Translate]:
     table: dict[tuple[str, str], Translate] = {}
-    for module in (
-        *(
-            elementwise,
-            linear,
-            arrays,
-            slicing,
-            choosing,
-            convolution,
-            normalisation,
-            recurrent,
-            samplers,
-            control_flow,
-        ),
-    ):
+    for module in _MODULES:
         for kind, function in module.OPS.items():
             if ("", kind) in table:
                 raise ValueError(f"{kind} stands twice in the table")

@@ -6,10 +6,13 @@ which become inputs); any of its inner values can then be fetched.
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from converters.runtimes.child import Model, claim_stdout, serve
 from converters.runtimes.wire import Tensors
@@ -28,6 +31,13 @@ def main() -> None:
         options.log_severity_level = 3
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
+    def fitting(array: Any, shape: Sequence[Any], kind: str) -> Any:
+        """A row as the model takes it: one without an axis for the agents, and doubles."""
+        dims = [d if isinstance(d, int) else 1 for d in shape]
+        if array.ndim != len(dims) and dims and array.size == math.prod(dims):
+            array = array.reshape(dims)
+        return array.astype(np.float64) if kind == "tensor(double)" else array
+
     class Written:
         """A model that is run as it is."""
 
@@ -45,10 +55,13 @@ def main() -> None:
 
         def __init__(self, path: str, draws: Sequence[str]) -> None:
             from converters.onnx import edit
+            from converters.onnx.halves import widen
             from converters.onnx.vetted import contained
 
             self.cut = edit.cut
-            self.model = edit.lifted(contained(Path(path)), draws)
+            model = contained(Path(path))
+            widen(model)
+            self.model = edit.lifted(model, draws)
             self.sessions: dict[tuple[str, ...], Any] = {}
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
@@ -56,9 +69,10 @@ def main() -> None:
             if key not in self.sessions:
                 self.sessions[key] = session(self.cut(self.model, key))
             chosen = self.sessions[key]
-            wanted = {i.name for i in chosen.get_inputs()}
-            values = chosen.run(list(key), {n: a for n, a in feeds.items() if n in wanted})
-            return dict(zip(key, values, strict=True))
+            wanted = {i.name: i for i in chosen.get_inputs()}
+            given = {n: fitting(a, wanted[n].shape, wanted[n].type) for n, a in feeds.items() if n in wanted}
+            values = chosen.run(list(key), given)
+            return {n: v.astype(np.float32) if v.dtype == np.float64 else v for n, v in zip(key, values, strict=True)}
 
     def load(header: Mapping[str, Any]) -> Model:
         if "lift" in header:

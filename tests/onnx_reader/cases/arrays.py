@@ -70,6 +70,11 @@ def pad(pads: Sequence[int], value: float) -> Callable[[int], Sequence[Any]]:
     return build
 
 
+def mirrored(mode: str) -> Case:
+    build = lambda _: [constant("p", [0, 1, 2, 0, 0, 1], np.int64), node("Pad", ["x", "p"], mode=mode)]  # noqa: E731
+    return Case("Pad", mode, build, {"x": CUBE}, opsets=(13, 18))
+
+
 def gather(title: str, indices: Any, axis: int, x: Any = CUBE) -> Case:
     build = lambda _: [constant("i", indices, np.int64), node("Gather", ["x", "i"], axis=axis)]  # noqa: E731
     return Case("Gather", title, build, {"x": x})
@@ -235,6 +240,8 @@ CASES = [
     ),
     Case("Pad", "zeros", pad([0, 1, 2, 0, 0, 1], 0.0), {"x": CUBE}),
     Case("Pad", "a number", pad([0, 1, 2, 0, 0, 1], 1.5), {"x": CUBE}),
+    mirrored("reflect"),
+    mirrored("edge"),
     Case("Pad", "cut off", pad([0, -1, 0, 0, 1, -2], 0.0), {"x": CUBE}),
     Case(
         "Pad",

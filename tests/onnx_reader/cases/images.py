@@ -72,6 +72,11 @@ CASES = [
     pool("AveragePool", "SAME that counts", kernel_shape=[3, 3], strides=[2, 2], auto_pad="SAME_UPPER",
          count_include_pad=1),
     pool("AveragePool", "rounded up", kernel_shape=[2, 2], strides=[2, 2], ceil_mode=1, opsets=(13, 15, 18)),
+    pool("MaxPool", "gaps", kernel_shape=[2, 3], dilations=[3, 2], strides=[1, 2], pads=[1, 0, 1, 1]),
+    pool("MaxPool", "gaps, rounded up", kernel_shape=[2, 2], dilations=[2, 2], strides=[2, 2], ceil_mode=1),
+    pool("AveragePool", "gaps", (19,), kernel_shape=[2, 2], dilations=[2, 3], strides=[2, 1], pads=[1, 1, 0, 1]),
+    pool("LpPool", "squares", (11, 18), kernel_shape=[2, 3], strides=[2, 2], pads=[1, 0, 0, 1]),
+    pool("GlobalLpPool", "cubes", (11, 18), p=3),
     pool("GlobalAveragePool", "plain", (9, *POOLS)),
     pool("GlobalMaxPool", "plain", (9, *POOLS)),
 ]  # fmt: skip

@@ -103,6 +103,7 @@ CASES = [
     einsum("bhqk,bhkd->bqhd", DEEP, floats(2, 3, 5, 4)),
     einsum("bij->bji", CUBE),
     einsum("bij->b", CUBE),
+    einsum("bi,bi", X, floats(3, 5, seed=7)),
     einsum("bi,bi->b", X, floats(3, 5, seed=7)),
     einsum("bi,bj", X, floats(3, 4, seed=7)),
     *(c for op in REDUCTIONS for c in reductions(op)),
@@ -136,5 +137,13 @@ CASES = [
         for title, more in (("default axis", {}), ("last axis", {"axis": -1}), ("axis 1", {"axis": 1}))
     ),
     Case("Softmax", "axis 0", lambda _: [node("Softmax", ["x"], axis=0)], {"x": X}, opsets=(13, 15, 18)),
+    Case(
+        "ArgMax",
+        "the last of equals",
+        lambda _: [node("ArgMax", ["x"], axis=1, select_last_index=1)],
+        {"x": TIES},
+        opsets=(13, 18),
+    ),
+    Case("Hardmax", "second axis", lambda _: [node("Hardmax", ["x"], axis=1)], {"x": CUBE}, opsets=(13, 18)),
     Case("Hardmax", "last axis", lambda _: [node("Hardmax", ["x"], axis=-1)], {"x": TIES}, opsets=OPSETS),
 ]

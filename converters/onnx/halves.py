@@ -1,0 +1,58 @@
+"""A model in half precision as one in float32: the same weights, computed with more digits.
+
+float16 and bfloat16 are for accelerators. No target here computes in them throughout, and their own rounding is no
+part of a policy, so both what is read and what it is compared with are the model in float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from converters.onnx.proto import tensors
+
+_FLOAT, _FLOAT16, _BFLOAT16 = 1, 10, 16  # TensorProto.DataType
+_HALVES = (_FLOAT16, _BFLOAT16)
+#: Attributes that name a data type: of Cast, and of the ops that make tensors.
+_TYPES = ("to", "dtype", "output_datatype", "stash_type")
+
+
+def widen(model: Any) -> bool:
+    """Make a ModelProto float32 in place, whose tensors hold their data; whether anything of it was half precision."""
+    found = False
+    for part in (model.graph, *model.functions):
+        for tensor in tensors(part):
+            if tensor.data_type in _HALVES:
+                found = True
+                _widen_tensor(tensor)
+        for body in _bodies(part):
+            values = (*body.input, *body.output, *body.value_info)
+            for value in (v for v in values if not isinstance(v, str)):  # a function's are names
+                if value.type.tensor_type.elem_type in _HALVES:
+                    found = True
+                    value.type.tensor_type.elem_type = _FLOAT
+            for attribute in (a for node in body.node for a in node.attribute):
+                if attribute.name in _TYPES and attribute.i in _HALVES:
+                    found = True
+                    attribute.i = _FLOAT
+    return found
+
+
+def _bodies(part: Any) -> Iterator[Any]:
+    """A graph or function and the bodies inside."""
+    yield part
+    for node in part.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                yield from _bodies(attribute.g)
+
+
+def _widen_tensor(tensor: Any) -> None:
+    bits = tensor.raw_data if tensor.HasField("raw_data") else np.array(tensor.int32_data, "<u2").tobytes()
+    raw = np.frombuffer(bits, "<u2")
+    wide = raw.view(np.float16).astype("<f4") if tensor.data_type == _FLOAT16 else (raw.astype("<u4") << 16).view("<f4")
+    tensor.ClearField("int32_data")
+    tensor.raw_data = wide.tobytes()
+    tensor.data_type = _FLOAT
