@@ -106,7 +106,7 @@ def add_companions(
         added[LOG_PROBS] = _joined(editor, parts, LOG_PROBS)
     if name not in fetches:
         if scores:
-            added[name] = _argmax(editor, scores, name)
+            added[name] = _argmax(editor, graph, scores, name)
         else:
             added[name] = _as_columns(editor, graph, action, name)
     return editor.graph(), added
@@ -119,10 +119,14 @@ def _joined(editor: Editor, parts: Sequence[str], name: str) -> str:
     return editor.add("ConcatV2", [*parts, axis], f"{name}/concat")
 
 
-def _argmax(editor: Editor, branches: Sequence[str], name: str) -> str:
-    columns = []
+def _argmax(editor: Editor, graph: Graph, branches: Sequence[str], name: str) -> str:
+    columns, types = [], infer_types(graph)
     for i, branch in enumerate(branches):
         prefix = f"{name}/branch_{i}"
+        shape = types[branch].shape or ()
+        if len(shape) > 2 and isinstance(shape[-1], int):  # [B, 1, n]
+            row = editor.const(np.array([-1, shape[-1]], INT32), f"{prefix}/row_shape")
+            branch = editor.add("Reshape", [branch, row], f"{prefix}/row")
         axis = editor.const(np.array(1, INT32), f"{prefix}/axis")
         best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
         columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))

@@ -11,7 +11,7 @@ from converters.graph.compilation import Compilation
 from converters.graph.nodes import Graph, Node, TensorShape, node_of
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
-from converters.understand.action import action_meaning
+from converters.understand.action import ActionMeaning, action_meaning
 from converters.understand.brains import Head
 from converters.understand.derived_outputs import LOG_PROBS
 from converters.understand.generations import generation
@@ -41,11 +41,14 @@ def understand_actions(c: Compilation) -> Compilation:
     types = infer_types(c.graph)
     masked = Role.MASKS in c.roles.values()
     meanings = {
-        head.name: action_meaning(
-            c.graph,
-            c.fetches[head.name],
-            types[c.fetches[head.name]].dtype,
-            masked and head.base != "continuous_actions",
+        head.name: _of_rows(
+            action_meaning(
+                c.graph,
+                c.fetches[head.name],
+                types[c.fetches[head.name]].dtype,
+                masked and head.base != "continuous_actions",
+            ),
+            types,
         )
         for head in c.brain.heads
     }
@@ -58,6 +61,13 @@ def understand_actions(c: Compilation) -> Compilation:
         branch_origins=branch_origins(c, branches),
         squashed=squashed,
     )
+
+
+def _of_rows(meaning: ActionMeaning, types: Types) -> ActionMeaning:
+    """A choice among scores that are no row of one branch ([B, branches, n]) is known by itself alone."""
+    shapes = [types[b].shape or () for b in meaning.branches]
+    rows = all(len(s) == 2 or (len(s) == 3 and s[1] == 1) for s in shapes)
+    return meaning if meaning.role is not Role.DETERMINISTIC or rows else replace(meaning, branches=())
 
 
 def sign(c: Compilation) -> Compilation:

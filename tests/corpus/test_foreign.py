@@ -20,7 +20,6 @@ from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.source import ReadOptions
 from exporter.export.sources import read_source
-from signatures.errors import ExportModelError
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Role
 from tests.conftest import NEEDED
@@ -31,11 +30,6 @@ pytestmark = [pytest.mark.corpus, pytest.mark.slow]
 FOREIGN = SHARED / "foreign"
 #: The file says 1e-4 · (1 + |x|): torch and the kernels add in another order.
 TOLERANCE = 1e-4
-#: Files that are refused, with what the refusal says; docs/tasks/other-trainers.md explains each.
-REFUSED = {
-    "clean_c51__legacy.onnx": "for one row only",
-    "sb3_recurrent_disc_own_forward__legacy_fixed.onnx": "it runs over a number of steps",
-}
 #: Files whose .json lists the outputs by name and whose recording has them in the model's order.
 OUTPUTS = {"keras_lstm_state.keras": ["action", "h_out", "c_out"]}
 FILES = sorted(p for end in ("onnx", "pt", "keras") for p in FOREIGN.glob(f"*.{end}")) or [
@@ -111,10 +105,6 @@ def compared(policy: Policy, answers: Arrays, expected: Arrays, where: str) -> i
 
 @pytest.mark.parametrize("file", FILES, ids=lambda p: p.name)
 def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path: Path, pool: RuntimePool) -> None:
-    if file.name in REFUSED:
-        with pytest.raises(ExportModelError, match=REFUSED[file.name]):
-            read_source(file).policies()
-        return
     about: dict[str, Any] = json.loads(file.with_suffix(".json").read_text())
     with np.load(file.with_suffix(".npz")) as archive:
         outputs = OUTPUTS.get(file.name) or about.get("onnx_outputs") or about["outputs"]
