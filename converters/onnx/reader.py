@@ -77,7 +77,8 @@ def read_onnx(given: Fetched) -> OnnxModel:
     declared = [v for v in graph.input if v.name not in constants]
     memories, axes = _memories(graph, declared)
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
-    reading = read_rows(partial(_imported, graph, opsets, declared, axes), declared, graph.output, axes)
+    ends = {m.output: m.axis for m in memories}
+    reading = read_rows(partial(_imported, graph, opsets, declared, axes), declared, graph.output, axes, ends)
     importer, types = reading.importer, reading.types
     outputs, left_out = _outputs(importer, [v.name for v in graph.output])
     return OnnxModel(

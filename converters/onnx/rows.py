@@ -53,9 +53,11 @@ class Reading:
 Import = Callable[[int | None, bool], Importer]
 
 
-def read_rows(imported: Import, declared: Sequence[Any], outputs: Sequence[Any], axes: Mapping[str, int]) -> Reading:
-    """The reading that is right; ``axes`` are the batch axes of memories. Raises what ``imported`` raises,
-    SignatureError where the model gives one row only and no reading gives more.
+def read_rows(
+    imported: Import, declared: Sequence[Any], outputs: Sequence[Any], axes: Mapping[str, int], ends: Mapping[str, int]
+) -> Reading:
+    """The reading that is right; ``axes`` and ``ends`` are the batch axes of memories, by input and by output. Raises
+    what ``imported`` raises, SignatureError where the model gives one row only and no reading gives more.
     """
     batch = _fixed_batch(declared, axes)
     importer = imported(batch, False)
@@ -67,7 +69,7 @@ def read_rows(imported: Import, declared: Sequence[Any], outputs: Sequence[Any],
         if fault is None:
             return Reading(importer, importer.graph(), importer.types, batch)
         try:
-            return _alone(imported, declared, outputs, True)
+            return _alone(imported, declared, outputs, axes, ends, leading=True)
         except ExportModelError:
             raise fault from None
     has_rows = batch is not None and _has_rows(importer, outputs)
@@ -76,7 +78,7 @@ def read_rows(imported: Import, declared: Sequence[Any], outputs: Sequence[Any],
     if has_rows and fault is None and not _broken(importer, outputs):
         return plain
     try:
-        alone = _alone(imported, declared, outputs, batch == 1)
+        alone = _alone(imported, declared, outputs, axes, ends, leading=batch == 1)
     except ExportModelError:
         if fault is not None:
             raise fault from None
@@ -90,19 +92,28 @@ def read_rows(imported: Import, declared: Sequence[Any], outputs: Sequence[Any],
 # ------------------------------------------------------------------ one agent at a time
 
 
-def _alone(imported: Import, declared: Sequence[Any], outputs: Sequence[Any], leading: bool) -> Reading:
+def _alone(
+    imported: Import,
+    declared: Sequence[Any],
+    outputs: Sequence[Any],
+    axes: Mapping[str, int],
+    ends: Mapping[str, int],
+    *,
+    leading: bool,
+) -> Reading:
     """The model for one agent, computed for each; ``leading``: a first axis of 1 is that of the agents. Raises
     UnsupportedOpError where it cannot be.
     """
     importer = imported(None, True)
     made = _made(importer, outputs)
-    inputs = {}
+    inputs: dict[str, int | None] = {}
     for value in declared:
-        node = importer.values[value.name]
+        node, axis = importer.values[value.name], axes.get(value.name, 0 if leading else None)
         shape = importer.type_of(node).shape or ()
         if importer.known(node) is None and (shape or (len(declared) == 1 and importer.dtype(node).kind in "iu")):
-            inputs[node] = leading and shape[:1] == (1,)
-    graph = for_every_row(importer.graph(), [importer.values[name] for name in made], inputs)
+            inputs[node] = axis if axis is not None and shape[axis : axis + 1] == (1,) else None
+    last = {importer.values[name]: axis for name, axis in ends.items() if name in made}
+    graph = for_every_row(importer.graph(), [importer.values[name] for name in made], inputs, last)
     unread = [n for n in importer.nodes if n.op == "Placeholder" and n.name not in graph]
     graph = Graph((*graph.nodes, *unread))
     return Reading(importer, graph, infer_types(graph), 1, alone=True)

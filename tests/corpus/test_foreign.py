@@ -128,6 +128,7 @@ def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path:
             models[f"{target} in {runtime}"] = pool.process(runtime).load(str(tmp_path / artifact.main), **kind)
     names = [s.name for s in signature.outputs]
     count = 0
+    recorded = [r for r in recorded if not lost(about, r[1])]
     for row, inputs, expected in recorded:
         size = len(next(iter(inputs.values())))
         feeds = feeds_of(policy, {**renamed_inputs(about, inputs), **inputs}, size)
@@ -135,7 +136,14 @@ def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path:
             count += compared(policy, model.run(feeds, names), expected, f"{row}, {where}")
     for model in models.values():
         model.unload()
-    assert count >= len(recorded) or set(names) <= drawn(policy) | {"deterministic_action"}
+    assert count >= len(recorded) > 0 or set(names) <= drawn(policy) | {"deterministic_action"}
+
+
+def lost(about: dict[str, Any], inputs: Arrays) -> bool:
+    """Whether the recording gives something to an input that the file has not: torch traced it as the zero it was."""
+    names = about.get("onnx_inputs") or inputs
+    same = set(names) <= set(inputs)  # else the exporter called them otherwise
+    return same and any(array.any() for name, array in inputs.items() if name not in names)
 
 
 def sensors(inputs: Arrays) -> tuple[tuple[int, ...], ...]:

@@ -27,7 +27,7 @@ def each(sample: Sample, owned: list[str]) -> None:
     pins = [Node(f"result{i}", "Identity", (name,)) for i, name in enumerate(sample.fetches)]
     graph = Graph((*whole.nodes, *pins))
     alone = [{name: others(a, rng) if name in owned else a for name, a in sample.feeds.items()} for _ in range(ROWS)]
-    many = for_every_row(graph, [p.name for p in pins], dict.fromkeys(owned, False))
+    many = for_every_row(graph, [p.name for p in pins], dict.fromkeys(owned))
     together = {name: np.stack([f[name] for f in alone]) if name in owned else a for name, a in sample.feeds.items()}
     got = run_graph(many, together, [p.name for p in pins])
     for i, feeds in enumerate(alone):
@@ -54,3 +54,20 @@ def test_each_row_is_what_it_is_alone(op: str) -> None:
                     for text in ("an operand that says", "must be", REFUSED.get(op, "no such words"))
                 ), (sample.title, owned, str(error))
     assert count or op in REFUSED or not any(s.feeds for s in SAMPLES if s.op == op)
+
+
+def test_an_axis_of_one_becomes_that_of_the_agents_where_it_is() -> None:
+    """Of a state [layers, 1, n] the second; what is read is the state for one agent."""
+    nodes = [
+        Node("h", "Placeholder", attrs={"dtype": np.dtype("f4"), "shape": TensorShape((2, 1, 3))}),
+        Node("x", "Placeholder", attrs={"dtype": np.dtype("f4"), "shape": TensorShape((1, 3))}),
+        Node("sum", "AddV2", ("h", "x")),
+        Node("out", "Identity", ("sum",)),
+        Node("y", "Identity", ("x",)),
+    ]
+    many = for_every_row(Graph(tuple(nodes)), ["out", "y"], {"h": 1, "x": 0}, {"out": 1})
+    assert [many[n].attrs["shape"].dims for n in ("h", "x")] == [(2, None, 3), (None, 3)]
+    h, x = np.arange(24, dtype=np.float32).reshape(2, 4, 3), np.ones((4, 3), np.float32)
+    got = run_graph(many, {"h": h, "x": x}, ["out", "y"])
+    np.testing.assert_array_equal(got["out"], h + x)
+    np.testing.assert_array_equal(got["y"], x)

@@ -18,27 +18,31 @@ from converters.graph.ops.per_row import Rows, rule_of
 from converters.graph.ops.table import op_of
 from converters.graph.passes.fold import fold
 from converters.graph.passes.normalise import normalise
-from converters.graph.types import BATCH
+from converters.graph.types import BATCH, TensorType
 
 #: What is drawn is drawn for each agent.
 _SAMPLERS = ("normal", "truncated normal", "uniform")
 
 
-def for_every_row(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, bool]) -> Graph:
+def for_every_row(
+    graph: Graph, outputs: Sequence[str], inputs: Mapping[str, int | None], ends: Mapping[str, int] | None = None
+) -> Graph:
     """The graph upstream of the nodes ``outputs``, which keep their names.
 
-    ``inputs`` are the placeholders that each agent has its own of; True: the first axis is of length 1 and becomes that
-    of the agents, False: they get one. An output's first axis of length 1 becomes the agents' where an input's did.
-    Raises UnsupportedOpError where an op has no such form, or a shape is not known.
+    ``inputs`` are the placeholders that each agent has its own of, with the axis of length 1 that becomes that of the
+    agents; None: they get one in front. ``ends`` has that axis for outputs; one that is not in it has it in front, in
+    place of a first axis of length 1 where an input's was one. Raises UnsupportedOpError where an op has no such form,
+    or a shape is not known.
     """
-    return _Turned(fold(normalise(graph.pruned(outputs))), inputs).run(outputs)
+    return _Turned(fold(normalise(graph.pruned(outputs))), inputs, ends or {}).run(outputs)
 
 
 class _Turned(Rows):
-    def __init__(self, graph: Graph, inputs: Mapping[str, bool]) -> None:
+    def __init__(self, graph: Graph, inputs: Mapping[str, int | None], ends: Mapping[str, int]) -> None:
         super().__init__(graph)
         self.graph = graph
         self.inputs = inputs
+        self.ends = ends
 
     def run(self, outputs: Sequence[str]) -> Graph:
         results = {name: self.b.names.fresh(f"{name}/row") for name in outputs if name not in self.inputs}
@@ -57,18 +61,25 @@ class _Turned(Rows):
         return self.b.graph()
 
     def _input(self, node: Node) -> None:
-        dims = self.shape(node.name)
-        leading = self.inputs[node.name]
-        shape = (None, *(dims[1:] if leading else dims))
-        self.b.append(replace(node, attrs={**node.attrs, "shape": TensorShape(shape)}))
-        self.at[node.name] = self.b.reshape(node.name, (BATCH, *dims)) if leading else node.name
+        dims, axis = self.shape(node.name), self.inputs[node.name]
         self.own.add(node.name)
+        if axis is None:
+            self.at[node.name] = self.b.append(_shaped(node, (None, *dims)))
+            return
+        given = self.b.append(_shaped(node, (*dims[:axis], None, *dims[axis + 1 :])))
+        if axis:
+            known = tuple(BATCH if i == axis else d for i, d in enumerate(dims))
+            self.b.types[given] = TensorType(self.b.dtype(given), known)
+            given = self.b.transpose(given, [axis, *(i for i in range(len(dims)) if i != axis)])
+        self.at[node.name] = self.b.reshape(given, (BATCH, *dims))
 
     def _output(self, name: str, inner: str) -> None:
         dims = self.shape(name)
-        leading = any(self.inputs.values()) and dims[:1] == (1,)
-        if leading:
-            inner = self.b.reshape(inner, (BATCH, *dims[1:]))
+        axis = self.ends.get(name, 0)
+        leading = name in self.ends or any(a is not None for a in self.inputs.values())
+        if leading and len(dims) > axis and dims[axis] == 1:
+            inner = self.b.reshape(inner, (BATCH, *dims[:axis], *dims[axis + 1 :]))
+            inner = self.b.transpose(inner, [*range(1, axis + 1), 0, *range(axis + 1, len(dims))])
         self.b.append(Node(name, "Identity", (inner,), origin=self.graph[name].origin))
 
     def _node(self, node: Node, name: str | None) -> None:
@@ -87,3 +98,7 @@ class _Turned(Rows):
 
     def _stand(self, node: Node, results: Sequence[str]) -> None:
         self.at.update((ref(node.name, i), result) for i, result in enumerate(results))
+
+
+def _shaped(node: Node, dims: tuple[int | None, ...]) -> Node:
+    return replace(node, attrs={**node.attrs, "shape": TensorShape(dims)})
