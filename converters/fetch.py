@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import stat
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,6 +13,8 @@ from signatures.errors import DamagedFileError, SourceError
 
 #: Protobuf's own limit; no policy comes near it.
 MAX_BYTES = (2 << 30) - 1
+#: As a path keeps an address: with one slash of the two.
+_ADDRESS = re.compile("(https?|ftps?|s3|gs|hf|ssh|git)://?")
 
 
 class Fetched:
@@ -64,7 +67,7 @@ def read_bytes(path: Path, *, empty: bool = False) -> bytes:
             )
         data = path.read_bytes()
     except FileNotFoundError as error:
-        raise SourceError("no such file", where=str(path), fix=_neighbours(path)) from error
+        raise _missing(path) from error
     except OSError as error:
         raise unreadable(path, error) from error
     except ValueError as error:  # a null character in the path
@@ -77,6 +80,20 @@ def read_bytes(path: Path, *, empty: bool = False) -> bytes:
 def unreadable(path: Path, error: OSError) -> SourceError:
     """What the system refused."""
     return SourceError("cannot be read", where=str(path), why=error.strerror, fix="check the path and its permissions")
+
+
+def _missing(path: Path) -> SourceError:
+    """There is no such file; an address is none."""
+    scheme = _ADDRESS.match(path.as_posix())
+    if scheme is None:
+        return SourceError("no such file", where=str(path), fix=_neighbours(path))
+    address = f"{scheme[1]}://{path.as_posix()[scheme.end() :]}"
+    return SourceError(
+        "is an address, not a file",
+        where=address,
+        why="nothing is fetched from the network",
+        fix="download it (the raw file, not the page that shows it), and give the file",
+    )
 
 
 def _neighbours(path: Path) -> str:

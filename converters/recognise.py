@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from converters.checkpoint import listing
@@ -13,6 +15,30 @@ from signatures.errors import NotAPolicyError, SourceError
 
 _UNITY_ASSET = (b"UnityFS", b"UnityRaw", b"UnityWeb", b"%YAML 1.1\n%TAG !u!")
 _UNPACK = "unpack it and give the model inside"
+_NOT_A_MODEL = "give a model file"
+
+
+def _marked(at: int, marks: Sequence[bytes], file: Content) -> bool:
+    return any(file.head[at : at + len(mark)] == mark for mark in marks)
+
+
+#: Key, name, advice, where the mark stands, and the marks.
+_OTHERS: tuple[tuple[str, str, str, int, *tuple[bytes, ...]], ...] = (
+    ("png", "a PNG picture", _NOT_A_MODEL, 0, b"\x89PNG\r\n"),
+    ("jpeg", "a JPEG picture", _NOT_A_MODEL, 0, b"\xff\xd8\xff"),
+    ("gif", "a GIF picture", _NOT_A_MODEL, 0, b"GIF87a", b"GIF89a"),
+    ("pdf", "a PDF document", _NOT_A_MODEL, 0, b"%PDF-"),
+    ("video", "a video", _NOT_A_MODEL, 4, b"ftyp"),
+    ("npy", "a NumPy array", "give the model that it belongs to", 0, b"\x93NUMPY"),
+    ("xz", "an xz archive", _UNPACK, 0, b"\xfd7zXZ"),
+    ("bzip2", "a bzip2 archive", _UNPACK, 0, b"BZh"),
+    ("7z", "a 7z archive", _UNPACK, 0, b"7z\xbc\xaf\x27\x1c"),
+    ("rar", "a RAR archive", _UNPACK, 0, b"Rar!\x1a"),
+    ("zstd", "a Zstandard archive", _UNPACK, 0, b"\x28\xb5\x2f\xfd"),
+    ("tar", "a tar archive", _UNPACK, 257, b"ustar"),
+    ("program", "a program or library", _NOT_A_MODEL, 0, b"\x7fELF", b"MZ\x90", b"\xcf\xfa\xed\xfe"),
+    ("sqlite", "an SQLite database", _NOT_A_MODEL, 0, b"SQLite format 3"),
+)
 #: What people give and no reader takes, the particular before the general.
 REFUSED = (
     Format(
@@ -44,6 +70,15 @@ REFUSED = (
         label="a web page",
         advice="download the raw file instead of the page that shows it",
         sniff=lambda file: (file.text or "").lower().startswith(("<!doctype", "<html")),
+    ),
+    *(
+        Format(
+            key=key,
+            label=label,
+            advice=advice,
+            sniff=partial(_marked, at, marks),
+        )
+        for key, label, advice, at, *marks in _OTHERS
     ),
     Format(key="json", label="JSON", advice="give a model file", sniff=lambda file: file.json is not None),
     Format(key="zip", label="a ZIP archive", advice=_UNPACK, sniff=lambda file: file.starts(b"PK\x03\x04")),

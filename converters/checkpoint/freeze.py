@@ -21,6 +21,9 @@ from converters.understand.brains import find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.roles import CONSTANT_NAMES
 
+_IN_A_CHECKPOINT = "it is the graph that training started from; the values are in a checkpoint, and none lies beside it"
+_GIVE_THAT = "give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended"
+
 
 class Values(Protocol):
     """Where the values of variables are: a checkpoint, or what a session holds."""
@@ -51,12 +54,17 @@ class Frozen:
     values: Mapping[str, np.ndarray]
 
 
-def freeze(training: TrainingGraph, checkpoint: Values | None, roots: Sequence[str] | None = None) -> Frozen:
+def freeze(
+    training: TrainingGraph,
+    checkpoint: Values | None,
+    roots: Sequence[str] | None = None,
+    where: tuple[str, str] = (_IN_A_CHECKPOINT, _GIVE_THAT),
+) -> Frozen:
     """The graph with its variables' values.
 
     Raises NotAPolicyError or DamagedFileError when a variable that the policy needs has no value, or one that does not
     fit. ``checkpoint`` has the values; it is None where there is none: a graph may do without. ``roots`` are the
-    policy's outputs; by default they are found by their names.
+    policy's outputs; by default they are found by their names. ``where`` says why there may be no values, and the fix.
     """
     graph = training.graph
     variables = {n.name: n for n in graph.nodes if n.op in VARIABLES}
@@ -74,7 +82,7 @@ def freeze(training: TrainingGraph, checkpoint: Values | None, roots: Sequence[s
         names = [name for name in missing if name in needed]
         if names:
             keys = [missing[n] for n in names]
-            raise _without_values(keys) if checkpoint is None else checkpoint.missing(keys)
+            raise _without_values(keys, *where) if checkpoint is None else checkpoint.missing(keys)
     return Frozen(frozen, values)
 
 
@@ -135,12 +143,12 @@ def _checked(node: Node, value: np.ndarray, checkpoint: Values) -> np.ndarray:
     return value
 
 
-def _without_values(keys: Sequence[str]) -> NotAPolicyError:
+def _without_values(keys: Sequence[str], why: str, fix: str) -> NotAPolicyError:
     """The error for a graph that has variables, where nothing has their values."""
     return NotAPolicyError(
         f"the graph has variables and no values for them: {several(keys)}",
-        why="it is the graph that training started from; the values are in a checkpoint, and none lies beside it",
-        fix="give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended",
+        why=why,
+        fix=fix,
     )
 
 

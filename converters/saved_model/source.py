@@ -11,7 +11,9 @@ from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
+from converters.content import Content
 from converters.fetch import Fetched
+from converters.frozen_graph import source as frozen_graph
 from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
@@ -21,6 +23,10 @@ from converters.understand.facts import SourceFacts
 from signatures.errors import NotAPolicyError
 
 FILE = "saved_model.pb"
+_WITHOUT_VARIABLES = (
+    f"the values of a SavedModel are in the folder variables/, which does not lie beside its {FILE}",
+    f"give the whole folder as it was saved: {FILE}, variables/",
+)
 
 
 def read(given: Fetched) -> list[SourceModel]:
@@ -28,6 +34,8 @@ def read(given: Fetched) -> list[SourceModel]:
     path = given.path
     folder = path if path.is_dir() else path.parent
     file = folder / FILE if path.is_dir() else path
+    if Content(given.bytes_of(file)).is_graph:  # some give a frozen graph this name
+        return frozen_graph.read(given.inside(file))
     saved = read_saved_model(given.bytes_of(file))
     frozen = frozen_model(saved, folder)
     graph, contract = recalled(frozen.graph)
@@ -57,7 +65,7 @@ def frozen_model(saved: Saved, folder: Path) -> FrozenModel:
     prefix = folder / "variables" / "variables"
     checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
     training, signature = _inlined(saved) if saved.calls else (training_graph(saved.graph_def), saved.signature)
-    frozen = freeze(training, checkpoint, signature.roots or None)
+    frozen = freeze(training, checkpoint, signature.roots or None, _WITHOUT_VARIABLES)
     definition = fed_by_signature(with_values(training.definition, frozen.values), signature)
     return FrozenModel(frozen.graph, definition, signature, () if checkpoint is None else checkpoint.files)
 

@@ -111,6 +111,7 @@ def export_command(
     This is the command that is meant where none is named.
     """
     from exporter.export.pipeline import ExportOptions, export
+    from exporter.fleet.sources import is_many
 
     if profile == "help":
         console.profiles()
@@ -128,7 +129,7 @@ def export_command(
         labels,
         profile,
     )
-    if jobs is not None or again or fail_fast or _is_many(sources):
+    if jobs is not None or again or fail_fast or is_many(sources):
         from exporter.cli.fleet import run_fleet
 
         run_fleet(sources, job, jobs or 1, again, fail_fast, console)
@@ -155,14 +156,6 @@ def export_command(
         sys.exit(2)
     if any(r.passed is False for r in results):
         sys.exit(1)
-
-
-def _is_many(sources: Sequence[Path]) -> bool:
-    if all(path.is_file() and path.suffix != ".txt" for path in sources):  # nearly always; what follows reads files
-        return False
-    from exporter.fleet.sources import is_many
-
-    return is_many(sources)
 
 
 def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:

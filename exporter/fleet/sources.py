@@ -20,12 +20,15 @@ _TELLING = ("lfs_pointer",)
 
 def is_many(given: Sequence[Path]) -> bool:
     """Whether one of the paths stands for others: a pattern, a list, or a folder that is no source itself."""
-    return any(
-        (path.is_dir() and not _is_source(path))
-        or (not path.exists() and not _MAGIC.isdisjoint(str(path)))
-        or (path.suffix == ".txt" and path.is_file())
-        for path in given
-    )
+    try:
+        return any(
+            (path.is_dir() and not _is_source(path))
+            or (not path.exists() and not _MAGIC.isdisjoint(str(path)))
+            or (path.suffix == ".txt" and path.is_file())
+            for path in given
+        )
+    except (OSError, ValueError):  # what cannot be a path: its reader says why
+        return False
 
 
 def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
