@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +168,29 @@ def test_out_writes_the_site_and_replaces_only_its_own(bundle: Bundle, tmp_path:
     assert export_model("serve", bundle("3DBall"), "--out", place).status == 0
     assert not (place / "old.txt").exists()
     assert files_in(tmp_path / "deep") == {"page", *(f"page/{n}" for n in files_in(place))}
+
+
+def test_a_camera_is_painted_in_the_layout_that_its_policy_takes() -> None:
+    """PyTorch's images are [C, H, W]: a pixel's channels do not lie side by side."""
+    node = javascript.node_executable()
+    if node is None:
+        pytest.skip("Node is not here")
+    script = f"""
+      import {{ fed, imageForm }} from "{(PAGE / "images.mjs").as_uri()}";
+      const pixels = Float32Array.from({{ length: 2 * 3 * 2 }}, (_, i) => i / 16);
+      const first = imageForm({{ shape: [null, 2, 2, 3] }}, {{ layout: "NCHW", range: [-16, 16] }});
+      const last = imageForm({{ shape: [null, 2, 3, 2] }}, {{ layout: "NHWC", range: [0, 16] }});
+      const plain = ({{ data, shape }}) => [[...data], shape];
+      const free = imageForm({{ shape: [null, null, null, 3] }});
+      console.log(JSON.stringify([plain(fed(pixels, first)), plain(fed(pixels, last)), free]));
+    """
+    command = [node, "--input-type=module", "--eval", script]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
+    (first, shape), (last, _), free = json.loads(done.stdout)
+    rows = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
+    np.testing.assert_allclose(np.reshape(first, shape), rows.transpose(2, 0, 1)[None] * 2 - 16)
+    np.testing.assert_allclose(np.reshape(last, (2, 3, 2)), rows)
+    assert (free["height"], free["width"], free["channels"]) == (36, 36, 3)
 
 
 def test_a_source_is_exported_for_the_page(bundle: Bundle, tmp_path: Path) -> None:

@@ -2,9 +2,9 @@
 
 import { Strip } from "./charts.mjs";
 import { h, newId } from "./dom.mjs";
+import { fed, imageForm } from "./images.mjs";
 
-/** What a free axis behind the batch is: image sides, number of entities. */
-const FREE_SIDE = 36;
+/** What a free axis behind the batch is, where it is no image: the number of entities. */
 const FREE_COUNT = 4;
 /** Sliders beyond these are folded away. */
 const SHOWN = 16;
@@ -99,14 +99,12 @@ export class Picture {
   #pixels;
   #canvas;
   #brush;
-  #channels;
+  #form;
 
-  constructor(spec, changed) {
+  constructor(spec, preprocess, changed) {
     this.name = spec.name;
-    const [height, width, channels] = spec.shape.slice(1).map((n, i) => n ?? (i < 2 ? FREE_SIDE : 1));
-    this.#channels = channels;
-    this.high = spec.distribution?.high ?? 1;
-    this.shape = [1, height, width, channels];
+    this.#form = imageForm(spec, preprocess);
+    const { height, width, channels } = this.#form;
     this.#pixels = new Float32Array(height * width * channels);
     this.changed = changed;
     this.#canvas = h("canvas", { class: "picture", width, height, role: "img" });
@@ -140,7 +138,7 @@ export class Picture {
   }
 
   value() {
-    return { data: this.#pixels.map((v) => v * this.high), shape: this.shape };
+    return fed(this.#pixels, this.#form);
   }
 
   middle() {
@@ -153,12 +151,12 @@ export class Picture {
 
   #colour() {
     const { value, type } = this.#brush;
-    if (type !== "color") return new Array(this.#channels).fill(Number(value));
+    if (type !== "color") return new Array(this.#form.channels).fill(Number(value));
     return [1, 3, 5].map((at) => parseInt(value.slice(at, at + 2), 16) / 255);
   }
 
   #all(colourAt, tells = true) {
-    const [, , width, channels] = this.shape;
+    const { width, channels } = this.#form;
     this.#pixels.forEach((_, i) => {
       const place = Math.floor(i / channels);
       this.#pixels[i] = colourAt(Math.floor(place / width), place % width, i % channels);
@@ -168,7 +166,7 @@ export class Picture {
   }
 
   #paint(event) {
-    const [, height, width, channels] = this.shape;
+    const { height, width, channels } = this.#form;
     const box = this.#canvas.getBoundingClientRect();
     const x = Math.floor(((event.clientX - box.left) / box.width) * width);
     const y = Math.floor(((event.clientY - box.top) / box.height) * height);
@@ -184,7 +182,7 @@ export class Picture {
   }
 
   #show() {
-    const [, height, width, channels] = this.shape;
+    const { height, width, channels } = this.#form;
     const image = new ImageData(width, height);
     let sum = 0;
     for (let i = 0; i < width * height; i++) {

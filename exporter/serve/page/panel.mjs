@@ -47,7 +47,7 @@ export class Panel {
     const branches = contract.branches;
     const made = [];
     for (const spec of contract.inputs) {
-      if (spec.role === "visual_observation") made.push(this.#observation(new Picture(spec, changed)));
+      if (spec.role === "visual_observation") made.push(this.#observation(new Picture(spec, contract.preprocess?.[spec.name], changed)));
       else if (["vector_observation", "variable_length_observation"].includes(spec.role)) {
         made.push(this.#observation(new Vector(spec, names, changed)));
       } else if (spec.role === "parameter") {
