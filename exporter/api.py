@@ -109,7 +109,8 @@ def export_model(
     How to read it:
 
     - ``inputs``, ``outputs``: name → role, where it cannot be told from the graph; ``values``: placeholder → number.
-    - ``step``: a run's checkpoint (default: the newest); ``sensors``: shapes that a ``.pt`` does not tell.
+    - ``step``: a run's checkpoint (default: the newest); ``sensors`` (``goals``: which of them),
+      ``activation``: what a ``.pt`` does not tell.
     - ``trust_source``: load a Keras model, which can run code.
 
     How to verify:

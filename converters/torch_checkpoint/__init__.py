@@ -1,4 +1,4 @@
-"""PyTorch checkpoints of ML-Agents (``.pt``)."""
+"""PyTorch checkpoints (``.pt``): of ML-Agents, rsl_rl, CleanRL."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ FORMATS = (
         label="a PyTorch checkpoint (.pt)",
         sniff=_sniff,
         read=_read,
-        takes=frozenset({"sensors"}),
+        takes=frozenset({"sensors", "activation"}),
     ),
 )

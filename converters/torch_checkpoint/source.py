@@ -1,19 +1,39 @@
-"""A PyTorch checkpoint of ML-Agents as a source: what is left where the export to ONNX failed."""
+"""A PyTorch checkpoint as a source: of ML-Agents, of rsl_rl, of CleanRL's scripts."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from converters.fetch import Fetched
 from converters.source import ReadOptions, SourceModel
+from converters.torch_checkpoint import cleanrl, rsl_rl
 from converters.torch_checkpoint.archive import Archive
+from converters.torch_checkpoint.configuration import activation_of
 from converters.torch_checkpoint.policy import to_graph
 from converters.torch_checkpoint.state import State
+from signatures.errors import UsageError
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    """The one policy of a checkpoint (``checkpoint.pt``, ``<behavior>-<step>.pt``).
+    """The one policy of a checkpoint: ``<behavior>-<step>.pt``, ``model_<n>.pt``, ``<script>.cleanrl_model``.
 
     Raises NotAPolicyError for another file of PyTorch's, SourceError for a network that is not built or whose sensors
-    the weights do not tell, DamagedFileError, UsageError for sensors that do not fit.
+    or activation the weights do not tell, DamagedFileError, UsageError for options that do not fit.
     """
-    graph, facts = to_graph(State(Archive(given.data)), options.sensors, options.goals)
-    return [SourceModel(graph, (given.path,), facts)]
+    archive = Archive(given.data)
+    layout = rsl_rl.layout_of(archive.value)
+    if layout is not None:
+        activation, files, notes = activation_of(given, options.activation, rsl_rl.USUAL)
+        graph, facts = rsl_rl.to_graph(archive, layout, activation)
+    elif (found := cleanrl.state_of(archive.value)) is not None:
+        activation, files, notes = activation_of(given, options.activation, cleanrl.USUAL)
+        graph, facts = cleanrl.to_graph(archive, *found, activation, options.sensors)
+    else:
+        state = State(archive)
+        if options.activation is not None:
+            raise UsageError(
+                "--activation says nothing about ML-Agents", why="its networks have Swish", fix="leave it out"
+            )
+        graph, facts = to_graph(state, options.sensors, options.goals)
+        files, notes = (), ()
+    return [SourceModel(graph, (given.path, *files), replace(facts, notes=(*facts.notes, *notes)))]

@@ -30,11 +30,11 @@ class State(Weights):
             policy = value  # the actor's own state dictionary, saved by hand
         if not isinstance(policy, dict) or not _is_actor(policy):
             raise NotAPolicyError(
-                "is no checkpoint of ML-Agents",
-                why=f"it holds {_content(value)}; a checkpoint of ML-Agents holds Policy, with version_number and "
-                "network_body in it",
-                fix="a state dictionary does not say what is computed with it: export the model to ONNX in its own "
-                "project (torch.onnx.export), and give that",
+                "is no checkpoint of a policy whose network is known",
+                why=f"it holds {_content(value)}, not the names that ML-Agents, rsl_rl or CleanRL give; a state "
+                "dictionary does not say what is computed with it",
+                fix="export the model to ONNX in its own project (torch.onnx.export), and give that; of "
+                "Stable-Baselines3 give the .zip that model.save wrote",
             )
         super().__init__(archive, policy, holder="its Policy", maker="ML-Agents", fix=LET_IT_EXPORT)
         self.forget(*_NOT_POLICY)

@@ -52,7 +52,7 @@ def image(folder: Path, name: str) -> Path:
 def test_another_checkpoint_is_refused_with_what_it_holds(value: Any, words: str, tmp_path: Path) -> None:
     for data in (Writer().zip(value), Writer().row(value)):
         (tmp_path / "a.pth").write_bytes(data)
-        with pytest.raises(NotAPolicyError, match="no checkpoint of ML-Agents") as caught:
+        with pytest.raises(NotAPolicyError, match="no checkpoint of a policy") as caught:
             read_source(tmp_path / "a.pth")
         assert words in str(caught.value)
         assert "torch.onnx.export" in str(caught.value)

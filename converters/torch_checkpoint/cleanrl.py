@@ -1,0 +1,271 @@
+"""State dictionaries of CleanRL's scripts, by the names that they give their layers.
+
+Source: cleanrl/{ppo,ppo_continuous_action,ppo_atari,ppo_atari_lstm,dqn,dqn_atari,c51,pqn,sac_continuous_action,
+td3_continuous_action,ddpg_continuous_action}.py. What is no weight in them (activations, strides, tanh) follows from
+those scripts; the activation, which people change, must be said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from converters.graph.nn.normalisation import layer
+from converters.graph.nodes import Graph
+from converters.graph.types import FLOAT32, INT32, INT64
+from converters.torch_checkpoint.activations import Activation
+from converters.torch_checkpoint.archive import Archive
+from converters.torch_checkpoint.network import Network, rnn_sizes
+from converters.torch_checkpoint.rsl_rl import per_action
+from converters.torch_checkpoint.weights import Weights
+from converters.understand.facts import SourceFacts
+from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.roles import Role
+
+USUAL = "CleanRL's scripts have tanh in PPO, relu in DQN, C51, PQN, SAC, TD3, DDPG and before images"
+EXPORT_ONNX = "export the policy to ONNX in its own project (torch.onnx.export), and give that"
+#: The logarithm of SAC's deviation lies between these.
+_LOWEST, _HIGHEST = -5.0, 2.0
+#: (kernel, stride) of the convolutions before Atari's images.
+_WINDOWS = ((8, 4), (4, 2), (3, 1))
+
+_Outputs = dict[str, Role | None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Script:
+    """A kind of script: the names that tell it, what it is called, and what builds it."""
+
+    names: tuple[str, ...]
+    algorithm: str
+    build: Callable[[_Making], str]
+
+
+@dataclass
+class _Making:
+    net: Network
+    activation: Activation
+    told: Sequence[tuple[int, ...]]
+    outputs: _Outputs
+    notes: list[str]
+    memory: tuple[str, ...] = ()
+
+
+def state_of(value: Any) -> tuple[Mapping[Any, Any], _Script] | None:
+    """The policy's state dictionary in what was saved, and the kind of script; None where it is none of CleanRL's."""
+    candidates = [value, *(value if isinstance(value, tuple | list) else ())]
+    if isinstance(value, dict):
+        candidates += [value.get("model_weights"), value.get("actor")]
+    for state in candidates:
+        if not isinstance(state, dict):
+            continue
+        for script in _SCRIPTS:
+            if all(any(str(k).startswith(name) for k in state) for name in script.names):
+                return state, script
+    return None
+
+
+def to_graph(
+    archive: Archive, state: Mapping[Any, Any], script: _Script, activation: Activation, told: Sequence[tuple[int, ...]]
+) -> tuple[Graph, SourceFacts]:
+    """The policy and what is known of it; ``told`` says the image's shape, where there is one.
+
+    Raises SourceError for parts that are not known, DamagedFileError, UsageError.
+    """
+    weights = Weights(archive, state, holder="its policy", maker="CleanRL", fix=EXPORT_ONNX)
+    weights.forget("critic", "_critic")
+    making = _Making(Network(weights), activation, told, {}, [])
+    meaning = script.build(making)
+    weights.check_all_read()
+    facts = SourceFacts(
+        family="CleanRL",
+        algorithm=script.algorithm,
+        image_layout="NCHW",
+        memory_layout=making.memory,
+        outputs=making.outputs,
+        notes=(
+            "no runtime but PyTorch with the script reads it: the verdict on the export is that its formats are "
+            "self-consistent",
+            f"by the names of its layers it is of CleanRL's {script.algorithm}: {meaning}; observations that its "
+            "wrappers normalise or clip must come so",
+            *making.notes,
+        ),
+    )
+    return making.net.graph(), facts
+
+
+# ------------------------------------------------------------------ layers
+
+
+def _observed(making: _Making, first: str) -> str:
+    """The input that the layer ``first`` reads: numbers, or an image, whose size the user says; divided by 255."""
+    net = making.net
+    shape = net.state.shape(f"{first}.weight")
+    if len(shape) == 2:
+        if making.told and tuple(making.told) != ((shape[1],),):
+            raise UsageError(
+                "--sensors does not fit the checkpoint", why=f"it observes {shape[1]} numbers", fix="leave it out"
+            )
+        return net.input("obs", shape[1])
+    if len(making.told) != 1 or len(making.told[0]) != 3:
+        raise SourceError(
+            "the checkpoint does not tell the size of the image that it sees",
+            why="convolutions take any",
+            fix="say it: --sensors 4x84x84 (channels, height, width; CleanRL stacks four grey frames)",
+        )
+    (size,) = making.told
+    if len(shape) != 4 or size[0] != shape[1]:
+        raise UsageError(
+            "--sensors does not fit the checkpoint", why=f"its image has {shape[1]} channels", fix="say them"
+        )
+    making.notes.append("its image has colours from 0 to 255, which CleanRL's scripts divide by 255")
+    image = net.input("obs", *size)
+    net.at("obs_scaled")
+    return net.nhwc(net.add("RealDiv", [image, net.floats(255)]))
+
+
+def _layers(making: _Making, x: str, module: str, *, ends: bool) -> str:
+    """``nn.Sequential`` of convolutions, linear layers and layer norms, an activation after each but the last."""
+    net, state = making.net, making.net.state
+    found = state.indices(f"{module}.")
+    ranks = {index: len(state.shape(f"{module}.{index}.weight")) for index in found}
+    images = [index for index in found if ranks[index] == 4]
+    for index in found:
+        name = f"{module}.{index}"
+        if ranks[index] == 4:
+            kernel = state.length(f"{name}.weight", 2)
+            place = images.index(index)
+            if len(images) != len(_WINDOWS) or kernel != _WINDOWS[place][0]:
+                raise state.unknown(
+                    name, "its strides are not in the file, and its kernels are not those of CleanRL's scripts"
+                )
+            x = net.convolution(x, name, _WINDOWS[place][1])
+        elif ranks[index] == 1:
+            width = net.width(x)
+            scale, bias = (state.array(f"{name}.{part}", width) for part in ("weight", "bias"))
+            net.at(name)
+            x = layer(net, x, 1, net.const(scale, "scale"), net.const(bias, "bias"))[0]
+        else:
+            x = net.linear(net.flat(x) if net.rank(x) == 4 else x, name)
+        if (index != found[-1] or not ends) and ranks.get(index + 1) != 1:
+            x = making.activation(net, x)
+    return x
+
+
+def _trunk(making: _Making) -> str:
+    """fc1, fc2 … of SAC, TD3 and DDPG."""
+    net, x, number = making.net, _observed(making, "fc1"), 1
+    while f"fc{number}.weight" in net.state:
+        x = making.activation(net, net.linear(x, f"fc{number}"))
+        number += 1
+    return x
+
+
+def _scaled(net: Network, value: str) -> str:
+    """tanh, to the bounds of the action space."""
+    net.at("action")
+    value = net.add("Tanh", [value])
+    scale, bias = (
+        net.state.array(name, *(1,) * (len(net.state.shape(name)) - 1), net.width(value)).reshape(-1)
+        for name in ("action_scale", "action_bias")
+    )
+    return net.add("Add", [net.add("Mul", [value, net.const(scale, "scale")]), net.const(bias, "bias")])
+
+
+# ------------------------------------------------------------------ scripts
+
+
+def _ppo_continuous(making: _Making) -> str:
+    net = making.net
+    mean = _layers(making, _observed(making, "actor_mean.0"), "actor_mean", ends=True)
+    net.output("action", mean)
+    per_action(net, mean, net.state.array("actor_logstd", 1, net.width(mean)).reshape(-1), "action_log_std")
+    making.outputs.update(action=Role.ACTION, action_log_std=Role.LOG_STD)
+    return "action is the mean of a Gaussian, action_log_std the logarithm of its deviation"
+
+
+def _ppo_discrete(making: _Making) -> str:
+    """Logits of an actor, after a trunk that it shares with the critic or alone; a memory between them."""
+    net = making.net
+    shared = "network.0.weight" in net.state
+    alone = "actor.weight" in net.state
+    if shared:
+        x = _layers(making, _observed(making, "network.0"), "network", ends=False)
+    else:
+        first = "" if alone else ".0"
+        x = _observed(making, f"actor{first}")
+        critic = f"critic{first}.weight"
+        if critic in net.state and net.state.length(critic, 1) != net.width(x):
+            raise SourceError(
+                "its actor and its critic are of no PPO",
+                why="its critic reads other numbers than its actor: what bounds the actor's action is not in the file",
+                fix=EXPORT_ONNX,
+            )
+    if "lstm.weight_ih_l0" in net.state:
+        hidden, gates, layers = rnn_sizes(net.state, "lstm")
+        making.memory = ("h", "c") if gates == 4 else ("h",)
+        x, memory = net.recurrent(x, net.input("recurrent_in", len(making.memory) * layers * hidden), "lstm")
+        net.output("recurrent_out", memory)
+        making.outputs["recurrent_out"] = Role.MEMORY_OUT
+    logits = net.linear(x, "actor") if alone else _layers(making, x, "actor", ends=True)
+    net.at("action")
+    net.output("action", net.add("Multinomial", [logits, net.ints(1, "count")], output_dtype=INT64))
+    making.outputs["action"] = Role.ACTION
+    return f"one choice of {net.width(logits)} actions"
+
+
+def _values(making: _Making) -> str:
+    """Values per action, or (C51) probabilities of values per action."""
+    net = making.net
+    x = _layers(making, _observed(making, "network.0"), "network", ends=True)
+    if "atoms" in net.state:
+        atoms = net.state.array("atoms", None)
+        actions, rest = divmod(net.width(x), max(len(atoms), 1))
+        if rest or not actions:
+            raise DamagedFileError(
+                f"its network has {net.width(x)} outputs for {len(atoms)} values",
+                why="each action has all",
+                fix=EXPORT_ONNX,
+            )
+        net.at("q_values")
+        rows = net.reshape(net.add("Softmax", [net.reshape(x, (-1, len(atoms)))]), (-1, actions, len(atoms)))
+        x = net.reduce("Sum", net.add("Mul", [rows, net.const(atoms, "atoms")]), [2], keep=False)
+    net.output("q_values", x)
+    net.at("action")
+    best = net.add("ArgMax", [x, net.ints(1, "axis")], output_type=INT64)
+    net.output("action", net.reshape(best, (-1, 1)))
+    making.outputs.update(action=Role.ACTION, q_values=Role.OTHER)
+    return f"the action of the highest of {net.width(x)} values"
+
+
+def _sac(making: _Making) -> str:
+    net = making.net
+    x = _trunk(making)
+    mean = net.linear(x, "fc_mean")
+    logarithm = net.add("Tanh", [net.linear(x, "fc_logstd", net.width(mean))])
+    share = net.add("Mul", [net.add("Add", [logarithm, net.floats(1)]), net.floats((_HIGHEST - _LOWEST) / 2)])
+    spread = net.add("Exp", [net.add("Add", [share, net.floats(_LOWEST)])])
+    shape = net.add("Shape", [mean], "shape", out_type=INT32)
+    noise = net.add("RandomStandardNormal", [shape], origin="action/RandomStandardNormal", dtype=FLOAT32)
+    net.output("action", _scaled(net, net.add("Add", [mean, net.add("Mul", [noise, spread])])))
+    making.outputs["action"] = Role.ACTION
+    return "the action is drawn, squashed by tanh and scaled"
+
+
+def _td3(making: _Making) -> str:
+    net = making.net
+    net.output("action", _scaled(net, net.linear(_trunk(making), "fc_mu")))
+    making.outputs["action"] = Role.ACTION
+    return "the action is squashed by tanh and scaled"
+
+
+_SCRIPTS = (
+    _Script(("actor_mean.0.", "actor_logstd"), "PPO", _ppo_continuous),
+    _Script(("fc1.", "fc_mean.", "fc_logstd.", "action_scale", "action_bias"), "SAC", _sac),
+    _Script(("fc1.", "fc_mu.", "action_scale", "action_bias"), "TD3 or DDPG", _td3),
+    _Script(("actor.0.", "critic."), "PPO", _ppo_discrete),
+    _Script(("actor.weight", "critic."), "PPO", _ppo_discrete),
+    _Script(("network.0.", "atoms"), "C51", _values),
+    _Script(("network.0.",), "DQN or PQN", _values),
+)

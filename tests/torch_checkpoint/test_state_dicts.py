@@ -1,0 +1,126 @@
+"""Checkpoints of rsl_rl and CleanRL's scripts against what their modules gave (fixtures/state_dicts)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.graph.run import run_graph
+from converters.source import ReadOptions
+from exporter.export.sources import read_source
+from fixtures.goldens import read_npz
+from fixtures.state_dicts import FOLDER, ROWS
+from fixtures.torch_checkpoint.cases import waves
+from signatures.errors import NotAPolicyError, SourceError, UsageError
+from signatures.roles import Role
+from tests.commands import export_model
+from tests.torch_checkpoint.pt_files import Writer
+
+ACTIVATIONS = {
+    **dict.fromkeys(("rsl_2_3", "rsl_5_5", "rsl_5_5_gru"), "elu"),
+    **dict.fromkeys(("rsl_3_1_lstm", "clean_ppo", "clean_ppo_continuous"), "tanh"),
+    "rsl_3_1_student": "selu",
+}
+EYE = ((2, 36, 38),)
+
+
+def tensors(name: str) -> dict[str, dict[str, np.ndarray]]:
+    """The checkpoint's state dictionaries by key."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for key, layout in json.loads((FOLDER / f"{name}.json").read_text()).items():
+        found[key] = {
+            n: np.array(e["values"], e["dtype"]).reshape(e["shape"]) if "values" in e else waves(n, e["shape"])
+            for n, e in layout.items()
+        }
+    return found
+
+
+def saved(folder: Path, name: str, **changed: Any) -> Path:
+    """A file as torch.save writes it; a state dictionary alone where it has no key."""
+    writer = Writer()
+    states = {key: writer.state({**state, **changed}) for key, state in tensors(name).items()}
+    path = folder / f"{name}.pt"
+    path.write_bytes(writer.zip(states.get("", {**states, "iter": 7, "infos": None})))
+    return path
+
+
+def options(name: str) -> ReadOptions:
+    eye = "atari" in name
+    return ReadOptions(sensors=EYE if eye else (), activation=ACTIVATIONS.get(name, "relu"))
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in FOLDER.glob("*.npz")))
+def test_gives_what_the_modules_give(name: str, tmp_path: Path) -> None:
+    (policy,) = read_source(saved(tmp_path, name), options(name)).policies()
+    golden = read_npz(FOLDER / f"{name}.npz")
+    given = {k.removeprefix("in/"): v for k, v in golden.items() if k.startswith("in/")}
+    feeds = {}
+    for spec in policy.signature.inputs:
+        key = spec.source if spec.source in given else spec.name
+        feeds[spec.name] = given[str(key)].reshape(tuple(ROWS if n is None else n for n in spec.shape))
+    answers = run_graph(policy.graph, feeds, [s.name for s in policy.signature.outputs])
+    wanted = {k: v for k, v in golden.items() if not k.startswith("in/")}
+    if "logits" in wanted:  # drawn: what the draw is taken from
+        logits = wanted.pop("logits").astype(np.float64)
+        wanted["action_log_probs"] = logits - np.log(np.exp(logits).sum(1, keepdims=True))
+        wanted["deterministic_action"] = logits.argmax(1)
+    for output, value in wanted.items():
+        assert answers[output].reshape(value.shape) == pytest.approx(value, abs=2e-6, rel=2e-5), output
+    unchecked = {s.name for s in policy.signature.outputs if s.role is not Role.SAMPLED} - set(wanted)
+    assert unchecked <= {"deterministic_action"}
+
+
+@pytest.mark.parametrize("name", ["rsl_5_5", "clean_ppo"])
+def test_the_activation_is_asked_for_and_never_guessed(name: str, tmp_path: Path) -> None:
+    path = saved(tmp_path, name)
+    with pytest.raises(SourceError, match="what stands between the layers") as caught:
+        read_source(path)
+    assert f"--activation NAME ({'rsl_rl' if name == 'rsl_5_5' else 'CleanRL'}" in str(caught.value)
+    exported = export_model(path, "-o", tmp_path / "out", "--activation", "elu", "--verify", "none")
+    assert exported.status == 0, exported.err
+    again = export_model(
+        "verify", tmp_path / "out" / name, "--source", path, "--runtimes", "numpy", "--allow-unverified"
+    )
+    assert again.status == 0, again.err
+
+
+def test_the_activation_that_isaac_lab_wrote_is_taken(tmp_path: Path) -> None:
+    path = saved(tmp_path, "rsl_5_5")
+    (tmp_path / "params").mkdir()
+    agent = tmp_path / "params/agent.yaml"
+    agent.write_text(
+        "seed: 42\npolicy:\n  class_name: ActorCritic\n  activation: tanh\nalgorithm:\n  activation: relu\n"
+    )
+    (policy,) = read_source(path).policies()
+    assert any("its activation is tanh, as params/agent.yaml says" in note for note in policy.signature.notes)
+    assert sum(n.op == "Tanh" for n in policy.graph.nodes) == 2
+    with pytest.raises(UsageError, match=r"contradicts params/agent\.yaml"):
+        read_source(path, ReadOptions(activation="elu"))
+    agent.write_text("actor:\n  activation: tanh\nstudent:\n  activation: relu\n")  # two: neither is taken
+    with pytest.raises(SourceError, match="what stands between the layers"):
+        read_source(path)
+
+
+def test_what_the_weights_do_not_tell_is_refused_and_named(tmp_path: Path) -> None:
+    weight = np.ones((4, 4), np.float32)
+    for name, more, words in (
+        ("rsl_5_5", {"cnns.0.weight": weight}, "cnns.0.weight"),
+        ("clean_ppo", {"critic.0.weight": np.ones((1, 9), np.float32)}, "are of no PPO"),
+        ("clean_ppo", {"std": np.ones(4, np.float32)}, "not read from a checkpoint: std"),
+        ("clean_dqn_atari", {"network.0.weight": np.ones((4, 2, 5, 5), np.float32)}, "its strides are not in the file"),
+    ):
+        with pytest.raises(SourceError) as caught:
+            read_source(saved(tmp_path, name, **more), options(name))
+        assert words in str(caught.value), name
+    with pytest.raises(SourceError, match="the size of the image") as caught:
+        read_source(saved(tmp_path, "clean_dqn_atari"), ReadOptions(activation="relu"))
+    assert "--sensors 4x84x84" in str(caught.value)
+    writer = Writer()
+    state = writer.state({"mlp_extractor.policy_net.0.weight": weight, "action_net.weight": weight})
+    (tmp_path / "policy.pth").write_bytes(writer.zip(state))
+    with pytest.raises(NotAPolicyError, match=r"give the \.zip"):
+        read_source(tmp_path / "policy.pth")
