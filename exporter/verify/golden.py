@@ -8,6 +8,8 @@ are then zero, masks allow everything. Arrays under the names of outputs are the
 from __future__ import annotations
 
 import math
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -26,6 +28,11 @@ from signatures.spec import PolicySignature, TensorSpec
 _ROWS = 64
 #: A recording may unpack to this many bytes, and so many times its own.
 MAX_UNPACKED_FREE, MAX_UNPACKED_FACTOR = 1 << 26, 20
+#: What zipfile, and numpy where it reads a header, raise for a damaged archive.
+_BROKEN = (
+    *(OSError, ValueError, TypeError, EOFError, MemoryError, OverflowError, NotImplementedError, RuntimeError),
+    *(SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error),
+)
 _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
 
 
@@ -87,16 +94,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 raise UsageError("--golden: is one array, not an archive", where=str(path), fix="numpy.savez(FILE, …)")
             with archive:
                 return {name: archive[name] for name in archive.files}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        MemoryError,
-        OverflowError,
-        RuntimeError,
-        zlib.error,
-        zipfile.BadZipFile,
-    ) as error:
+    except _BROKEN as error:
         raise UsageError(
             "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"
         ) from error

@@ -31,6 +31,7 @@ ENTRIES = {
     "a header of four EiB": header((1 << 60,)),
     "a header of numbers that overflow": header((1 << 62, 1 << 62)),
     "a pickle": header((1,), "|O") + b"cos\nsystem\n(S'touch marker'\ntR.",
+    "a header that does not end": header((1,)).replace(b"}", b"("),
     "no header": b"state",
     "nothing": b"",
 }
