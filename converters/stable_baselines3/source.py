@@ -20,7 +20,7 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 
 _DATA, _POLICY = "data", "policy.pth"
 #: Stable-Baselines3 does not compress; a ZIP that was packed again shrinks JSON to a tenth, weights hardly.
-_MOST = 64
+_MOST, _MOST_ADDED = 64, 64 << 20
 _COPY_AGAIN = "copy or download it again"
 
 
@@ -57,10 +57,10 @@ def _entries(data: bytes) -> list[bytes]:
             found = []
             for name in (_DATA, _POLICY):
                 entry = archive.getinfo(name)
-                if entry.file_size > _MOST * len(data):
+                if entry.file_size > min(_MOST * len(data), len(data) + _MOST_ADDED):
                     raise DamagedFileError(
                         f"its entry {name!r} unfolds to {entry.file_size} bytes",
-                        why=f"that is more than {_MOST} times the file",
+                        why=f"that is more than {_MOST} times the file, or {_MOST_ADDED >> 20} MiB more",
                         fix="save the model again: model.save",
                     )
                 with archive.open(entry) as stream:

@@ -224,7 +224,7 @@ def shape_error(node: Node, args: Sequence[TensorType], why: str) -> GraphError:
 
 
 #: What Python and numpy raise where a node has fewer inputs, other ranks or other attributes than its op.
-MISFIT = (IndexError, KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
+MISFIT = (IndexError, KeyError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError)
 
 
 def misfit(node: Node, error: Exception) -> GraphError:

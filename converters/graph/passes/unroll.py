@@ -60,7 +60,10 @@ def unroll(graph: Graph) -> Graph:
         wanted = _INPUTS.get(CONTROL_FLOW[node.op])
         if not node.inputs or (wanted is not None and len(node.inputs) != wanted):
             raise _broken(node, f"it has {len(node.inputs)} inputs")
-    return _Unroller(graph).run() if flow else graph
+    try:
+        return _Unroller(graph).run() if flow else graph
+    except RecursionError as error:
+        raise _broken(flow[0], "its loop or branch is deeper than any of a policy, or contains itself") from error
 
 
 class _Unroller:
@@ -76,13 +79,18 @@ class _Unroller:
         self.predicates = {self.frames[n.name]: n for n in graph.nodes if n.op == "LoopCond" and n.name in self.frames}
 
     def run(self) -> Graph:
+        read = {split_ref(r)[0] for n in self.graph.nodes for r in n.inputs}
         for node in self.graph.nodes:
             if node.name in self.frames:
                 continue  # loop bodies are made on demand, once per turn
             try:
                 self.tensor(node.name, None)
             except _DeadError:
-                continue
+                if node.name not in read:  # an output
+                    raise GraphError(
+                        f"the output {node.origin!r} lies on the side of a branch that is not taken",
+                        fix="the graph is damaged; freeze it again from its checkpoint",
+                    ) from None
         return self.editor.graph()
 
     # ---- one tensor of the old graph, at one turn of its loop
