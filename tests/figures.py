@@ -3,6 +3,7 @@
 It writes docs/figures.json and docs/figures.md. Every frozen graph of ../shared/genuine and ../shared/corpus is
 exported to four formats and verified in all runtimes that are installed; in browsers too with ``--browsers``. The page
 says nothing that depends on the machine's place or speed.
+``python -m tests.figures --profiles`` counts what each profile of ``--for`` holds and refuses (tests/targets/sweep.py),
 ``python -m tests.figures --page`` writes the page anew from the figures that are there.
 """
 
@@ -123,6 +124,10 @@ def measured(files: Sequence[tuple[str, Path]], runtimes: Sequence[str]) -> Iter
             print(f"{number} of {len(files)}: {file.name}", file=sys.stderr, flush=True)
 
 
+def _today() -> str:
+    return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+
+
 def figures(files: Sequence[tuple[str, Path]], runtimes: Sequence[str]) -> dict[str, Any]:
     """Everything that is measured, as JSON."""
     cells: dict[tuple[str, str, str], Cell] = defaultdict(Cell)
@@ -139,7 +144,7 @@ def figures(files: Sequence[tuple[str, Path]], runtimes: Sequence[str]) -> dict[
             cells[kind, comparison.format, comparison.runtime].add(policy, comparison)
         versions.update({n: str(e["version"]) for n, e in report.runtimes.items() if e["status"] == "ran"})
     return {
-        "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        "date": _today(),
         "files": len(files),
         "policies": dict(counts),
         "kinds": {k: kinds[k] for k in KINDS if kinds[k]},
@@ -232,8 +237,40 @@ def page(content: Mapping[str, Any]) -> str:
         "## Runtimes",
         "",
         *_table(["runtime", "version"], [[r, v] for r, v in content["runtimes"].items()]),
+        *(_profiles(content["unity"]) if "unity" in content else []),
     ]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _profiles(counted: Mapping[str, Any]) -> list[str]:
+    """The section on ``--for``."""
+    unread = sum(counted["unread"].values())
+    return [
+        "## Unity",
+        "",
+        f"Counted on {counted['date']} by `python -m tests.figures --profiles`: {counted['files']} files and folders "
+        f"(public models, genuine trainings, other trainers), of which {unread} are not read as a policy; the others "
+        f"hold {counted['policies']}. *Held* is written, has no construct or layer that an importer of that profile "
+        "misreads by the recorded verdicts, and is accepted by our checkers of its releases. That what is held acts as "
+        "the policy does is run by the tests: ONNX in onnxruntime, `.bytes` in TensorFlow 1.4 and 1.7, `.nn` by the "
+        "layer rules of the format.",
+        "",
+        *_table(
+            ["`--for`", "format", "held", "refused", "why"],
+            [
+                [
+                    f"`{c['profile']}`",
+                    c["format"],
+                    c["held"],
+                    sum(c["refused"].values()),
+                    "; ".join(f"{why}: {n}" for why, n in c["refused"].items()),
+                ]
+                for c in counted["profiles"]
+            ],
+        ),
+        "Not read: " + "; ".join(f"{why}: {n}" for why, n in counted["unread"].items()) + ".",
+        "",
+    ]
 
 
 def _spread(found: Sequence[Mapping[str, Any]]) -> list[object]:
@@ -253,8 +290,15 @@ def main() -> int:
     parser.add_argument("--browsers", action="store_true", help="also the runtimes in Chromium")
     parser.add_argument("--only", default="", help="only files whose path holds this; nothing is written to docs/")
     parser.add_argument("--page", action="store_true", help="only the page, from the figures that are there")
+    parser.add_argument("--profiles", action="store_true", help="only what each profile of --for holds")
     options = parser.parse_args()
-    if not options.page:
+    before = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.is_file() else {}
+    if options.profiles:
+        from tests.targets import sweep
+
+        counted = {"date": _today(), **sweep.swept(sweep.sources())}
+        FIGURES.write_text(json.dumps({**before, "unity": counted}, indent=1) + "\n", encoding="utf-8")
+    elif not options.page:
         files = [(origin, f) for origin, f in sources() if options.only in str(f)]
         if not files or not SHARED.is_dir():
             print("not measured: ../shared is not beside this checkout")
@@ -264,7 +308,8 @@ def main() -> int:
         if options.only:
             print(page(content))
             return 1 if content["failed"] else 0
-        FIGURES.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        kept = {"unity": before["unity"]} if "unity" in before else {}
+        FIGURES.write_text(json.dumps({**content, **kept}, indent=1) + "\n", encoding="utf-8")
     content = json.loads(FIGURES.read_text(encoding="utf-8"))
     PAGE.write_text(page(content), encoding="utf-8")
     print(f"wrote {PAGE.relative_to(DOCS.parent)}; failed: {', '.join(content['failed']) or 'none'}")

@@ -15,6 +15,13 @@ def test_the_page_is_that_of_the_figures() -> None:
     assert figures.PAGE.read_text(encoding="utf-8") == figures.page(CONTENT)
 
 
+def test_no_policy_acts_otherwise_under_a_profile() -> None:
+    counted = CONTENT["unity"]
+    assert not any(cell["wrong"] for cell in counted["profiles"])
+    for cell in counted["profiles"]:
+        assert cell["held"] + sum(cell["refused"].values()) == counted["policies"]
+
+
 def test_what_the_front_page_quotes() -> None:
     cells = CONTENT["cells"]
     assert f"{sum(c['comparisons'] for c in cells):,} comparisons in {len(CONTENT['runtimes']) - 1} runtimes" in INDEX

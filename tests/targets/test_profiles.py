@@ -15,7 +15,7 @@ from exporter import export_model
 from signatures.errors import ExportModelError, ProfileError, UsageError
 from signatures.roles import Role
 from tests import commands
-from tests.handmade import graph_bytes, sampled_policy
+from tests.handmade import constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, compiled, run
 
 pytest.importorskip("onnxruntime")
@@ -168,6 +168,26 @@ def test_masks_that_a_policy_lacks_are_supplied_and_applied(draws: bool, tmp_pat
     given = run(pair.made, feeds, None)
     assert given["discrete_actions"][:, 0].tolist() == allowed.tolist()
     assert given["deterministic_discrete_actions"][:, 0].tolist() == allowed.tolist()
+
+
+@pytest.mark.parametrize("wanted", [p for p in PROFILES if p.name != "barracuda-1.0"], ids=lambda p: p.name)
+def test_a_branch_of_one_action_is_held_beside_others(wanted: Profile, tmp_path: Path) -> None:
+    """0.5 to 0.6 had branches; up to 0.4 such a policy is refused by the number of its branches."""
+    path = tmp_path / "branches.bytes"
+    draws = [
+        node(name, "Multinomial", f"{name}_logits", "one", output_dtype=np.int64, seed=1, seed2=2) for name in "ab"
+    ]
+    heads = [n for name, size in (("a", 4), ("b", 1)) for n in dense(f"{name}_logits", "vector_observation", 3, size)]
+    given = [placeholder("vector_observation"), constant("one", 1), constant("axis", 1), *heads, *draws]
+    path.write_bytes(graph_bytes([*given, node("action", "ConcatV2", "a", "b", "axis")]))
+    (policy,) = compiled(path)
+    if wanted.name in ("tfsharp-0.2", "tfsharp-0.3", "tfsharp-0.4"):
+        with pytest.raises(ProfileError, match="has 2 branches"):
+            Pair.of(policy, wanted)
+        return
+    pair = Pair.of(policy, wanted)
+    assert pair.dressed.signature.branches == (4, 1)
+    assert pair.difference(3, 0) is None
 
 
 def test_what_unity_reads_is_float32_and_constants_are_outputs(tmp_path: Path) -> None:
