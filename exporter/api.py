@@ -102,7 +102,7 @@ def export_model(
     - ``name``: the policy's name (of a single one); ``brain``: only this brain of a graph that holds several.
     - ``names``: ``"canonical"``, or ``"source"`` for the trainer's own tensor names.
     - ``noise``: noise drawn in the graph becomes an input (``"lift"``), stays (``"keep"``) or is removed (``"zero"``);
-      ``deterministic``: ``action`` is the one without chance.
+      ``deterministic``: ``action`` is the deterministic one.
     - ``opset``: of ONNX (default: 15, or what ``for_`` loads); ``labels``: names of observations and actions, a file or
       a mapping.
 

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Noise drawn in the graph: an input, kept, or removed.",
 )
-@click.option("--deterministic", is_flag=True, help="Make 'action' the one without chance.")
+@click.option("--deterministic", is_flag=True, help="Make 'action' the deterministic one.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")

@@ -18,7 +18,7 @@ from signatures.spec import PolicySignature, TensorSpec
 _FEED = {
     Role.VECTOR: "vector observation",
     Role.ENTITIES: "variable-length observation",
-    Role.NOISE: "N(0, 1) draws; zeros: the action without chance",
+    Role.NOISE: "N(0, 1) draws; zeros: the deterministic action",
     Role.MASKS: "1 allows an action, 0 forbids it; branches side by side",
     Role.PREV_ACTION: "the actions of the step before",
     Role.MEMORY_IN: "the memory of the step before; zeros at the start of an episode",

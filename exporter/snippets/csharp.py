@@ -56,7 +56,7 @@ def tensorflowsharp(bundle: Bundle) -> str:
     for i, (name, spec) in enumerate(fetched.items()):
         lines += [f"// {line}" for line in action_meaning(bundle, bundle.heads[i])]
         chance = bundle.heads[i].name
-        hint = "" if chance == spec.name else f"  // without chance; with it: graph[{quoted(chance)}]"
+        hint = "" if chance == spec.name else f"  // deterministic; drawn: graph[{quoted(chance)}]"
         lines.append(f"var {name} = ({_kind(spec)})output[{i}].GetValue();{hint}")
     if memory is not None:
         lines.append(f"memory = ({_kind(bundle.signature.output(memory[1]))})output[{len(fetched)}].GetValue();")

@@ -105,7 +105,7 @@ def _agents(bundle: Bundle) -> str:
     shown = ", ".join("decision.continuous" if h.is_continuous else "decision.discrete" for h in bundle.heads)
     lines.append(f"console.log({shown});  // a row per agent")
     start = [
-        "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): without chance",
+        "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): no draws",
         "const agents = policy.agent();",
     ]
     return "\n".join([*start, *_looped(bundle, lines)])
@@ -149,7 +149,7 @@ def _steps(bundle: Bundle, lines: list[str], value: object) -> str:
         lines.append(_again(previous, taken, tensorflow=value is _tf_value))
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
     chance = [f"outputs[{quoted(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]
-    hint = f"  // without chance; with it: {', '.join(chance)}" if chance else ""
+    hint = f"  // deterministic; drawn: {', '.join(chance)}" if chance else ""
     lines.append(f"console.log({', '.join(fetched)});{hint}")
     return "\n".join([*before, *_looped(bundle, lines)])
 

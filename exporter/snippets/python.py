@@ -122,7 +122,7 @@ def _action(bundle: Bundle, head: TensorSpec) -> list[str]:
     variable, plain = _variable(bundle, head), bundle.plain(head)
     lines = [f"# {text}" for text in action_meaning(bundle, head)]
     if plain != head:
-        lines.append(f"# without chance: outputs[{quoted(plain.name)}]")
+        lines.append(f"# deterministic: outputs[{quoted(plain.name)}]")
     output = f"outputs[{quoted(head.name)}]"
     if head.role not in (Role.LOG_PROBS, Role.PROBS):
         return [*lines, f"{variable} = {output}"]

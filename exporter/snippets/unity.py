@@ -97,7 +97,7 @@ def _placeholders(bundle: Bundle, scope: str) -> list[tuple[str, str]]:
     for spec in bundle.signature.inputs:
         name, kind = spec.name.removeprefix(scope), "Floating Point" if spec.dtype == "float32" else "Integer"
         if spec.role is Role.NOISE:
-            text = f"{name}: {kind}, Min Value 0, Max Value 0 (without chance; -1 and 1: with noise)"
+            text = f"{name}: {kind}, Min Value 0, Max Value 0 (deterministic; -1 and 1: with noise)"
             rows.append(("Graph Placeholder", text))
         elif spec.role is Role.PARAMETER:
             rows.append(("Graph Placeholder", f"{name}: {kind}, Min Value and Max Value: its value"))

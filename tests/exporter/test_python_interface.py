@@ -105,7 +105,7 @@ def test_what_the_command_line_refuses_is_raised(tmp_path: Path) -> None:
         inspect_model(tmp_path / "text.bytes")
     with pytest.raises(UsageError, match="no source"):
         export_model([])
-    with pytest.raises(BundleError, match="no bundle"):
+    with pytest.raises(BundleError, match="not a bundle"):
         verify_bundle(tmp_path)
     with pytest.raises(UsageError, match="there is no runtime"):
         export_model(BALL, tmp_path / "out", verify=["nothing"])

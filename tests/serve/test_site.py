@@ -130,7 +130,7 @@ def test_what_a_sampler_decides_is_not_golden(bundle: Bundle) -> None:
 
 
 def test_bundles_that_cannot_be_shown_are_refused(bundle: Bundle, tmp_path: Path) -> None:
-    with pytest.raises(BundleError, match="no bundle"):
+    with pytest.raises(BundleError, match="not a bundle"):
         assemble(tmp_path)
     source = bundle("continuous") / "continuous.bytes"
     for targets, missing in (("bytes", "tfjs/model.json"), ("tfjs", "continuous.bytes")):
