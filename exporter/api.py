@@ -10,8 +10,9 @@ from typing import Any
 
 from converters.graph.options import CompileOptions, NoiseMode
 from converters.source import ReadOptions
+from exporter.export.again import verify_folder
 from exporter.export.labels import Labels
-from exporter.export.pipeline import ExportOptions, ExportResult, export, verify_folder
+from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
 from exporter.verify.options import VerifyOptions

@@ -54,7 +54,8 @@ def verify_command(
     A folder of bundles stands for all of them.
     """
     from converters.bundle.bundle import bundles_in
-    from exporter.export.pipeline import counted, verify_folder
+    from exporter.export.again import verify_folder
+    from exporter.export.pipeline import counted
 
     console.prepare()
     bundles = tuple(found for place in bundles for found in bundles_in(place) or [place])

@@ -10,42 +10,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from converters.bundle import bundle
-from converters.bundle.bundle import Bundle
-from converters.bundle.embed import runnable
 from converters.folders import scratch_folder
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
 from converters.frozen_graph.writer import frozen
-from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
-from converters.source import OriginalRun, ReadOptions, SourceModel
+from converters.source import ReadOptions, SourceModel
 from exporter.export.labels import Labels, check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.size import check_budget
-from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
-from exporter.verify.outline import outline
 from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import check_rules
 from exporter.verify.verification import verify
 from exporter.version import __version__
-from signatures.contract import PARITY, POLICY, Contract, Origin, parse, safe_name
+from signatures.contract import PARITY, Contract, Origin, parse, safe_name
 from signatures.errors import (
-    BundleError,
     ExportModelError,
     RefusedError,
-    RuntimeUnavailableError,
     SignatureError,
     UsageError,
     naming,
 )
 from signatures.fields import FieldError, printable
-from signatures.spec import PolicySignature
 
 if TYPE_CHECKING:
     from converters.targets.profile import Profile
@@ -141,7 +133,7 @@ class Exporter:
 
     def __init__(self, options: ExportOptions) -> None:
         self.options = options
-        wanted = None if options.profile is None else _profile(options.profile)
+        wanted = None if options.profile is None else consumer(options.profile)
         self._formats = _formats(options, wanted)
         taken = (
             {} if wanted is None else {k: w for k, w in wanted.undressed.items() if k in {f.key for f in self._formats}}
@@ -215,9 +207,9 @@ class Exporter:
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     plain = replace(job, policy=job.own, profile=None)
-                    under = _tested_in(plain, self._formats, folder / "own")
+                    under = tested_in(plain, self._formats, folder / "own")
                     rules = replace(options.parity, rules=(), golden=None, budget={})
-                    report = _joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
+                    report = joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
                 with bundle.writing(options.out):
                     (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
             failed = report is not None and report.passed is False
@@ -268,7 +260,8 @@ def counted(progress: Progress, number: int, total: int) -> Progress:
     return progress if total == 1 else lambda text: progress(f"[{number}/{total}] {text}")
 
 
-def _profile(name: str) -> Profile:
+def consumer(name: str) -> Profile:
+    """The profile that ``--for`` names. Raises UsageError."""
     from converters.targets.profiles import profile  # most exports are for no consumer in particular
 
     return profile(name)
@@ -376,7 +369,7 @@ def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path)
     )
 
 
-def _tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
+def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
     """A policy written to a folder that is thrown away."""
     artifacts = [f.artifact(job.policy, WriteOptions("{}")) for f in formats]
     for artifact in artifacts:
@@ -387,216 +380,9 @@ def _tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnder
     return _tested(job, folder, artifacts, folder)
 
 
-def _joined(report: ParityReport, own: ParityReport) -> ParityReport:
+def joined(report: ParityReport, own: ParityReport) -> ParityReport:
     """The report of a policy in a consumer's names, with what came of the policy that it was made from."""
     note = f"the policy under its own names, from which this was made: {own.verdict}, against {own.reference}"
     passed = False if own.passed is False else report.passed
     comparisons, notes = (*report.comparisons, *own.failures), (*report.notes, note)
     return replace(report, passed=passed, comparisons=comparisons, notes=notes, self_consistent=own.self_consistent)
-
-
-def verify_folder(
-    folder: Path,
-    *,
-    source: Path | None = None,
-    step: int | None = None,
-    trust_source: bool = False,
-    runtimes: str | Sequence[str] = "auto",
-    options: VerifyOptions | None = None,
-    allow_unverified: bool = False,
-    progress: Progress = lambda text: None,
-) -> ParityReport:
-    """Verify a bundle again: hashes first, then every format in the runtimes.
-
-    Without ``source`` the reference is the bundle's own ``.bytes``, without that its ``.nn``. Raises BundleError, and
-    RuntimeUnavailableError when no independent runtime ran (unless ``allow_unverified``, or there is only a ``.nn``,
-    which no runtime outside Unity has).
-    """
-    if step is not None and source is None:
-        raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
-    found = Bundle.open(folder)
-    found.verify_hashes()
-    contract = found.contract
-    read = None if source is None else _source_of(source, contract, step, trust_source)
-    signature = contract.signature
-    formats = [f for f in WRITTEN.values() if found.has(f)]
-    artefacts = {f.key: found.path(f) for f in formats}
-    made_for = contract.tool.get("profile")
-    # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
-    again = None if read is None or made_for is None else _made_again(read, contract, _profile(made_for))
-    original = None if read is None or again is not None else _original_of(read, contract)
-    # Without the source, it is the consumer alone that is asked.
-    asked = again is None and made_for is not None and not {"bytes", "nn"} & artefacts.keys()
-    if asked:
-        _check_asked(folder, artefacts, str(made_for), runtimes, options)
-    reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if made_for else found.graph_file)
-    if "nn" in artefacts:
-        from converters.barracuda.writer import contract_text
-
-        with naming(artefacts["nn"]):
-            found.verify_contract(contract_text(artefacts["nn"].read_bytes()))
-    names = [s.name for s in (*signature.inputs, *signature.outputs)]
-    if "bytes" in artefacts:
-        with naming(reference):
-            embedding = found.graph()
-        graph = _whole_graph(embedding, names, artefacts)
-        with naming(reference):
-            found.check_graph(runnable(graph))
-    else:
-        graph = outline(signature, noise_kept=contract.source.noise_kept)
-    graph = graph if again is None else again.policy.graph
-    policy = Policy(
-        found.name,
-        graph,
-        signature,
-        {s.name: s.name for s in signature.inputs},
-        {s.name: s.name for s in signature.outputs},
-        contract.source,
-    )
-    used, known = chosen_runtimes(runtimes, formats)
-    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    sizes = {f.key: found.size(f) for f in formats}
-    with scratch_folder() as folder, RuntimePool() as pool:
-        copies = _vetted(artefacts, names, list(keys), folder)
-        if again is not None:
-            reference = folder / "reference.bytes"
-            reference.write_bytes(frozen(again.policy))
-        tested = PolicyUnderTest(
-            found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
-            made_for, artefacts,
-        )  # fmt: skip
-        report = verify(tested, () if asked else used or ("numpy",), known, pool, options, progress)
-        if again is not None and again.own is not None:
-            under = _tested_in(replace(again, policy=again.own, profile=None), formats, folder / "own")
-            report = _joined(report, verify(under, used or ("numpy",), known, pool, None, progress))
-    if asked:
-        note = (
-            f"made for {made_for}: its bytes and what the consumer's checkers say were verified; its numbers were "
-            "compared when it was exported, and are again with --source FILE"
-        )
-        return replace(report, notes=(*report.notes, note))
-    if source is None:
-        own = "bytes" if "bytes" in artefacts else "nn"
-        note = f"the source was not given: the reference is the bundle's own .{own}"
-        report = replace(report, reference=f"{own}/numpy", notes=(*report.notes, note), self_consistent=False)
-    if report.passed is None and set(artefacts) == {"nn"}:
-        # No runtime outside Unity has it, so none can be asked for: the files are whole and one contract says so.
-        note = "only Unity runs a .nn: its bytes, its contract and that it answers by our own reader were verified"
-        report = replace(report, notes=(*report.notes, note))
-    elif report.passed is None and not allow_unverified:
-        raise RuntimeUnavailableError(
-            "no independent runtime is installed, so nothing was verified",
-            where=str(folder),
-            why="only the numpy reference ran",
-            fix="pip install export-model[onnxruntime] (or [tensorflow]), or --allow-unverified",
-        )
-    return report
-
-
-def _vetted(
-    artefacts: Mapping[str, Path], names: Sequence[str], signatures: Sequence[str], scratch: Path
-) -> dict[str, Path]:
-    """Copies of a bundle's artefacts as far as a runtime may be given them: anyone may have made the bundle.
-
-    Raises UnsupportedOpError where one does more than compute, DamagedFileError, GraphError.
-    """
-    copies = {}
-    for key, path in artefacts.items():
-        found, folder = WRITTEN[key], scratch / key
-        folder.mkdir()
-        with naming(path):
-            copies[key] = (
-                path if found.vetted is None else found.vetted(path, signatures if found.signatures else names, folder)
-            )
-    return copies
-
-
-def _check_asked(
-    folder: Path,
-    artefacts: Mapping[str, Path],
-    made_for: str,
-    runtimes: str | Sequence[str],
-    options: VerifyOptions | None,
-) -> None:
-    """Raise where a bundle in a consumer's names lacks the file, or is to be compared without its source."""
-    if "onnx" not in artefacts:
-        raise BundleError(
-            "has no file that its consumer loads",
-            where=str(folder),
-            why=f"it was made for {made_for}",
-            fix="export the policy again",
-        )
-    if runtimes != "auto" or (options is not None and (options.golden or options.rules)):
-        raise UsageError(
-            f"without its source, a bundle that was made for {made_for} is asked of its consumer's checkers alone",
-            where=str(folder),
-            why="its names are the consumer's; its numbers were compared when it was exported",
-            fix="give the source too: --source FILE",
-        )
-
-
-def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Path]) -> Graph:
-    """A graph that has all inputs and outputs: the .bytes', else the SavedModel's.
-
-    A .bytes that lacks one is what the comparison is to find; raises BundleError where there is no SavedModel either.
-    """
-    missing = [name for name in names if name not in graph]
-    if missing and "saved_model" in artefacts:
-        with naming(artefacts["saved_model"]):
-            graph = saved_graph(artefacts["saved_model"])
-        missing = [name for name in names if name not in graph]
-    if missing:
-        raise BundleError(
-            f"has no tensor {missing[0]!r}",
-            where=str(artefacts["bytes"]),
-            why=f"{POLICY} names it",
-            fix="export the policy again",
-        )
-    return graph
-
-
-def _source_of(source: Path, contract: Contract, step: int | None, trust_source: bool) -> Source:
-    """What a bundle was exported from; raises BundleError where ``source`` is another file.
-
-    A run's folder is read at ``step``, by default at the one that the export asked for.
-    """
-    origin = contract.origin
-    asked = origin.step if step is None else step
-    read = ReadOptions(asked, origin.sensors, trust_source, origin.goals, origin.activation)
-    found = read_source(source, read)
-    if found.sha256 != origin.sha256:
-        raise BundleError(
-            "is not the source of this bundle",
-            where=str(source),
-            why=f"its sha256 differs from that of {origin.path} in {POLICY}",
-            fix="give the file it was exported from (a checkpoint of a run's folder: its --step), or export it again",
-        )
-    return found
-
-
-def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
-    """How to run the source of a bundle."""
-    named = [m for m in found.models if m.name is not None and printable(m.name) == contract.origin.model]
-    original = (named or list(found.models))[0].original
-    with naming(found.path):
-        return None if original is None else original.narrowed(contract.source)
-
-
-def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
-    """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
-    compiled = list(found.compiled())
-    named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
-    for model, own in named or compiled[: len(compiled) == 1]:
-        dressed = wanted.dress(own)
-        if _tensors(dressed.signature) == _tensors(contract.signature):
-            return Job(found, model, replace(dressed, name=contract.name), wanted, own)
-    raise BundleError(
-        "cannot be held against its source",
-        where=str(found.path),
-        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
-        fix="leave --source out, or export it again",
-    )
-
-
-def _tensors(signature: PolicySignature) -> list[tuple[object, ...]]:
-    return [(s.name, s.role, s.dtype, s.shape) for s in (*signature.inputs, *signature.outputs)]

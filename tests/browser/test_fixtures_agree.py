@@ -13,7 +13,8 @@ import pytest
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.cli.summary import failure_lines
-from exporter.export.pipeline import ExportOptions, export, verify_folder
+from exporter.export.again import verify_folder
+from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.options import VerifyOptions
 from fixtures import FIXTURES
 from fixtures import path as fixture
@@ -73,7 +74,7 @@ def spoil(folder: Path) -> None:
 def test_a_bundle_is_verified_again_in_a_browser_and_a_wrong_weight_is_found(
     tmp_path: Path, browsers: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("exporter.export.pipeline.RuntimePool", lambda: contextlib.nullcontext(browsers))
+    monkeypatch.setattr("exporter.export.again.RuntimePool", lambda: contextlib.nullcontext(browsers))
     options = ExportOptions(tmp_path, ("bytes", "tfjs"), verify="none")
     (result,) = export([fixture("recurrent")], options)
     wanted = ["tfjs-wasm@chromium"]

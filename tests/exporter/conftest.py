@@ -12,5 +12,6 @@ from converters.runtimes.pool import RuntimePool
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
     """All real runtimes; every command that this test runs shares their processes."""
-    monkeypatch.setattr("exporter.export.pipeline.RuntimePool", lambda: contextlib.nullcontext(pool))
+    for module in ("pipeline", "again"):
+        monkeypatch.setattr(f"exporter.export.{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool

@@ -17,7 +17,8 @@ from converters.frozen_graph.tensors import from_array, to_array
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import RuntimeInfo
-from exporter.export.pipeline import ExportOptions, export, verify_folder
+from exporter.export.again import verify_folder
+from exporter.export.pipeline import ExportOptions, export
 from exporter.verify import work
 from exporter.verify.checks.draws import least_likely, with_zeros
 from exporter.verify.options import VerifyOptions

@@ -11,7 +11,7 @@ from converters.bundle.embed import runnable
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
-from exporter.export.pipeline import verify_folder
+from exporter.export.again import verify_folder
 from exporter.verify.difference import compare
 from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
 from exporter.verify.participants import PolicyUnderTest, participants_of
@@ -36,7 +36,7 @@ def policy_under_test(folder: object, monkeypatch: pytest.MonkeyPatch) -> Policy
         caught.append(replace(tested, artefacts=tested.files))  # the copies of a verification are gone after it
         raise CaughtError
 
-    monkeypatch.setattr("exporter.export.pipeline.verify", catch)
+    monkeypatch.setattr("exporter.export.again.verify", catch)
     with pytest.raises(CaughtError):
         verify_folder(folder)  # type: ignore[arg-type]
     return caught[0]

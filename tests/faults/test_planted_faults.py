@@ -8,7 +8,7 @@ import pytest
 
 from converters.formats import WRITTEN
 from exporter.cli.summary import failure_lines
-from exporter.export.pipeline import verify_folder
+from exporter.export.again import verify_folder
 from exporter.verify.findings import Finding
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport

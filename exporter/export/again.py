@@ -1,0 +1,246 @@
+"""A bundle that was written, verified again: hashes first, then its formats against its source or its own graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from converters.bundle.bundle import Bundle
+from converters.bundle.embed import runnable
+from converters.folders import scratch_folder
+from converters.formats import WRITTEN
+from converters.frozen_graph.writer import frozen
+from converters.graph.nodes import Graph
+from converters.policy import Policy
+from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from converters.saved_model.writer import signatures_of
+from converters.source import OriginalRun, ReadOptions
+from exporter.export.pipeline import Job, Progress, consumer, joined, tested_in
+from exporter.export.sources import Source, read_source
+from exporter.verify.inner_tensors import saved_graph
+from exporter.verify.options import VerifyOptions
+from exporter.verify.outline import outline
+from exporter.verify.participants import PolicyUnderTest
+from exporter.verify.report import ParityReport
+from exporter.verify.verification import verify
+from signatures.contract import POLICY, Contract, safe_name
+from signatures.errors import (
+    BundleError,
+    RuntimeUnavailableError,
+    UsageError,
+    naming,
+)
+from signatures.fields import printable
+from signatures.spec import PolicySignature
+
+if TYPE_CHECKING:
+    from converters.targets.profile import Profile
+
+
+def verify_folder(
+    folder: Path,
+    *,
+    source: Path | None = None,
+    step: int | None = None,
+    trust_source: bool = False,
+    runtimes: str | Sequence[str] = "auto",
+    options: VerifyOptions | None = None,
+    allow_unverified: bool = False,
+    progress: Progress = lambda text: None,
+) -> ParityReport:
+    """Verify a bundle again: hashes first, then every format in the runtimes.
+
+    Without ``source`` the reference is the bundle's own ``.bytes``, without that its ``.nn``. Raises BundleError, and
+    RuntimeUnavailableError when no independent runtime ran (unless ``allow_unverified``, or there is only a ``.nn``,
+    which no runtime outside Unity has).
+    """
+    if step is not None and source is None:
+        raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
+    found = Bundle.open(folder)
+    found.verify_hashes()
+    contract = found.contract
+    read = None if source is None else _source_of(source, contract, step, trust_source)
+    signature = contract.signature
+    formats = [f for f in WRITTEN.values() if found.has(f)]
+    artefacts = {f.key: found.path(f) for f in formats}
+    made_for = contract.tool.get("profile")
+    # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
+    again = None if read is None or made_for is None else _made_again(read, contract, consumer(made_for))
+    original = None if read is None or again is not None else _original_of(read, contract)
+    # Without the source, it is the consumer alone that is asked.
+    asked = again is None and made_for is not None and not {"bytes", "nn"} & artefacts.keys()
+    if asked:
+        _check_asked(folder, artefacts, str(made_for), runtimes, options)
+    reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if made_for else found.graph_file)
+    if "nn" in artefacts:
+        from converters.barracuda.writer import contract_text
+
+        with naming(artefacts["nn"]):
+            found.verify_contract(contract_text(artefacts["nn"].read_bytes()))
+    names = [s.name for s in (*signature.inputs, *signature.outputs)]
+    if "bytes" in artefacts:
+        with naming(reference):
+            embedding = found.graph()
+        graph = _whole_graph(embedding, names, artefacts)
+        with naming(reference):
+            found.check_graph(runnable(graph))
+    else:
+        graph = outline(signature, noise_kept=contract.source.noise_kept)
+    graph = graph if again is None else again.policy.graph
+    policy = Policy(
+        found.name,
+        graph,
+        signature,
+        {s.name: s.name for s in signature.inputs},
+        {s.name: s.name for s in signature.outputs},
+        contract.source,
+    )
+    used, known = chosen_runtimes(runtimes, formats)
+    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
+    sizes = {f.key: found.size(f) for f in formats}
+    with scratch_folder() as scratch, RuntimePool() as pool:
+        copies = _vetted(artefacts, names, list(keys), scratch)
+        if again is not None:
+            reference = scratch / "reference.bytes"
+            reference.write_bytes(frozen(again.policy))
+        tested = PolicyUnderTest(
+            found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
+            made_for, artefacts,
+        )  # fmt: skip
+        report = verify(tested, () if asked else used or ("numpy",), known, pool, options, progress)
+        if again is not None and again.own is not None:
+            under = tested_in(replace(again, policy=again.own, profile=None), formats, scratch / "own")
+            report = joined(report, verify(under, used or ("numpy",), known, pool, None, progress))
+    if asked:
+        note = (
+            f"made for {made_for}: its bytes and what the consumer's checkers say were verified; its numbers were "
+            "compared when it was exported, and are again with --source FILE"
+        )
+        return replace(report, notes=(*report.notes, note))
+    if source is None:
+        own = "bytes" if "bytes" in artefacts else "nn"
+        note = f"the source was not given: the reference is the bundle's own .{own}"
+        report = replace(report, reference=f"{own}/numpy", notes=(*report.notes, note), self_consistent=False)
+    if report.passed is None and set(artefacts) == {"nn"}:
+        # No runtime outside Unity has it, so none can be asked for: the files are whole and one contract says so.
+        note = "only Unity runs a .nn: its bytes, its contract and that it answers by our own reader were verified"
+        report = replace(report, notes=(*report.notes, note))
+    elif report.passed is None and not allow_unverified:
+        raise RuntimeUnavailableError(
+            "no independent runtime is installed, so nothing was verified",
+            where=str(folder),
+            why="only the numpy reference ran",
+            fix="pip install export-model[onnxruntime] (or [tensorflow]), or --allow-unverified",
+        )
+    return report
+
+
+def _vetted(
+    artefacts: Mapping[str, Path], names: Sequence[str], signatures: Sequence[str], scratch: Path
+) -> dict[str, Path]:
+    """Copies of a bundle's artefacts as far as a runtime may be given them: anyone may have made the bundle.
+
+    Raises UnsupportedOpError where one does more than compute, DamagedFileError, GraphError.
+    """
+    copies = {}
+    for key, path in artefacts.items():
+        found, folder = WRITTEN[key], scratch / key
+        folder.mkdir()
+        with naming(path):
+            copies[key] = (
+                path if found.vetted is None else found.vetted(path, signatures if found.signatures else names, folder)
+            )
+    return copies
+
+
+def _check_asked(
+    folder: Path,
+    artefacts: Mapping[str, Path],
+    made_for: str,
+    runtimes: str | Sequence[str],
+    options: VerifyOptions | None,
+) -> None:
+    """Raise where a bundle in a consumer's names lacks the file, or is to be compared without its source."""
+    if "onnx" not in artefacts:
+        raise BundleError(
+            "has no file that its consumer loads",
+            where=str(folder),
+            why=f"it was made for {made_for}",
+            fix="export the policy again",
+        )
+    if runtimes != "auto" or (options is not None and (options.golden or options.rules)):
+        raise UsageError(
+            f"without its source, a bundle that was made for {made_for} is asked of its consumer's checkers alone",
+            where=str(folder),
+            why="its names are the consumer's; its numbers were compared when it was exported",
+            fix="give the source too: --source FILE",
+        )
+
+
+def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Path]) -> Graph:
+    """A graph that has all inputs and outputs: the .bytes', else the SavedModel's.
+
+    A .bytes that lacks one is what the comparison is to find; raises BundleError where there is no SavedModel either.
+    """
+    missing = [name for name in names if name not in graph]
+    if missing and "saved_model" in artefacts:
+        with naming(artefacts["saved_model"]):
+            graph = saved_graph(artefacts["saved_model"])
+        missing = [name for name in names if name not in graph]
+    if missing:
+        raise BundleError(
+            f"has no tensor {missing[0]!r}",
+            where=str(artefacts["bytes"]),
+            why=f"{POLICY} names it",
+            fix="export the policy again",
+        )
+    return graph
+
+
+def _source_of(source: Path, contract: Contract, step: int | None, trust_source: bool) -> Source:
+    """What a bundle was exported from; raises BundleError where ``source`` is another file.
+
+    A run's folder is read at ``step``, by default at the one that the export asked for.
+    """
+    origin = contract.origin
+    asked = origin.step if step is None else step
+    read = ReadOptions(asked, origin.sensors, trust_source, origin.goals, origin.activation)
+    found = read_source(source, read)
+    if found.sha256 != origin.sha256:
+        raise BundleError(
+            "is not the source of this bundle",
+            where=str(source),
+            why=f"its sha256 differs from that of {origin.path} in {POLICY}",
+            fix="give the file it was exported from (a checkpoint of a run's folder: its --step), or export it again",
+        )
+    return found
+
+
+def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
+    """How to run the source of a bundle."""
+    named = [m for m in found.models if m.name is not None and printable(m.name) == contract.origin.model]
+    original = (named or list(found.models))[0].original
+    with naming(found.path):
+        return None if original is None else original.narrowed(contract.source)
+
+
+def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
+    """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
+    compiled = list(found.compiled())
+    named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
+    for model, own in named or compiled[: len(compiled) == 1]:
+        dressed = wanted.dress(own)
+        if _tensors(dressed.signature) == _tensors(contract.signature):
+            return Job(found, model, replace(dressed, name=contract.name), wanted, own)
+    raise BundleError(
+        "cannot be held against its source",
+        where=str(found.path),
+        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
+        fix="leave --source out, or export it again",
+    )
+
+
+def _tensors(signature: PolicySignature) -> list[tuple[object, ...]]:
+    return [(s.name, s.role, s.dtype, s.shape) for s in (*signature.inputs, *signature.outputs)]
