@@ -2,9 +2,9 @@
 
 Only the fields that are needed, by the numbers of TensorFlow's public .proto files (graph.proto, node_def.proto,
 attr_value.proto, tensor.proto, tensor_shape.proto, versions.proto, saved_model.proto, meta_graph.proto,
-function.proto, op_def.proto, saver.proto, tensor_bundle.proto, tensor_slice.proto, event.proto). Fields that are not
-listed survive as unknown fields. A private pool, so that a real ``tensorflow`` in the same process does not clash, and
-so that no generated code has to match the installed protobuf.
+function.proto, op_def.proto, saver.proto, tensor_bundle.proto, tensor_slice.proto, trackable_object_graph.proto,
+event.proto). Fields that are not listed survive as unknown fields. A private pool, so that a real ``tensorflow`` in the
+same process does not clash, and so that no generated code has to match the installed protobuf.
 """
 
 from __future__ import annotations
@@ -74,6 +74,10 @@ _MESSAGES = {
         "1 dtype int32, 2 shape TensorShapeProto, 3 shard_id int32, 4 offset int64, 5 size int64, 6 crc32c fixed32, "
         "7 slices TensorSliceProto*"
     ),
+    # trackable_object_graph.proto
+    "SerializedTensor": "2 full_name string, 3 checkpoint_key string",
+    "TrackableObject": "2 attributes SerializedTensor*",
+    "TrackableObjectGraph": "1 nodes TrackableObject*",
     # event.proto
     "Event": "1 wall_time double, 2 step int64, 3 file_version string, 4 graph_def bytes",
 }
@@ -128,6 +132,7 @@ MetaGraphDef = _CLASSES["MetaGraphDef"]
 SavedModel = _CLASSES["SavedModel"]
 BundleHeaderProto = _CLASSES["BundleHeaderProto"]
 BundleEntryProto = _CLASSES["BundleEntryProto"]
+TrackableObjectGraph = _CLASSES["TrackableObjectGraph"]
 Event = _CLASSES["Event"]
 
 

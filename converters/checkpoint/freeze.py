@@ -16,8 +16,8 @@ from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
 from converters.graph.ops.outside import EFFECTS, VARIABLES
-from converters.graph.ops.table import hands_on, is_fed
-from converters.understand.brains import find_brains
+from converters.graph.ops.table import hands_on
+from converters.understand.brains import depends_on_input, find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.roles import CONSTANT_NAMES
 
@@ -100,11 +100,7 @@ def _roots(graph: Graph) -> list[str]:
 def wanted_variables(graph: Graph) -> list[str]:
     """Variables that something computes with an input from, and ML-Agents' constants."""
     variables = [n.name for n in graph.nodes if n.op in VARIABLES]
-    fed: set[str] = set()
-    for node in graph.nodes:
-        if is_fed(node) or (not is_effect(node) and any(node_of(r) in fed for r in node.inputs)):
-            fed.add(node.name)
-    needed = graph.ancestors(sorted(fed))
+    needed = graph.ancestors(sorted(depends_on_input(graph, is_effect)))
     return [n for n in variables if n in needed or n.rpartition("/")[2] in CONSTANT_NAMES]
 
 

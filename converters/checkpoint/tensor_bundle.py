@@ -12,6 +12,7 @@ Nothing is read before it is asked for, and nothing is allocated before the shar
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +30,10 @@ _FIX = "copy the checkpoint again, all of its files, or take one of another step
 
 #: (start, length) per axis; a length of 0 stands for the whole axis.
 Extents = Sequence[tuple[int, int]]
+
+
+#: Where a checkpoint of Python objects says what they are.
+_OBJECTS = "_CHECKPOINTABLE_OBJECT_GRAPH"
 
 
 class Checkpoint:
@@ -62,7 +67,7 @@ class Checkpoint:
     @property
     def of_objects(self) -> bool:
         """Whether its keys are paths of Python objects (trackable_object_graph.proto), not names of a graph."""
-        return b"_CHECKPOINTABLE_OBJECT_GRAPH" in self._entries
+        return _OBJECTS in self
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -128,7 +133,35 @@ class Checkpoint:
         data = self._bytes(name, entry)
         return np.frombuffer(data, dtype).astype(dtype.newbyteorder("="), copy=False).reshape(shape)
 
+    def by_variable(self) -> dict[str, str]:
+        """Of a checkpoint of objects: the name of each variable that no other has → its key, as far as it says so.
+
+        The graph of objects is a scalar string: its length as a varint, four bytes of checksum, the message.
+        """
+        if not self.of_objects:
+            return {}
+        data = self._raw(_OBJECTS, self._entry(_OBJECTS.encode(), _OBJECTS))
+        start = next((i for i, byte in enumerate(data[:10]) if byte < 0x80), 0) + 5
+        objects = self._message(schema.TrackableObjectGraph, data[start:], "graph of objects")
+        kept = [a for node in objects.nodes for a in node.attributes if a.full_name and a.checkpoint_key]
+        counts = Counter(a.full_name for a in kept)
+        return {a.full_name: a.checkpoint_key for a in kept if counts[a.full_name] == 1}
+
     def _bytes(self, name: str, entry: Any) -> bytes:
+        data = self._raw(name, entry)
+        if masked(crc32c(data)) != entry.crc32c:
+            raise self._damaged_values(name, entry)
+        return data
+
+    def _damaged_values(self, name: str, entry: Any) -> DamagedFileError:
+        return DamagedFileError(
+            f"the values of {name!r} are damaged",
+            where=self._shard(entry.shard_id).name,
+            why="they have another checksum (crc32c) than they were written with",
+            fix=_FIX,
+        )
+
+    def _raw(self, name: str, entry: Any) -> bytes:
         if not 0 <= entry.shard_id < self._header.num_shards:
             raise self._damaged(f"{name!r} lies in shard {entry.shard_id} of {self._header.num_shards}")
         shard = self._shard(entry.shard_id)
@@ -151,13 +184,8 @@ class Checkpoint:
                 why="the values of a checkpoint lie in its .data files, the .index only says where",
                 fix="put the .data file beside the .index, or take a checkpoint that has both: --step N",
             ) from error
-        if len(data) != entry.size or masked(crc32c(data)) != entry.crc32c:
-            raise DamagedFileError(
-                f"the values of {name!r} are damaged",
-                where=shard.name,
-                why="they have another checksum (crc32c) than they were written with",
-                fix=_FIX,
-            )
+        if len(data) != entry.size:
+            raise self._damaged_values(name, entry)
         return data
 
     def _shard(self, number: int) -> Path:

@@ -16,6 +16,7 @@ from converters.graph.passes.memories import join_memories
 from converters.graph.passes.naming import name_ports
 from converters.graph.passes.noise import settle_noise, settle_single_draws, unseeded
 from converters.graph.passes.normalise import normalise
+from converters.graph.passes.ranks import settle_ranks
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.passes.unroll import unroll
@@ -38,6 +39,7 @@ PASSES = (
     Pass("normalise", on_graph(normalise), (has.settled_inputs,), (has.one_spelling,)),
     Pass("complete shapes", on_inputs(complete_shapes), (has.one_spelling,), (has.one_spelling,)),
     Pass("unroll", on_graph(unroll), (has.one_spelling,), (has.one_spelling, has.no_control_flow, has.pinned_outputs)),
+    Pass("settle ranks", on_graph(settle_ranks), (has.no_control_flow,), (has.one_spelling,)),
     FOLD,
     DROP,
     Pass("collapse views", on_tensors(collapse_views), (has.no_identities,), (has.no_identities, has.no_dead_nodes)),

@@ -31,6 +31,10 @@ class Editor(Builder):
             reference = self._redirected[reference]
         return reference
 
+    def constant_of(self, reference: str) -> np.ndarray | None:
+        """The value of a tensor of the old graph that is a Const."""
+        return self._old.constant(reference)
+
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
         if reference != to:

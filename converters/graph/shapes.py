@@ -40,6 +40,7 @@ def _inferred(graph: Graph, partial: bool) -> Types:
     for node in graph.nodes:
         if node.op in CONTROL_FLOW and partial:
             dtype = types[node.inputs[0]].dtype if node.inputs and node.inputs[0] in types else FLOAT32
+            dtype = node.attrs.get("element_dtype", dtype)
             if node.op == "TensorArraySizeV3":
                 dtype = INT32
             for index in range(2):
@@ -144,12 +145,20 @@ def _symbolic(
             )
             for v in (np.asarray(o, dtype=object) for o in outputs)
         ]
-    if node.op == "Mul":
+    if node.op == "Mul" or node.op == "Maximum":  # not a list: the op table alone has those
         shape = broadcast(args[0].shape, args[1].shape, symbols)
         a, b = np.broadcast_arrays(values[0].astype(object), values[1].astype(object))
         cells = np.empty(a.shape, object)
         for index in np.ndindex(a.shape):
-            cells[index] = product((a.item(*index), b.item(*index)), symbols)
+            pair = (a.item(*index), b.item(*index))
+            if node.op == "Mul":
+                cells[index] = product(pair, symbols)
+            elif isinstance(pair[0], int) and isinstance(pair[1], int):
+                cells[index] = max(pair)
+            elif pair[0] == pair[1] or 1 in pair:  # a length is 1 or more
+                cells[index] = next((p for p in pair if p != 1), 1)
+            else:
+                return results
         return [TensorType(args[0].dtype, shape, _plain(cells, args[0].dtype))]
     if node.op == "Prod" and results[0].shape in ((), (1,)):
         total = np.empty(() if results[0].shape == () else (1,), object)

@@ -17,17 +17,17 @@ from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph
 from converters.graph.ops.base import MISFIT
+from converters.graph.ops.table import is_fed
 from converters.keras.config import config_of, refuse_code
 from converters.keras.frozen import frozen_by_tensorflow
 from converters.keras.hdf5 import stored_in
 from converters.keras.model import model_of
 from converters.keras.network import Network, UnknownLayerError
 from converters.keras.weights import Groups, Listed, Weights
-from converters.saved_model.signature import expose, output_names
+from converters.saved_model.signature import declared, expose, output_names
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError, RuntimeUnavailableError
-from signatures.roles import OUTPUT_NAMES
 
 _SAVE_AGAIN = "save the model again: model.save('policy.keras')"
 
@@ -92,8 +92,8 @@ def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str
     names = output_names(signature)
     facts = SourceFacts(
         roles=roles,
-        outputs={name: OUTPUT_NAMES.get(name) for name in names.values()},
-        memories=net.memories(names),
+        outputs=declared(signature),
+        memories=net.memories(names) or None,
         notes=tuple(net.notes),
     )
     return SourceModel(graph, files, facts)
@@ -116,16 +116,12 @@ def _beside_keras(model: SourceModel, path: Path) -> SourceModel:
         data, signature = frozen_by_tensorflow(path)
     except RuntimeUnavailableError:
         return model
-    ends = {"Placeholder": signature.inputs, "Identity": signature.outputs}
-    nodes = []
-    found: dict[str, set[Any]] = {"Placeholder": set(), "Identity": set()}
+    fed, given, nodes = {**signature.inputs}, {**signature.outputs}, []
     for node in model.graph.nodes:
-        outer = node.op == "Placeholder" or node.name in model.facts.outputs
-        if outer and node.origin in ends[node.op]:
-            found[node.op].add(node.origin)
-            node = replace(node, origin=ends[node.op][str(node.origin)].name)
-        nodes.append(node)
-    if any(found[op] != {*ends[op]} for op in ends):  # what Keras calls its outputs does not tell them apart
+        ends = fed if is_fed(node) else given if node.name in model.facts.outputs else {}
+        tensor = ends.pop(str(node.origin), None)
+        nodes.append(node if tensor is None else replace(node, origin=tensor.name))
+    if fed or given:  # what Keras calls its outputs does not tell them apart
         return model
     original = OriginalRun("tensorflow", path, definition=schema.parse(schema.GraphDef, data, "TensorFlow graph"))
     return replace(model, graph=Graph(tuple(nodes)), original=original)
@@ -137,4 +133,4 @@ def _through_keras(path: Path) -> SourceModel:
     definition = schema.parse(schema.GraphDef, data, "TensorFlow graph")
     graph, roles = expose(from_graph_def(definition), signature)
     original = OriginalRun("tensorflow", path, definition=definition)
-    return SourceModel(graph, (path,), SourceFacts(roles=roles), None, original)
+    return SourceModel(graph, (path,), SourceFacts(roles=roles, outputs=declared(signature)), None, original)

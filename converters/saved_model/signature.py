@@ -18,11 +18,14 @@ import numpy as np
 from converters.format import Port
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.graph.ops.table import is_fed
+from converters.graph.types import Symbols, TensorType
 from converters.renaming import renamed
 from converters.schema import dtype_number
 from converters.understand.inputs import role_by_name
+from converters.understand.memories import float_rows, paired_memories
 from signatures.contract import EMBEDDED
 from signatures.errors import DamagedFileError
+from signatures.memories import SeparateMemory
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 
@@ -90,6 +93,33 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
     roles = {node_of(t.name): role for k, t in signature.inputs.items() if (role := _role(graph, k, t)) is not None}
     nodes = [*renamed(graph, moved).nodes, *(p.with_inputs(_moved(r, moved) for r in p.inputs) for p in pins)]
     return Graph(topological(nodes)), {moved.get(n, n): role for n, role in roles.items()}
+
+
+def declared(signature: ModelSignature) -> dict[str, Role | None]:
+    """The outputs that a signature declares, as they are called once exposed, with the roles that their names say."""
+    return {name: OUTPUT_NAMES.get(name.rpartition("/")[2]) for name in output_names(signature).values()}
+
+
+def memories_of(signature: ModelSignature, roles: Mapping[str, Role]) -> tuple[SeparateMemory, ...]:
+    """The inputs of a signature that are fed what an output gave; it says the shapes of both."""
+    inputs = {node_of(t.name): t for t in signature.inputs.values() if node_of(t.name) not in roles}
+    names = output_names(signature)
+    outputs = {names[k]: t for k, t in signature.outputs.items() if names[k] not in OUTPUT_NAMES}
+
+    def types() -> dict[str, TensorType]:
+        free = Symbols()
+        return {
+            name: TensorType(t.dtype, tuple(free.fresh() if d is None else d for d in t.shape.dims))
+            for name, t in (*inputs.items(), *outputs.items())
+            if t.dtype is not None and t.shape.dims is not None
+        }
+
+    given = {f"state{k[1:]}": node_of(t.name) for k, t in signature.inputs.items() if re.fullmatch(r"1(/.*)?", k)}
+    if given and given.keys() <= signature.outputs.keys():  # PolicySaver of TF-Agents: 1/lstm/0 and state/lstm/0
+        kinds = types()
+        sides = [(n, names[k], float_rows(kinds.get(n)), float_rows(kinds.get(names[k]))) for k, n in given.items()]
+        return tuple(SeparateMemory(n, out, a, b) for n, out, a, b in sides if a is not None and b is not None)
+    return paired_memories(inputs, outputs, types)
 
 
 def _moved(reference: str, names: Mapping[str, str]) -> str:

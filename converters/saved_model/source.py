@@ -10,6 +10,7 @@ from converters.bundle.embed import facts_of, recalled
 from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
+from converters.checkpoint.training_graph import Saved as Place
 from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
 from converters.content import Content
 from converters.fetch import Fetched
@@ -17,7 +18,7 @@ from converters.frozen_graph import source as frozen_graph
 from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
-from converters.saved_model.signature import ModelSignature, expose, fed_by_signature
+from converters.saved_model.signature import ModelSignature, declared, expose, fed_by_signature, memories_of
 from converters.source import OriginalRun, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.errors import NotAPolicyError
@@ -42,7 +43,12 @@ def read(given: Fetched) -> list[SourceModel]:
     facts = facts_of(graph, contract)
     if contract is None:
         graph, roles = expose(frozen.graph, frozen.signature)
-        facts = SourceFacts(roles=roles, notes=_notes(saved))
+        facts = SourceFacts(
+            roles=roles,
+            outputs=declared(frozen.signature),
+            memories=memories_of(frozen.signature, roles),
+            notes=_notes(saved),
+        )
     original = OriginalRun("tensorflow", folder, definition=frozen.definition)
     return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
 
@@ -65,6 +71,9 @@ def frozen_model(saved: Saved, folder: Path) -> FrozenModel:
     prefix = folder / "variables" / "variables"
     checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
     training, signature = _inlined(saved) if saved.calls else (training_graph(saved.graph_def), saved.signature)
+    if checkpoint is not None and saved.calls:
+        named = {name: Place(key) for name, key in checkpoint.by_variable().items()}
+        training = replace(training, saved={**named, **training.saved})
     frozen = freeze(training, checkpoint, signature.roots or None, _WITHOUT_VARIABLES)
     definition = fed_by_signature(with_values(training.definition, frozen.values), signature)
     return FrozenModel(frozen.graph, definition, signature, () if checkpoint is None else checkpoint.files)

@@ -23,10 +23,9 @@ from signatures.errors import DamagedFileError
 _OWN = frozenset(
     (
         *("FusedDepthwiseConv2dNative", "Prelu"),
-        *("TensorListReserve", "TensorListFromTensor", "TensorListGetItem", "TensorListSetItem", "TensorListStack"),
-        *("TensorListConcat", "TensorListConcatV2", "TensorListLength", "TensorListResize", "EmptyTensorList"),
+        *("TensorListConcat", "TensorListConcatV2", "TensorListResize", "EmptyTensorList"),
         *("TensorListPushBack", "TensorListPopBack", "TensorListGather", "TensorListScatter", "TensorListScatterV2"),
-        *("TensorListSplit", "StatelessRandomNormal", "StatelessRandomUniform", "Einsum", "LinSpace"),
+        *("TensorListSplit", "StatelessRandomNormal", "StatelessRandomUniform", "LinSpace"),
     )
 )
 _FIX = "convert the model again with the official converter, the policy's outputs only"

@@ -7,7 +7,7 @@ candidates.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -104,7 +104,7 @@ def find_brains(
     """
     if wanted:
         return _chosen(graph, wanted, declared)
-    fed = _depends_on_input(graph)
+    fed = depends_on_input(graph)
     given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
     if Role.ACTION in given.values():
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
@@ -149,12 +149,15 @@ def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
     return Brain(scope, tuple(outputs), _constants(graph, scope))
 
 
-def _depends_on_input(graph: Graph) -> set[str]:
-    """Names of nodes downstream of a placeholder (parameters included)."""
+def depends_on_input(graph: Graph, left_out: Callable[[Node], bool] = lambda node: False) -> set[str]:
+    """Names of nodes downstream of a placeholder (parameters included), not by way of those that are ``left_out``."""
     fed: set[str] = set()
-    for node in graph.nodes:
-        if is_fed(node) or any(node_of(r) in fed for r in node.inputs):
-            fed.add(node.name)
+    count = -1
+    while count != len(fed):  # a loop hands back what stands behind
+        count = len(fed)
+        for node in graph.nodes:
+            if is_fed(node) or (not left_out(node) and any(node_of(r) in fed for r in node.inputs)):
+                fed.add(node.name)
     return fed
 
 

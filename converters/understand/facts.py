@@ -26,7 +26,8 @@ class SourceFacts:
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``notes``: what the user should know of this source.
     - ``labels``: names of observations (by placeholder) and actions, where the source carries them.
-    - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined.
+    - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined; None:
+      names and shapes tell.
     """
 
     roles: Mapping[str, Role] = field(default_factory=dict)
@@ -40,4 +41,4 @@ class SourceFacts:
     rows: int | None = None
     notes: tuple[str, ...] = ()
     labels: Mapping[str, Any] = field(default_factory=dict)
-    memories: tuple[SeparateMemory, ...] = ()
+    memories: tuple[SeparateMemory, ...] | None = None

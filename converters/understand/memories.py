@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from signatures.memories import SeparateMemory
 Shape = tuple[int | None, ...]
 
 
-def paired_memories(graph: Graph, inputs: Iterable[str], outputs: Iterable[str]) -> tuple[SeparateMemory, ...]:
+def paired_memories(
+    inputs: Iterable[str], outputs: Iterable[str], types: Callable[[], Mapping[str, TensorType]]
+) -> tuple[SeparateMemory, ...]:
     """Inputs that are fed what an output gave, in the order of ``inputs``: they agree in name and shape.
 
     ``h_in`` and ``h_out``, ``hx`` and ``new_hx``, ``h0`` and ``hn``, ``state_in_0`` and ``state_out_0``: names that are
     the same once the words for the step's two ends are left out, one of them the word of a memory. What is not plain is
-    no pair: the output that is left over then asks.
+    no pair: the output that is left over then asks. ``types`` gives what is known of all of them.
     """
     ends: dict[tuple[str, ...], list[str]] = {}
     for name in outputs:
@@ -31,11 +33,11 @@ def paired_memories(graph: Graph, inputs: Iterable[str], outputs: Iterable[str])
     pairs = [(name, ends[stem]) for name in inputs if (stem := stem_of(name)) in ends]
     if not pairs:
         return ()
-    types = infer_types(graph, partial=True)
+    kinds = types()
     found = []
     for name, candidates in pairs:
-        taken = _float_rows(types.get(name))
-        fitting = [(o, given) for o in candidates if (given := _float_rows(types.get(o))) is not None]
+        taken = float_rows(kinds.get(name))
+        fitting = [(o, given) for o in candidates if (given := float_rows(kinds.get(o))) is not None]
         fitting = [(o, given) for o, given in fitting if taken is not None and _numbers(taken) == _numbers(given)]
         if taken is not None and len(fitting) == 1:
             output, given = fitting[0]
@@ -44,7 +46,7 @@ def paired_memories(graph: Graph, inputs: Iterable[str], outputs: Iterable[str])
     return tuple(m for m in found if outputs_taken.count(m.output) == 1)
 
 
-def _float_rows(kind: TensorType | None) -> Shape | None:
+def float_rows(kind: TensorType | None) -> Shape | None:
     """The shape of a float32 tensor with one free axis, the batch."""
     shape = None if kind is None or kind.dtype != FLOAT32 else static_shape(kind.shape)
     return shape if shape is not None and shape.count(None) == 1 else None

@@ -48,7 +48,7 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
         image_layout=_image_layout(model),
         rows=rows,
         outputs=dict.fromkeys(model.outputs.values()),
-        memories=model.memories,
+        memories=model.memories or None,
     )
     if model.producer.startswith("tf2onnx"):
         facts = _of_tensorflow(model, facts, number)

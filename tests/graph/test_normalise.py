@@ -125,6 +125,24 @@ def divided(x: Array, y: Array) -> Case:
     return [*nodes, node("y", "DivNoNan", "a", "b", T=F32)], {"a": x, "b": y}, None
 
 
+def summed(equation: str, *operands: Array) -> Case:
+    names = "ab"[: len(operands)]
+    nodes = [placeholder(n, (None, *a.shape[1:])) for n, a in zip(names, operands, strict=True)]
+    made = node("y", "Einsum", *names, equation=equation, N=len(operands), T=F32)
+    return [*nodes, made], dict(zip(names, operands, strict=True)), None
+
+
+def shape_of_both(a: Array, b: Array) -> Case:
+    nodes = [placeholder(n, (None, *x.shape[1:])) for n, x in (("a", a), ("b", b))]
+    shapes = [node(f"s{n}", "Shape", n, T=F32, out_type=np.int32) for n in "ab"]
+    return [*nodes, *shapes, node("y", "BroadcastArgs", "sa", "sb", T=np.int32)], {"a": a, "b": b}, None
+
+
+def turned(*axes: int) -> Case:
+    nodes = [placeholder("x", (None, 3, 4)), constant("axes", np.array(axes, np.int32))]
+    return [*nodes, node("y", "ReverseV2", "x", "axes", T=F32, Tidx=np.int32)], {"x": floats(2, 3, 4)}, None
+
+
 STRIDED = {"strides": (1, 1, 2, 1), "padding": "SAME"}
 POOLED = {**STRIDED, "ksize": (1, 3, 2, 1)}
 CASES: Mapping[str, Case] = {
@@ -160,6 +178,16 @@ CASES: Mapping[str, Case] = {
     "FusedBatchNormV2": batch_norm("FusedBatchNormV2", IMAGE, epsilon=0.1),
     "FusedBatchNormV3": batch_norm("FusedBatchNormV3", IMAGE, epsilon=0.01),
     "FusedBatchNormV3, NCHW": batch_norm("FusedBatchNormV3", TURNED, epsilon=0.01, data_format="NCHW"),
+    "Einsum": summed("abc,cde->abde", floats(2, 3, 4), floats(4, 2, 3)),
+    "Einsum, of attention": summed("aecd,abcd->acbe", floats(2, 3, 2, 4), floats(2, 5, 2, 4)),
+    "Einsum, no result but a sum": summed("ab,ab->", floats(2, 3), floats(2, 3, seed=1)),
+    "Einsum, one operand": summed("abc->ca", floats(2, 3, 4)),
+    "Erfc": unary("Erfc"),
+    "ReverseV2": turned(1),
+    "ReverseV2, two axes": turned(2, 0),
+    "ReverseV2, none": turned(),
+    "BroadcastArgs": shape_of_both(floats(2, 1, 4), floats(1, 3, 1)),
+    "BroadcastArgs, unlike ranks": shape_of_both(floats(3), floats(2, 3)),
     "Concat": concat(),
     "IdentityN": bundled(),
     "Conv2D, NCHW": window("Conv2D", "NCHW", kernel=KERNEL, **STRIDED),
@@ -246,6 +274,12 @@ REFUSED: Mapping[str, Sequence[Any]] = {
         node("y", "GatherV2", "x", "i", "axis", batch_dims=1),
     ],
     "incompatible_shape_error": binary("Equal", floats(2, 3), f32(1, 2, 3), incompatible_shape_error=False)[0],
+    "no plain product": summed("aa->a", floats(2, 2))[0],
+    "axes that are computed": [
+        placeholder("x", (None, 3)),
+        placeholder("i", (1,), np.int32),
+        node("y", "ReverseV2", "x", "i"),
+    ],
     "training mode": batch_norm("FusedBatchNormV3", IMAGE, is_training=True)[0],
 }
 

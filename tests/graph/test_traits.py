@@ -22,6 +22,7 @@ NAMES = {*TABLE, *SPELLINGS, *CONTROL_FLOW, *FORBIDDEN, *OUTSIDE}
 #: Where names are a source's or a consumer's own words, which only sound like TensorFlow's: folder or file → whose.
 VOCABULARIES = {
     "converters/barracuda": "Barracuda's layers",
+    "converters/keras/layers": "Keras' layers and operations",
     "converters/onnx": "ONNX's ops",
     "converters/targets": "the ops that Unity's importers take",
     "converters/tfjs/unfuse.py": "the fused ops of TensorFlow.js",

@@ -17,6 +17,8 @@ import numpy as np
 os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISIBLE_DEVICES="-1")
 
 import tensorflow as tf
+from tensorflow.python.framework import type_spec_registry
+from tensorflow.python.framework.composite_tensor import CompositeTensor
 
 RANDOM = np.random.default_rng(7)
 v1 = tf.compat.v1
@@ -221,7 +223,105 @@ def keras(folder: Path) -> None:
     )
 
 
+def history(folder: Path) -> None:
+    """Keras' loops over tensor lists, its Einsum of attention, its gelu, a product on three axes; two states beside."""
+    layers = tf.keras.layers
+    observation, h, c = (tf.keras.Input(s, name=n) for s, n in (([4, 6], "observation"), ([5], "h_in"), ([5], "c_in")))
+    seen = layers.MultiHeadAttention(2, 3)(observation, layers.Dense(5, activation="gelu")(observation))
+    seen = layers.Bidirectional(layers.GRU(3, return_sequences=True))(seen)
+    value, h_out, c_out = layers.LSTM(5, return_state=True)(seen, initial_state=[h, c])
+    action = layers.Dense(2, name="action")(value)
+    model = tf.keras.Model([observation, h, c], {"action": action, "h_out": h_out, "c_out": c_out})
+    feeds = {"observation": draw(3, 4, 6), "h_in": draw(3, 5), "c_in": draw(3, 5)}
+    results = model([*feeds.values()])
+    model.export(folder / "history", verbose=False)
+    memory = [
+        np.concatenate([side[n] for n in names], 1)
+        for side, names in ((feeds, ("c_in", "h_in")), (results, ("c_out", "h_out")))
+    ]
+    keep(
+        folder,
+        "history",
+        {"entities_0": feeds["observation"], "recurrent_in": memory[0]},
+        {"action": results["action"], "recurrent_out": memory[1]},
+    )
+
+
+class Boxed(CompositeTensor):
+    """A tensor whose type TensorFlow cannot load where this class is not."""
+
+    def __init__(self, tensor: Any) -> None:
+        self.tensor = tensor
+
+    @property
+    def _type_spec(self) -> Any:
+        return BoxedSpec(self.tensor.shape)
+
+
+@type_spec_registry.register("tests.Boxed")
+class BoxedSpec(tf.TypeSpec):
+    value_type = property(lambda self: Boxed)
+    _component_specs = property(lambda self: tf.TensorSpec(self.shape))
+
+    def __init__(self, shape: Any) -> None:
+        self.shape = tf.TensorShape(shape)
+
+    def _to_components(self, value: Any) -> Any:
+        return value.tensor
+
+    def _from_components(self, tensor: Any) -> Any:
+        return Boxed(tensor)
+
+    def _serialize(self) -> tuple[Any, ...]:
+        return (self.shape,)
+
+
+class Saver(tf.Module):
+    """What PolicySaver of TF-Agents writes: nested names, a state, outer axes squashed, shapes broadcast."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kernel, self.spread = tf.Variable(draw(6, 5)), tf.Variable(draw(2))
+        self.cell, self.head = tf.keras.layers.LSTMCell(5), tf.keras.layers.Dense(2)
+
+    @tf.function
+    def act(self, step_type: Any, observation: Any, h: Any, c: Any) -> dict[str, Any]:
+        outer = tf.shape(observation)[:-1]
+        rows = tf.reshape(observation, tf.concat([[tf.reduce_prod(outer)], tf.shape(observation)[-1:]], 0))
+        going_on = tf.cast(tf.not_equal(step_type, 0), tf.float32)[:, None]
+        value, (h, c) = self.cell(tf.nn.relu(rows @ self.kernel), [h * going_on, c * going_on])
+        mean = tf.reshape(self.head(value), tf.concat([outer, [2]], 0))
+        action = tf.broadcast_to(tf.tanh(mean), tf.broadcast_dynamic_shape(tf.shape(mean), tf.shape(self.spread)))
+        return {"action": tf.clip_by_value(action, -0.9, 0.9), "state/lstm/0": h, "state/lstm/1": c}
+
+    @tf.function(input_signature=[BoxedSpec([None, 6])])
+    def boxed(self, value: Any) -> Any:
+        return value.tensor * 2
+
+
+def saver(folder: Path) -> None:
+    policy = Saver()
+    feeds = {
+        "0/step_type": np.array([0, 1, 1], np.int32),
+        "0/observation": draw(3, 6),
+        **{f"1/lstm/{i}": draw(3, 5) for i in range(2)},
+    }
+    specs = [tf.TensorSpec([None, *a.shape[1:]], a.dtype, name) for name, a in feeds.items()]
+    results = policy.act(*feeds.values())
+    signatures = {"action": policy.act.get_concrete_function(*specs)}
+    tf.saved_model.save(policy, folder / "saver", signatures=signatures)
+    memory = [np.concatenate(list(side), 1) for side in ([*feeds.values()][2:], [*results.values()][1:])]
+    keep(
+        folder,
+        "saver",
+        {"0/step_type": feeds["0/step_type"], "state": feeds["0/observation"], "recurrent_in": memory[0]},
+        {"action": results["action"], "recurrent_out": memory[1]},
+    )
+
+
 def main(folder: Path) -> None:
+    history(folder)
+    saver(folder)
     tf2(folder)
     winding(folder)
     v1.disable_control_flow_v2()

@@ -20,7 +20,13 @@ from tests.saved_model.models import assert_agrees, roles, sources
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("written_by_tensorflow")]
 
 FLAT = {name: name for name in ("references", "resources", "bare", "bare-resources", "keys", "partitioned")}
-OF_FUNCTIONS = {"function": "function", "winding": "winding", "exported": "keras"}
+OF_FUNCTIONS = {
+    "function": "function",
+    "winding": "winding",
+    "exported": "keras",
+    "history": "history",
+    "saver": "saver",
+}
 TRUSTED = ReadOptions(trust_source=True)
 #: Read as data, Keras' own run beside it; and one whose activation Keras alone knows.
 WITH_KERAS = {"policy.keras": "keras", "policy.h5": "keras", "beyond.keras": "beyond"}

@@ -7,7 +7,7 @@ GraphDef, how other versions of TensorFlow spell it, and the *traits* that passe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, Protocol
 
@@ -59,17 +59,25 @@ class OnnxBuilder(Protocol):
         ...
 
 
-class GraphBuilder(Protocol):
-    """What an op that is written as other ops may use; ``converters.graph.editor.Editor`` is one."""
+class NodeBuilder(Protocol):
+    """What makes nodes."""
 
     def add(
-        self, op: str, inputs: Iterable[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
+        self, op: str, inputs: Sequence[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
     ) -> str:
         """A new node under a fresh name like ``name``; returns its output 0."""
         ...
 
     def const(self, array: np.ndarray, name: str) -> str:
         """A new Const under a fresh name like ``name``."""
+        ...
+
+
+class GraphBuilder(NodeBuilder, Protocol):
+    """What an op that is written as other ops may use; ``converters.graph.editor.Editor`` is one."""
+
+    def constant_of(self, reference: str) -> np.ndarray | None:
+        """The value of a tensor of the old graph that is a Const."""
         ...
 
     def redirect(self, reference: str, to: str) -> None:

@@ -6,9 +6,11 @@ import numpy as np
 
 from converters.graph.nodes import Node, TensorShape, normal_ref, ref
 from converters.graph.ops.base import Attr, GraphBuilder, Older, OpDef, written_as_older
+from converters.graph.ops.einsum import einsum
 from converters.graph.types import BOOL, FLOAT32, INT32
 from signatures.errors import UnsupportedOpError
 
+_MAX_AXIS = 7
 TO_NCHW, TO_NHWC = np.array([0, 3, 1, 2], INT32), np.array([0, 2, 3, 1], INT32)
 
 
@@ -129,6 +131,58 @@ def broadcast_to(builder: GraphBuilder, node: Node) -> str:
     return wide if dtype != BOOL else builder.add("Cast", [wide], f"{node.name}/bool", node.origin, DstT=BOOL)
 
 
+def _einsum(builder: GraphBuilder, node: Node) -> str:
+    """Einsum (TF 1.15)."""
+    try:
+        return einsum(builder, str(node.attrs.get("equation", "")), node.inputs, f"{node.name}/einsum")
+    except UnsupportedOpError as error:
+        what = f"cannot convert Einsum (node {node.name!r}): {error.what}"
+        raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
+
+
+def _erfc(builder: GraphBuilder, node: Node) -> str:
+    """Erfc, which Keras' gelu is made of, as 1 − erf(x)."""
+    one = builder.const(np.ones((), _dtype(node)), f"{node.name}/one")
+    return builder.add("Sub", [one, builder.add("Erf", node.inputs, f"{node.name}/Erf")], f"{node.name}/rest")
+
+
+def _reversed(builder: GraphBuilder, node: Node) -> str:
+    """ReverseV2 of given axes, which no ONNX op is: a StridedSlice that goes backwards."""
+    tensor, operand = node.inputs
+    constant = builder.constant_of(operand)
+    axes = [] if constant is None else [int(a) for a in constant.reshape(-1)]
+    if constant is None or min(axes, default=0) < 0 or max(axes, default=0) > _MAX_AXIS:
+        raise UnsupportedOpError(
+            f"cannot convert ReverseV2 (node {node.name!r}) along {axes or 'axes that are computed'}",
+            issues=[(node.name, node.op)],
+        )
+    if not axes:
+        return tensor
+    count, mask = max(axes) + 1, (1 << (max(axes) + 1)) - 1
+    steps = np.array([-1 if i in axes else 1 for i in range(count)], INT32)
+    zeros = np.zeros(count, INT32)
+    bounds = [builder.const(a, f"{node.name}/{k}") for a, k in ((zeros, "begin"), (zeros, "end"), (steps, "steps"))]
+    return builder.add(
+        "StridedSlice", [tensor, *bounds], f"{node.name}/reversed", node.origin, begin_mask=mask, end_mask=mask
+    )
+
+
+def _broadcast_args(builder: GraphBuilder, node: Node) -> str:
+    """BroadcastArgs, the shape that two broadcast to: the larger lengths, ones before the shorter shape."""
+    shapes = list(node.inputs)
+    counts = [builder.add("Size", [s], f"{node.name}/count", out_type=INT32) for s in shapes]
+    longer = builder.add("Maximum", counts, f"{node.name}/longer")
+    wide = []
+    for shape, count in zip(shapes, counts, strict=True):
+        missing = builder.add("Sub", [longer, count], f"{node.name}/missing")
+        vector = builder.add("Pack", [missing], f"{node.name}/vector", axis=0)
+        one = builder.const(np.ones((), _dtype(node) if "T" in node.attrs else INT32), f"{node.name}/one")
+        ones = builder.add("Fill", [vector, one], f"{node.name}/ones")
+        axis = builder.const(np.array(0, INT32), f"{node.name}/axis")
+        wide.append(builder.add("ConcatV2", [ones, shape, axis], f"{node.name}/wide"))
+    return builder.add("Maximum", wide, f"{node.name}/shape", node.origin)
+
+
 def _spelt(name: str, older: Older, *spellings: str) -> OpDef:
     return OpDef(name, written_as_older, older=older, spellings=spellings)
 
@@ -138,6 +192,10 @@ OPS = (
     _spelt("FusedBatchNorm", _batch_norm, "FusedBatchNormV2", "FusedBatchNormV3"),
     _spelt("Concat", _concat_v1, "ConcatV1"),
     _spelt("IdentityN", _identity_n),
+    _spelt("Einsum", _einsum),
+    _spelt("Erfc", _erfc),
+    _spelt("ReverseV2", _reversed),
+    _spelt("BroadcastArgs", _broadcast_args),
     OpDef(
         "PlaceholderWithDefault",
         written_as_older,

@@ -19,6 +19,8 @@ CONTROL_FLOW: Mapping[str, str] = MappingProxyType(
         "LoopCond": "loop_cond",
         "TensorArrayV3": "array",
         **{f"TensorArray{op}V3": op.lower() for op in ("Scatter", "Gather", "Read", "Write", "Size")},
+        **{f"TensorList{op}": f"list_{op.lower()}" for op in ("FromTensor", "Reserve", "GetItem", "SetItem", "Stack")},
+        "TensorListLength": "list_length",
     }
 )
 

@@ -69,7 +69,7 @@ def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tupl
     given_out = {normal_ref(n): r for n, r in options.outputs.items()}
     told = tuple(
         m
-        for m in facts.memories or _paired(graph, facts)
+        for m in (_paired(graph, facts) if facts.memories is None else facts.memories)
         if m.input not in options.values
         and given_in.get(m.input) in (None, Role.MEMORY_IN)
         and given_out.get(m.output) in (None, Role.MEMORY_OUT)
@@ -89,7 +89,8 @@ def _paired(graph: Graph, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
     """The memories that names and shapes tell, of inputs that nothing else is known of."""
     named = (n for n in graph.nodes if n.op == "Placeholder" and n.name not in facts.roles)
     unknown = [n.name for n in named if role_by_name(n.name.rsplit("/", 1)[-1], n) is None]
-    return paired_memories(graph, unknown, [n for n, role in facts.outputs.items() if role is None])
+    outputs = [n for n, role in facts.outputs.items() if role is None]
+    return paired_memories(unknown, outputs, lambda: infer_types(graph, partial=True))
 
 
 def _named(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[SeparateMemory, ...]:

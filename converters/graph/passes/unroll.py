@@ -11,7 +11,7 @@ UnsupportedOpError where a predicate is not constant or a loop runs for more tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,12 +41,14 @@ class _Flow:
 
     size: int | None
     items: tuple[tuple[int, str], ...] = ()
+    #: the tensor whose rows are the elements (TensorListFromTensor)
+    source: str = ""
 
-    def get(self, node: Node, index: int) -> str:
-        for at, tensor in self.items:
-            if at == index:
-                return tensor
-        raise _broken(node, f"element {index} of its tensor array was never written")
+    def get(self, index: int) -> str | None:
+        return dict(self.items).get(index)
+
+    def with_item(self, index: int, value: str) -> _Flow:
+        return replace(self, items=tuple({**dict(self.items), index: value}.items()))
 
 
 class _DeadError(Exception):
@@ -226,10 +228,9 @@ class _Unroller:
     def _scatter(self, node: Node, index: int, turn: int | None) -> _Flow:
         _, indices, value, flow_in = node.inputs
         flow, source = self._flow(flow_in, turn), self.plain(value, turn)
-        items = dict(flow.items)
         for position, i in enumerate(self._indices(node, indices, turn)):
-            items[i] = self._element(source, position, f"{node.name}/{i}")
-        return _Flow(flow.size, tuple(items.items()))
+            flow = flow.with_item(i, self._element(source, position, f"{node.name}/{i}"))
+        return flow
 
     def _element(self, source: str, position: int, name: str) -> str:
         bounds = [
@@ -239,17 +240,17 @@ class _Unroller:
         return self._add("StridedSlice", [source, *bounds], name, shrink_axis_mask=1)
 
     def _read(self, node: Node, index: int, turn: int | None) -> str:
-        return self._flow(node.inputs[2], turn).get(node, self._index(node, turn))
+        return self._item(node, self._flow(node.inputs[2], turn), self._index(node, turn))
 
     def _write(self, node: Node, index: int, turn: int | None) -> _Flow:
         position = self._index(node, turn)
         flow = self._flow(node.inputs[3], turn)
         value = self.plain(node.inputs[2], turn)
-        return _Flow(flow.size, tuple({**dict(flow.items), position: value}.items()))
+        return flow.with_item(position, value)
 
     def _gather(self, node: Node, index: int, turn: int | None) -> str:
         flow = self._flow(node.inputs[2], turn)
-        parts = [flow.get(node, i) for i in self._indices(node, node.inputs[1], turn)]
+        parts = [self._item(node, flow, i) for i in self._indices(node, node.inputs[1], turn)]
         return self._add("Pack", parts, f"{node.name}/pack", axis=0)
 
     def _size(self, node: Node, index: int, turn: int | None) -> str:
@@ -257,6 +258,50 @@ class _Unroller:
         if flow.size is None:
             raise _undecided(node, "the size of a tensor array")
         return self._const(np.array(flow.size, INT32), f"{node.name}/size")
+
+    def _item(self, node: Node, flow: _Flow, index: int) -> str:
+        """An element of an array, which was written, or is a row of what the array was made of."""
+        item = flow.get(index)
+        if item is None and flow.source and index >= 0:
+            key = (f"{flow.source}[{index}]", None)
+            if key not in self.memo:
+                self.memo[key] = self._element(flow.source, index, f"{node.name}/{index}")
+            item = self.memo[key]  # type: ignore[assignment]
+        if item is None:
+            raise _broken(node, f"element {index} of its tensor array was never written")
+        return item
+
+    # ---- tensor lists, the arrays of TensorFlow 2: values, where a tensor array is a resource with a flow
+
+    def _list_reserve(self, node: Node, index: int, turn: int | None) -> _Flow:
+        size = self.constant(self.plain(node.inputs[1], turn))
+        return _Flow(None if size is None else int(size))
+
+    def _list_fromtensor(self, node: Node, index: int, turn: int | None) -> _Flow:
+        known = self.types.get(node.inputs[0])
+        length = known.shape[0] if known is not None and known.shape else None
+        return _Flow(length if isinstance(length, int) else None, source=self.plain(node.inputs[0], turn))
+
+    def _list_getitem(self, node: Node, index: int, turn: int | None) -> str:
+        return self._item(node, self._flow(node.inputs[0], turn), self._index(node, turn))
+
+    def _list_setitem(self, node: Node, index: int, turn: int | None) -> _Flow:
+        return self._flow(node.inputs[0], turn).with_item(self._index(node, turn), self.plain(node.inputs[2], turn))
+
+    def _list_stack(self, node: Node, index: int, turn: int | None) -> str:
+        flow = self._flow(node.inputs[0], turn)
+        if flow.source and not flow.items:
+            return flow.source
+        size = len(flow.items) if flow.size is None else flow.size
+        if size > MAX_TURNS:
+            raise _undecided(node, f"the number of elements, or one above {MAX_TURNS},")
+        return self._add("Pack", [self._item(node, flow, i) for i in range(size)], f"{node.name}/pack", axis=0)
+
+    def _list_length(self, node: Node, index: int, turn: int | None) -> str:
+        size = self._flow(node.inputs[0], turn).size
+        if size is None:
+            raise _undecided(node, "the length of a tensor list")
+        return self._const(np.array(size, INT32), f"{node.name}/length")
 
     # ---- new nodes
 

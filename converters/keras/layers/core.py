@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nn.linear import einsum, matmul
+from converters.graph.nn.linear import matmul
 from converters.graph.nn.shaping import padded, taken
+from converters.graph.ops.einsum import einsum
 from converters.graph.types import FLOAT32, INT32, Dim
 from converters.keras.layers.activations import activated
 from converters.keras.layers.step import Step, Translate

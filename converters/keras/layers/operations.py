@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nn.activations import clip
-from converters.graph.nn.linear import einsum, matmul
+from converters.graph.nn.linear import matmul
+from converters.graph.ops.einsum import einsum
 from converters.graph.types import FLOAT32
 from converters.keras.layers.activations import activation_of, softmax
 from converters.keras.layers.step import Step, Translate

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from converters.graph.nn import reduction
 from converters.graph.nn import shaping as nn
 from converters.graph.nn.choosing import last, moved_back
-from converters.graph.nn.linear import einsum, matmul
+from converters.graph.nn.linear import matmul
+from converters.graph.ops.einsum import einsum
 from converters.graph.types import INT64, product
 from converters.onnx.importer.elementwise import is_bias
 from converters.onnx.importer.importer import Importer

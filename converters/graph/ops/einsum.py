@@ -1,0 +1,87 @@
+"""Sums of products after an equation (numpy.einsum, ONNX and TensorFlow's Einsum) as ops that TensorFlow 1.4 has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.graph.ops.base import NodeBuilder
+from converters.graph.types import INT32
+from signatures.errors import UnsupportedOpError
+
+_OPERANDS = 2
+
+
+def einsum(b: NodeBuilder, equation: str, tensors: Sequence[str], name: str = "einsum") -> str:
+    """One or two tensors, each label at most once per operand; nothing need be known of their shapes.
+
+    Raises UnsupportedOpError for other equations.
+    """
+    equation = equation.replace(" ", "")
+    left, arrow, result = equation.partition("->")
+    terms, tensors = left.split(","), [*tensors]
+    if not arrow:
+        letters = sorted(set(left) - {","})
+        result = "".join(c for c in letters if left.count(c) == 1)
+    simple = "." not in equation and all(len(set(t)) == len(t) for t in (*terms, result))
+    if not simple or len(terms) != len(tensors) or len(terms) > _OPERANDS or set(result) - set(left):
+        raise UnsupportedOpError(
+            f"the equation {equation[:80]!r} is no plain product",
+            why="one or two operands without repeated labels are written as products; no policy uses others",
+        )
+    lone = [[c for c in t if c not in result and left.count(c) == 1] for t in terms]
+    for i, labels in enumerate(lone):
+        if labels:
+            axes = b.const(np.array([terms[i].index(c) for c in labels], INT32), f"{name}/axes")
+            tensors[i] = b.add("Sum", [tensors[i], axes], f"{name}/sum", keep_dims=False)
+            terms[i] = "".join(c for c in terms[i] if c not in labels)
+    if len(terms) == 1:
+        return _turned(b, tensors[0], terms[0], result, name)
+    return _contracted(b, tensors, terms, result, name)
+
+
+def _contracted(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], result: str, name: str) -> str:
+    """Two operands as matrix products: [batch…, rows, inner] × [batch…, inner, columns]."""
+    first, second = terms
+    batch = [c for c in first if c in second and c in result]
+    inner = [c for c in first if c in second and c not in result]
+    rows, columns = ([c for c in t if c not in o] for t, o in ((first, second), (second, first)))
+    shapes = [b.add("Shape", [t], f"{name}/shape", out_type=INT32) for t in tensors]
+
+    def length(label: str) -> str:
+        term = 0 if label in first else 1
+        axis = terms[term].index(label)
+        at = [b.const(np.array([n], INT32), f"{name}/at") for n in (axis, axis + 1, 1)]
+        return b.add("StridedSlice", [shapes[term], *at], f"{name}/length", shrink_axis_mask=1)
+
+    def side(labels: Sequence[str], *, known: bool) -> str:
+        """The number of elements of one axis made of these; -1 where it is the one that is left open."""
+        if not known or not labels:
+            return b.const(np.array(-1 if labels else 1, INT32), f"{name}/open")
+        count = length(labels[0])
+        for label in labels[1:]:
+            count = b.add("Mul", [count, length(label)], f"{name}/count")
+        return count
+
+    matrices = []
+    for tensor, term, sides in zip(tensors, terms, ((rows, inner), (inner, columns)), strict=True):
+        value = _turned(b, tensor, term, "".join([*batch, *sides[0], *sides[1]]), name)
+        if [len(s) for s in sides] != [1, 1]:
+            dims = [*map(length, batch), *(side(s, known=s is inner) for s in sides)]
+            value = b.add("Reshape", [value, b.add("Pack", dims, f"{name}/dims", axis=0)], f"{name}/matrix")
+        matrices.append(value)
+    value = b.add("BatchMatMul" if batch else "MatMul", matrices, f"{name}/product")
+    order = [*batch, *rows, *columns]
+    if [len(rows), len(columns)] != [1, 1]:
+        dims = [length(c) for c in order]
+        shape = b.add("Pack", dims, f"{name}/dims", axis=0) if dims else b.const(np.zeros(0, INT32), f"{name}/dims")
+        value = b.add("Reshape", [value, shape], f"{name}/whole")
+    return _turned(b, value, "".join(order), result, name)
+
+
+def _turned(b: NodeBuilder, tensor: str, term: str, result: str, name: str) -> str:
+    if term == result:
+        return tensor
+    order = b.const(np.array([term.index(c) for c in result], INT32), f"{name}/order")
+    return b.add("Transpose", [tensor, order], f"{name}/turned")
