@@ -77,6 +77,8 @@ bench: install
 N := 20000
 fuzz: install
 	$(BIN)/python -m tests.fuzz --count $(N)
+	$(BIN)/python -m tests.hostile.contracts
+	$(BIN)/python -m tests.hostile.kills
 
 train: install .venv-train/.installed
 	OMP_NUM_THREADS=1 PYTHONPATH=. .venv-train/bin/python -m fixtures.train

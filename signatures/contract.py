@@ -179,6 +179,8 @@ def parse_signature(whole: Field) -> PolicySignature:
         raise whole["outputs"].error("lacks an action")
     if space == "hybrid" and len({head.is_continuous for head in heads}) < 2:
         raise whole["outputs"].error("lacks the continuous or the discrete action of a hybrid")
+    for key, specs in (("inputs", inputs), ("outputs", outputs)):
+        _check_branches(whole, key, specs)
     named = {s.name: s for s in inputs}
     preprocess = {name: _preprocess(entry) for name, entry in whole["preprocess"].members().items()}
     if not preprocess.keys() <= named.keys():
@@ -241,6 +243,14 @@ def _check_sizes(whole: Field, inputs: tuple[TensorSpec, ...]) -> None:
     for entry, spec in zip(whole["inputs"].items(), inputs, strict=True):
         if spec.role in (Role.MASKS, Role.PREV_ACTION) and (spec.shape[-1] or 0) > _MOST_ACTIONS:
             raise entry["shape"].error(f"has more than {_MOST_ACTIONS} actions")
+
+
+def _check_branches(whole: Field, key: str, specs: tuple[TensorSpec, ...]) -> None:
+    """Raise FieldError where masks, or chances, are not one for each action of the branches."""
+    total = sum(n.value for n in whole["branches"].items())
+    for entry, spec in zip(whole[key].items(), specs, strict=True):
+        if spec.role in (Role.MASKS, Role.LOG_PROBS, Role.PROBS) and total and spec.shape[-1] not in (None, total):
+            raise entry["shape"].error(f"is not as wide as the branches, which have {total} actions")
 
 
 def _tensor(entry: Field, roles: Any) -> TensorSpec:

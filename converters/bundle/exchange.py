@@ -86,7 +86,7 @@ def _synced(folder: Path) -> None:
     inside = [folder, *folder.rglob("*")]
     # Side by side: the disk then waits once for all of them, not once for each.
     failed: list[OSError] = []
-    threads = [threading.Thread(target=_sync_or_note, args=(path, failed)) for path in inside]
+    threads = [threading.Thread(target=_sync_or_note, args=(path, failed), daemon=True) for path in inside]
     for thread in threads:
         thread.start()
     for thread in threads:

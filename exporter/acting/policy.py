@@ -272,6 +272,12 @@ class LoadedPolicy:
         else:
             scores = outputs[self._scores.name]
         branches = head.branches or (scores.shape[1],)
+        if sum(branches) != scores.shape[1]:
+            raise BundleError(
+                f"gives {scores.shape[1]} chances for branches of {list(branches)} actions",
+                where=self.name,
+                fix="export the policy again",
+            )
         return likeliest(scores, branches) if deterministic else self._generator.choices(scores, branches)
 
 

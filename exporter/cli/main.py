@@ -12,6 +12,9 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 
+#: Seconds in which a command that was told to stop does so by itself.
+_GRACE = 3
+
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line ``args``, this process's own where there are none. Raises SystemExit unless all is well."""
@@ -34,8 +37,10 @@ def main(args: Sequence[str] | None = None) -> None:
 
 @contextlib.contextmanager
 def _stoppable(told: list[int]) -> Iterator[None]:
-    """Ctrl-C, SIGTERM and a terminal that is closed are an interrupt inside, so that folders and processes are ended; a
-    second one ends at once. ``told`` gets the signals. What was ignored from outside (nohup) stays so.
+    """Ctrl-C, SIGTERM and a terminal that is closed are an interrupt inside, so that folders and processes are ended.
+
+    A second one ends at once, and so does an alarm, as Python loses an interrupt that comes in a destructor. ``told``
+    gets the signals. What was ignored from outside (nohup) stays so.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -45,7 +50,10 @@ def _stoppable(told: list[int]) -> Iterator[None]:
         told.append(number)
         if len(told) > 1:
             _clean_up()
-            os._exit(128 + number)
+            os._exit(128 + told[0])
+        if hasattr(signal, "SIGALRM"):
+            signal.signal(signal.SIGALRM, stop)
+            signal.alarm(_GRACE)
         raise KeyboardInterrupt
 
     numbers = [n for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
@@ -54,6 +62,8 @@ def _stoppable(told: list[int]) -> Iterator[None]:
     try:
         yield
     finally:
+        if told and hasattr(signal, "SIGALRM"):
+            signal.alarm(0)
         for number, handler in before.items():
             signal.signal(number, handler)
 

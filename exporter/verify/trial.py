@@ -209,7 +209,7 @@ class Trial:
         if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
             return None
         scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
-        if scores is None or scores not in expected:
+        if scores is None or scores not in expected or expected[scores].shape[-1] != sum(self.signature.branches):
             return None
         found = ties(
             expected[scores], self.signature.branches, self.tolerance(scores, participant), rounding.get(scores)

@@ -307,6 +307,34 @@ def test_a_signal_leaves_no_folder_and_no_traceback(number: signal.Signals, agai
     assert files_in(tmp_path) == {"out", "temporary"}
 
 
+#: Loses the interrupt, as Python does where it comes in a destructor.
+LOST = """
+import os, signal, sys, time
+from converters.runtimes import pool
+from exporter.cli.main import main
+
+start = pool.RuntimePool.start
+def losing(self, names):
+    start(self, names)
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1)
+    except KeyboardInterrupt:
+        time.sleep(60)
+pool.RuntimePool.start = losing
+main(sys.argv[1:])
+"""
+
+
+def test_a_signal_that_was_lost_ends_it_all_the_same(tmp_path: Path) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    arguments = (fixture("continuous"), "-o", tmp_path / "out", "--verify", "numpy")
+    ran = python("-c", LOST, *arguments, environment={"TMPDIR": str(temporary)})
+    assert ran.status == 128 + signal.SIGTERM
+    assert files_in(tmp_path) == {"out", "temporary"}
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_exports_that_are_killed_at_random_tear_nothing_and_leave_nobody(tmp_path: Path) -> None:
