@@ -265,8 +265,9 @@ def _actor_critic(made: _Built, observed: Space | Mapping[str, Space]) -> None:
         return
     if len(net.state.shape("log_std")) == 1:
         net.at("action_net")
-        spread = net.const(np.exp(net.state.array("log_std", net.width(out)).astype(np.float64)).astype(FLOAT32), "std")
-        _continuous(made, out, spread)
+        with np.errstate(over="ignore"):  # a damaged file's; a spread without end is one that verification finds
+            spread = np.exp(net.state.array("log_std", net.width(out)).astype(np.float64)).astype(FLOAT32)
+        _continuous(made, out, net.const(spread, "std"))
         return
     _continuous(made, out, _state_dependent(made, x, "log_std", net.width(out)))
 

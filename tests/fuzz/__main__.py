@@ -34,7 +34,7 @@ def main() -> int:
     print("| reader | mutants | refused | converted | failures | slowest | minutes |\n|---|---|---|---|---|---|---|")
     for reader in readers:
         begun = time.monotonic()
-        result = run(reader, given.first, given.count)
+        result = run([reader], given.first, given.count)
         failed += len(result.failures)
         print(row(result, time.monotonic() - begun), flush=True)
         for often, what, number in result.grouped():

@@ -244,7 +244,7 @@ def json_tree(content: Any, random: Random) -> Any:
             del container[key]
         elif how < 0.35:
             container[key] = copy.deepcopy(other[where])
-        elif how < 0.45 and isinstance(container, list):
+        elif how < 0.45 and isinstance(container, list) and len(str(container)) < 5000:
             container.extend([copy.deepcopy(container[key])] * random.choice((1, 3, 1000)))
         elif how < 0.55 and isinstance(container, dict):
             container[text(random, []).decode("utf-8", "surrogateescape")] = container.pop(key)

@@ -8,7 +8,7 @@ import selectors
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,10 +50,10 @@ class Result:
 class _Worker:
     """One process; it is given ranges of numbers, and ended where it does not answer."""
 
-    def __init__(self, reader: str) -> None:
+    def __init__(self, readers: Sequence[str]) -> None:
         environment = {**os.environ, "PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz.worker", reader],
+            [sys.executable, "-m", "tests.fuzz.worker", *readers],
             cwd=_ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
         self._waiting = b""
@@ -90,12 +90,12 @@ class _Worker:
         return f"status {self._process.returncode} {said.decode(errors='replace').strip()[-300:]}"
 
 
-def run(reader: str, first: int, count: int, progress: Callable[[Result], None] = lambda result: None) -> Result:
-    """The mutants ``first`` to ``first + count`` of a reader."""
-    result = Result(reader)
+def run(readers: Sequence[str], first: int, count: int) -> Result:
+    """The mutants ``first`` to ``first + count`` of a reader; several readers take turns, with ``count`` for all."""
+    result = Result(", ".join(readers))
     at, last = first, first + count
     while at < last:
-        worker = _Worker(reader)
+        worker = _Worker(readers)
         worker.give(at, last)
         while at < last:
             line = worker.line()
@@ -108,7 +108,6 @@ def run(reader: str, first: int, count: int, progress: Callable[[Result], None] 
                 break
             result.add(at, json.loads(line))
             at += 1
-            progress(result)
         else:
             worker.end()
     return result

@@ -13,11 +13,12 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory are Linux's"),
 ]
+#: Of each reader.
+COUNT = 20
 
 
-@pytest.mark.parametrize("reader", READERS)
-def test_mutants_are_converted_or_refused(reader: str) -> None:
-    result = run(reader, 1_000_000, 25)
+def test_mutants_are_converted_or_refused() -> None:
+    result = run(list(READERS), 0, COUNT * len(READERS))
     assert not result.failures, result.grouped()
-    assert sum(result.counts.values()) == 25
-    assert result.counts["refused"] > 0
+    assert sum(result.counts.values()) == COUNT * len(READERS)
+    assert min(result.counts["refused"], result.counts["ok"]) > COUNT

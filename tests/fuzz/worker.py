@@ -1,7 +1,7 @@
-"""A process that makes mutants and gives them to the commands, under limits; it says on its output what came of each.
+"""A process that makes mutants and gives them to the commands, under limits; it says what came of each.
 
-``python -m tests.fuzz.worker READER`` reads lines ``FIRST LAST`` and answers ``> NUMBER`` before a mutant and a line of
-JSON after it. It is started by ``tests.fuzz.run``, which ends it where it hangs.
+``python -m tests.fuzz.worker READER...`` reads lines ``FIRST LAST``, and answers ``> NUMBER`` before a mutant and JSON
+after it. It is started by ``tests.fuzz.run``, which ends it where it hangs.
 """
 
 from __future__ import annotations
@@ -169,21 +169,18 @@ def _numbers() -> Iterator[int]:
         yield from range(first, last)
 
 
-def main(reader: str) -> None:
-    """Answer until the input ends."""
-    chosen = READERS[reader]
+def main(readers: list[str]) -> None:
+    """Answer until the input ends; the readers take turns."""
     top = Path(tempfile.mkdtemp(prefix="export-model-fuzz-"))
     os.environ["TMPDIR"] = tempfile.tempdir = str(top)
     say = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        for files in chosen.seeds():  # the modules that are imported on demand are no mutant's doing
-            attempt(
-                files if "." not in chosen.main or chosen.main in files else mutant(reader, -1),
-                chosen.main,
-                chosen.takes,
-                top,
-            )
+        for reader in readers:  # the modules that are imported on demand are no mutant's doing
+            chosen = READERS[reader]
+            for files in chosen.seeds()[:4]:
+                whole = chosen.main in files or not chosen.main
+                attempt(files if whole else mutant(reader, -1), chosen.main, chosen.takes, top)
         base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
         mapped = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, mapped + MEMORY))
@@ -191,7 +188,9 @@ def main(reader: str) -> None:
         say.write("ready\n")
         for number in _numbers():
             say.write(f"> {number}\n")
-            outcome = attempt(mutant(reader, number), chosen.main, chosen.takes, top)
+            reader = readers[number % len(readers)]
+            chosen = READERS[reader]
+            outcome = attempt(mutant(reader, number // len(readers)), chosen.main, chosen.takes, top)
             grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10) - base
             if grown > MEMORY:
                 outcome.update(kind="memory", said=f"{grown >> 20} MiB", place="")
@@ -201,4 +200,4 @@ def main(reader: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1:])
