@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from converters.graph.jitter import Arithmetic
+    from converters.graph.ops.approximations import Arithmetic
 
 Progress = Callable[[str], None]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -35,21 +36,24 @@ class Names:
         self._taken[name.casefold()] = path
 
     def _claim(self, path: Path, name: str) -> Claimed:
-        found = next(wish for wish in _wishes(path, name) if wish.casefold() not in self._taken)
-        self._taken[found.casefold()] = path
-        if found == name:
+        other = self._taken.get(name.casefold())
+        if other is None:
+            self._taken[name.casefold()] = path
             return name, None
-        return found, f"called {found}: {name} is the policy of {self._taken[name.casefold()]}"
+        wishes = _numbered(name) if other == path else _wishes(path, name)
+        found = next(wish for wish in wishes if wish.casefold() not in self._taken)
+        self._taken[found.casefold()] = path
+        return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {other}"
 
 
 def _wishes(path: Path, name: str) -> Iterator[str]:
-    yield name
     wish = name
     for part in (path.stem, *reversed(path.absolute().parent.parts[1:])):
         if part != name:
             wish = safe_name(f"{part}-{wish}")
             yield wish
-    number = 2
-    while True:
-        yield f"{name}-{number}"
-        number += 1
+    yield from _numbered(name)
+
+
+def _numbered(name: str) -> Iterator[str]:
+    return (f"{name}-{number}" for number in itertools.count(2))

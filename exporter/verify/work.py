@@ -46,7 +46,7 @@ def products(graph: Graph) -> int:
     types = infer_types(graph)
     total = 0
     for node in graph.nodes:
-        if node.op in ("Placeholder", "Const"):
+        if not node.inputs:
             continue
         result = _elements(types[ref(node.name, 0)])
         terms = 1.0

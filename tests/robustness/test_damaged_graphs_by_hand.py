@@ -414,14 +414,21 @@ def test_a_constant_that_is_read_through_nothing_is_none(tmp_path: Path) -> None
 # ------------------------------------------------------------------ names
 
 
-def test_two_brains_whose_names_become_one_are_refused(tmp_path: Path) -> None:
-    nodes = [*continuous_policy("Ball-A/B/"), *continuous_policy("Ball/A-B/")]
-    refused(nodes, tmp_path, "policy-Ball-A-B", "Ball-A/B", "Ball/A-B")
-
-
-def test_two_brains_that_differ_in_case_only_are_refused(tmp_path: Path) -> None:
-    nodes = [*continuous_policy("Ball/"), *continuous_policy("BALL/")]
-    refused(nodes, tmp_path, "policy-Ball", "policy-BALL")
+@pytest.mark.parametrize(
+    ("brains", "called"),
+    [
+        (("Ball-A/B/", "Ball/A-B/"), ["policy-Ball-A-B", "policy-Ball-A-B-2"]),
+        (("Ball/", "BALL/"), ["policy-BALL-2", "policy-Ball"]),
+    ],
+)
+def test_two_brains_whose_names_become_one_are_numbered(
+    brains: tuple[str, str], called: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "policy.bytes").write_bytes(graph_bytes([*continuous_policy(brains[0]), *continuous_policy(brains[1])]))
+    ran = export_model(tmp_path / "policy.bytes", "-o", tmp_path / "out", "--verify", "none")
+    assert ran.status == 0, ran.err
+    assert "is another policy of" in ran.out
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == called
 
 
 def test_names_of_nodes_may_be_anything(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from converters.formats import WRITTEN
-from converters.graph.jitter import APPROXIMATIONS
+from converters.graph.ops.approximations import APPROXIMATIONS
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes
 from exporter.export.pipeline import ExportOptions, export

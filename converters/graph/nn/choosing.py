@@ -71,7 +71,8 @@ def scattered(b: Builder, x: str, indices: str, updates: str, combined: Combined
     if combined == "mul":
         factor = b.reduce("Prod", b.where(hit, given, b.number(x, 1, "nothing")), [rank - 1], keep=False)
         return b.add("Mul", [x, factor])
-    kind, op = ("Max", "Maximum") if combined == "max" else ("Min", "Minimum")
+    kind = "Max" if combined == "max" else "Min"
+    op = f"{kind}imum"
     own = b.expand_dims(x, rank - 1)
     return b.add(op, [x, b.reduce(kind, b.where(hit, given, own), [rank - 1], keep=False)])
 

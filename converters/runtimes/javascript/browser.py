@@ -29,7 +29,7 @@ from converters.runtimes.javascript.node import (
 from signatures.errors import RuntimeUnavailableError
 
 if TYPE_CHECKING:
-    from converters.graph.jitter import Arithmetic
+    from converters.graph.ops.approximations import Arithmetic
 
 CHROMIUM_VARIABLE = "EXPORT_MODEL_CHROMIUM"
 """The environment variable that names Chromium's program; it goes before every other place."""

@@ -1,0 +1,53 @@
+"""How far the runtimes' approximations of functions are from the functions, by op.
+
+It was measured (``tests/runtimes/test_approximations.py``), over arguments from 1e-6 to 30; a formula like exp(x) - 1
+is as far off at its zero as anywhere, which no number of units in the last place of its result says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, TypeAlias
+
+Arithmetic: TypeAlias = Literal["processor", "graphics"]
+
+#: Op → (units in the last place of the result, absolute): the farther of both counts. The worst of TensorFlow 1.4, 1.7
+#: and 2.21 (Eigen), onnxruntime 1.31 and its wasm build 1.30 (MLAS), TensorFlow.js 4.22's cpu and wasm (XNNPACK).
+_PROCESSOR: Mapping[str, tuple[float, float]] = {
+    "Cos": (2, 3.2e-7),
+    "Elu": (1, 7e-8),
+    "Erf": (5, 1.7e-7),
+    "Exp": (2, 0),
+    "Expm1": (4, 9e-8),
+    "Log": (3, 0),
+    "Log1p": (3, 1.1e-7),
+    "LogSoftmax": (3, 1.3e-7),
+    "Rsqrt": (3, 0),
+    "Selu": (2, 1.3e-7),
+    "Sigmoid": (6, 1.7e-7),
+    "Sin": (5, 2.5e-7),
+    "Softmax": (36, 0),
+    "Softplus": (7, 1.1e-7),
+    "Sqrt": (4, 0),
+    "Tanh": (6, 0),
+}
+#: TensorFlow.js' WebGL, where it is worse: shaders, and here Chromium's software renderer.
+_GRAPHICS = {
+    "Cos": (2, 2e-4),
+    "Elu": (4, 1.8e-7),
+    "Erf": (6, 5.8e-7),
+    "Exp": (28, 0),
+    "Expm1": (28, 2.2e-7),
+    "Log": (4, 1.2e-7),
+    "Log1p": (4, 1.8e-7),
+    "LogSoftmax": (3, 2.4e-7),
+    "Selu": (4, 3.2e-7),
+    "Sin": (5, 2e-4),
+    "Softmax": (64, 0),
+    "Softplus": (7, 1.1e-7),
+    "Tanh": (6, 1.4e-7),
+}
+APPROXIMATIONS: Mapping[Arithmetic, Mapping[str, tuple[float, float]]] = {
+    "processor": _PROCESSOR,
+    "graphics": {**_PROCESSOR, **_GRAPHICS},
+}
