@@ -195,11 +195,14 @@ def _outputs(importer: Importer, names: Sequence[str]) -> tuple[dict[str, str], 
     """(output → node, output that could not be made → why). An action that cannot be made is an error."""
     outputs: dict[str, str] = {}
     broken: dict[str, UnsupportedOpError] = {}
+    missing: dict[str, str] = {}
     for name in dict.fromkeys(names):
         if name in importer.values:
             outputs[name] = importer.values[name]
         elif name in importer.broken:
             broken[name] = importer.broken[name]
+        elif name in CONSTANT_NAMES:  # Unity's own SoccerTwos
+            missing[name] = "it is a constant of ML-Agents, and nothing in the file makes it"
         else:
             raise DamagedFileError(
                 f"nothing makes the output {name!r}", why="the model was cut or edited", fix="export the model again"
@@ -207,7 +210,7 @@ def _outputs(importer: Importer, names: Sequence[str]) -> tuple[dict[str, str], 
     needed = [n for n in broken if n.split(":")[0] in ACTION_NAMES]
     if broken and (needed or not _computed(outputs, importer)):
         raise joined_errors([broken[n] for n in needed or broken])
-    return outputs, {name: error.what for name, error in broken.items()}
+    return outputs, {**missing, **{name: error.what for name, error in broken.items()}}
 
 
 def _computed(outputs: Mapping[str, str], importer: Importer) -> Collection[str]:

@@ -114,13 +114,20 @@ def _by_structure(
         elif integer and placeholder_rank(node) in (1, 2) and _feeds_one_hot(node, consumers):
             if recurrent and any(r in OBSERVATIONS for r in roles.values()):
                 roles[node.name] = Role.PREV_ACTION
-            elif not any(r in OBSERVATIONS for r in roles.values()):
+            elif declared or not any(r in OBSERVATIONS for r in roles.values()):
                 roles[node.name] = Role.VECTOR
+        elif declared and integer and not recurrent and _is_free(node) and _feeds_table(graph, node, consumers):
+            roles[node.name] = Role.VECTOR  # a class, by the row of an embedding
+        elif declared and not integer and not recurrent and _is_free(node) and placeholder_rank(node) == 2:
+            roles[node.name] = Role.PARAMETER if looks_like_state(node.name) else Role.VECTOR
         elif placeholder_rank(node) == 2 and not integer and _is_mask(graph, node, consumers):
             roles[node.name] = Role.MASKS
         elif declared and _has_rows(node) and not integer and not looks_like_state(node.name):
             roles[node.name] = Role.VECTOR if placeholder_rank(node) == 2 else Role.ENTITIES
     if any(r in OBSERVATIONS for r in roles.values()):
+        open_roles = [n for n in unknown if roles[n.name] is Role.PARAMETER and _is_free(n)]
+        if declared and not recurrent and open_roles:
+            raise _undecided(open_roles)
         return
     floats = [
         n
@@ -141,6 +148,29 @@ def _has_rows(node: Node) -> bool:
     shape: TensorShape | None = node.attrs.get("shape")
     dims = () if shape is None or shape.dims is None else shape.dims
     return len(dims) in (2, 3) and dims[0] is None and dims[-1] is not None and (dims[-1] > 1 or len(dims) > 2)
+
+
+def _undecided(nodes: Sequence[Node]) -> SignatureError:
+    name = nodes[0].name
+    return SignatureError(
+        f"it is not clear what the input {name!r} is for",
+        why=f"each agent has its own, beside an observation: {', '.join(f'{n.name} {_shape_text(n)}' for n in nodes)}",
+        fix=f"say what it is: --input {name}=vector_observation, --input {name}=parameter, or --set {name}=VALUE",
+    )
+
+
+def _is_free(node: Node) -> bool:
+    """Whether the first axis of a placeholder is that of the agents, and it is [B] or [B, n]."""
+    shape: TensorShape | None = node.attrs.get("shape")
+    dims = () if shape is None or shape.dims is None else shape.dims
+    return len(dims) in (1, 2) and dims[0] is None
+
+
+def _feeds_table(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> bool:
+    """Whether a tensor says which rows of a constant are taken."""
+    readers = _reached(node, consumers, lambda n: _shows(n) or traits(n).elementwise)
+    picked = [r for r in readers if traits(r).moves == "pick" and len(r.inputs) > 1]
+    return any(graph.constant(r.inputs[0]) is not None for r in picked)
 
 
 def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Callable[[Node], bool]) -> list[Node]:

@@ -24,8 +24,13 @@ from converters.understand.generations import torch_generation
 from signatures.roles import OUTPUT_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
-_ACTION = re.compile(r"actions?|action_mean|mean_actions?|outputs?|mean|mu|pi|policy")
-_VALUE = re.compile(r"values?|value_estimate|critic")
+_ACTION = re.compile(r"actions?|act|action_mean|mean_actions?|action_logits|logits|outputs?|mean|mu|pi|policy")
+_VALUE = re.compile(r"values?|value_estimate|critic|vf")
+_SCORES = re.compile(r"(action_)?logits")
+#: What only policies (and critics) call their inputs and outputs.
+_OF_A_POLICY = re.compile(
+    r"obs|state|act(ion)?s?($|_)|polic|logits|value|critic|actor|agent|goal|vec|mean|(^|_)(pi|mu|q|vf|std|sigma)($|_)"
+)
 #: ... and the spread of a Gaussian action (rl_games, skrl, tianshou, CleanRL), its logarithm, the log-probability.
 _STD = re.compile(r"(action_?)?(std|stddev|std_dev|sigma|scale)s?")
 _LOG_STD = re.compile(r"(action_?)?log_?(std|stddev|std_dev|sigma|scale)s?")
@@ -57,7 +62,7 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     else:
         roles = _roles_by_name(model)
         graph = _with_spreads(model, graph, roles)
-        facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model))
+        facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model, roles))
         if _positional(model):
             facts = replace(facts, family="Stable-Baselines3")
     return graph, replace(facts, notes=(*facts.notes, *notes, *_common_notes(model)))
@@ -224,9 +229,18 @@ def _columns(model: OnnxModel, name: str) -> int | str | None:
     return shape[-1] if shape else None
 
 
-def _notes_of_others(model: OnnxModel) -> tuple[str, ...]:
+def _notes_of_others(model: OnnxModel, roles: Mapping[str, Role | None]) -> tuple[str, ...]:
     if not _positional(model):
-        return ()
+        names = [n.lower() for n in (*model.inputs, *model.outputs)]
+        if not any(_OF_A_POLICY.search(n) for n in names):
+            return (
+                "nothing marks this file as a policy: no input or output has a name that trainers give "
+                f"({', '.join((*model.inputs, *model.outputs))}); what it computes is exported all the same",
+            )
+        scores = [
+            n for n, role in roles.items() if role is Role.ACTION and _SCORES.fullmatch(n.rpartition("/")[2].lower())
+        ]
+        return tuple(f"{n} are scores of a choice, not normalised: the best is the largest" for n in scores)
     names = list(model.outputs)
     order = f"{names[0]} is the action, {names[1]} the value"
     return (f"outputs by their order, as Stable-Baselines3's policies give them: {order}",)

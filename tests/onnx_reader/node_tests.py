@@ -10,7 +10,9 @@ model for one agent, and is run with several.
 
 from __future__ import annotations
 
+import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +28,7 @@ from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
+from converters.runtimes.process import RunFailedError
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 from signatures.roles import Role
@@ -49,16 +52,12 @@ class NodeTest:
     rtol: float
     atol: float
 
-    @property
-    def op(self) -> str:
-        """The operator that is tested; of one that is written out by its definition, too."""
-        kinds = [n.op_type for n in self.model.graph.node]
-        return kinds[-1] if len(set(kinds)) == 1 else f"{self.name.removeprefix('test_')}"
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a test: ``right``, ``refused``, ``wrong`` or ``no policy`` (with the reason)."""
+    """What became of a test, with the reason: ``right``, ``refused``, ``wrong``, ``no kernel`` (in onnxruntime) or
+    ``no policy``.
+    """
 
     state: str
     reason: str = ""
@@ -95,7 +94,10 @@ def outcome(test: NodeTest, folder: Path, pool: RuntimePool | None) -> Outcome:
             refusals.append(_short(error))
             continue
         taken = True
-        fault = _fault(test, fed, policy, folder, pool)
+        try:
+            fault = _fault(test, fed, policy, folder, pool)
+        except RunFailedError as error:
+            return Outcome("no kernel", error.why or error.what)
         if fault:
             return Outcome("wrong", f"{fault} (fed: {fed})")
     if taken:
@@ -213,3 +215,66 @@ def _short(error: ExportModelError) -> str:
     text = error.what.split(" (also: ")[0]
     reason = text.partition("): ")[2] or text
     return reason if "no entry of the table" not in reason else "not in the table"
+
+
+# ------------------------------------------------------------------ the page
+
+
+def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
+    """docs/onnx-operators.md: counts, and what is refused, with the reason. Expansions of an operator count with it."""
+    states = Counter(o.state for _, o in outcomes)
+    refused: dict[str, dict[str, int]] = {}
+    right = Counter(subject(t) for t, o in outcomes if o.state == "right")
+    for test, found in outcomes:
+        if found.state == "refused":
+            reasons = refused.setdefault(subject(test), {})
+            reasons[found.reason] = reasons.get(found.reason, 0) + 1
+    lines = [
+        "# Operators of ONNX",
+        "",
+        f"ONNX's own tests of its operators (onnx {onnx.__version__}, {len(outcomes)} tests), each made into a policy:",
+        "one observation without a batch axis is cut into the test's inputs, its outputs are the action. The export is",
+        f"run for three agents in numpy and onnxruntime. {states['right']} give the expected numbers,",
+        f"{states['wrong']} give others, {states['refused']} are refused, {states['no kernel']} use a type that",
+        f"onnxruntime has no kernel for, and {states['no policy']} are no policy (strings, sequences, draws).",
+        "",
+        f"Converted in at least one form: {', '.join(sorted(right))}.",
+        "",
+        "What is refused, with the reason and the number of tests:",
+        "",
+        "| operator | reason | tests |",
+        "|---|---|---|",
+    ]
+    for kind, reasons in sorted(refused.items()):
+        lines += [f"| {kind} | {reason} | {count} |" for reason, count in sorted(reasons.items())]
+    return "\n".join(
+        [*lines, "", "`python -m tests.onnx_reader.node_tests` writes this page; a test holds a part of it.", ""]
+    )
+
+
+def subject(test: NodeTest) -> str:
+    """The operator that a test is about: its definition by others, written out, is named after it."""
+    kinds = [n.op_type for n in test.model.graph.node]
+    return kinds[-1] if not test.name.endswith("expanded") else f"{_stem(test.name)} (by its definition)"
+
+
+def _stem(name: str) -> str:
+    return name.removeprefix("test_").partition("_expanded")[0].split("_")[0]
+
+
+def main() -> None:
+    """Run all, print what is wrong, write the page."""
+    found = []
+    pool = RuntimePool()
+    with tempfile.TemporaryDirectory() as folder:
+        for test in collected():
+            found.append((test, outcome(test, Path(folder), pool)))
+            if found[-1][1].state == "wrong":
+                print(test.name, found[-1][1].reason, flush=True)
+    pool.close()
+    PAGE.write_text(page(found), encoding="utf-8")
+    print(Counter(o.state for _, o in found))
+
+
+if __name__ == "__main__":
+    main()

@@ -213,16 +213,55 @@ def test_an_inner_value_may_be_the_action(tmp_path: Path) -> None:
     assert policy.signature.outputs[0].source == "/net/mean"
 
 
-def test_an_input_of_one_number_may_be_a_flag_and_roles_decide(tmp_path: Path) -> None:
-    message = model(
-        [node("Concat", ["p", "q"], "c", axis=1), node("MatMul", ["c", "w"], "action")],
-        {"p": (np.float32, ["batch", 2]), "q": (np.float32, ["batch", 1])},
-        ["action"],
-        {"w": floats(3, 3)},
-    )
-    assert compiled(message, tmp_path).signature.input("q").role is Role.PARAMETER
-    signature = compiled(message, tmp_path, inputs={"q": Role.VECTOR}).signature
+def test_what_each_agent_has_its_own_of_is_an_observation_or_asked_for(tmp_path: Path) -> None:
+    """Beside another observation: one number, the row of an embedding; a bare number per agent may be anything."""
+    joined = [node("Concat", ["p", "q"], "c", axis=1), node("MatMul", ["c", "w"], "action")]
+    inputs: dict[str, Any] = {"p": (np.float32, ["batch", 2]), "q": (np.float32, ["batch", 1])}
+    signature = compiled(model(joined, inputs, ["action"], {"w": floats(3, 3)}), tmp_path).signature
     assert [(s.name, s.source) for s in signature.inputs] == [("state", "p"), ("state_1", "q")]
+    embedded = [node("Gather", ["table", "cell"], "q"), *joined]
+    inputs = {"p": (np.float32, ["batch", 2]), "cell": (np.int64, ["batch"])}
+    message = model(embedded, inputs, ["action"], {"w": floats(5, 3), "table": floats(7, 3)})
+    assert {s.source: s.role for s in compiled(message, tmp_path).signature.inputs} == dict.fromkeys(
+        inputs, Role.VECTOR
+    )
+    scaled = [node("Unsqueeze", ["gain", "one"], "g"), node("Mul", ["p", "g"], "action")]
+    inputs = {"p": (np.float32, ["batch", 2]), "gain": (np.float32, ["batch"])}
+    message = model(scaled, inputs, ["action"], {"one": np.array([1])})
+    with pytest.raises(SignatureError, match="what the input 'gain' is for") as caught:
+        compiled(message, tmp_path)
+    assert "--input gain=parameter" in (caught.value.fix or "")
+    assert compiled(message, tmp_path, inputs={"gain": Role.PARAMETER}).signature.input("gain").role is Role.PARAMETER
+
+
+def test_logits_beside_a_value_are_the_action(tmp_path: Path) -> None:
+    nodes = [node("MatMul", ["obs", "w"], "logits"), node("MatMul", ["obs", "v"], "value")]
+    message = model(nodes, {"obs": (np.float32, ["b", 3])}, ["logits", "value"], {"w": floats(3, 4), "v": floats(3, 1)})
+    signature = compiled(message, tmp_path).signature
+    sources = {s.source: s.name for s in signature.outputs}
+    assert (sources["logits"], sources["value"]) == ("action", "value_estimate")
+    assert any("scores of a choice" in note for note in signature.notes)
+
+
+def test_a_file_that_nothing_marks_as_a_policy_says_so(tmp_path: Path) -> None:
+    """As mnist-8.onnx: Input3 and Plus214_Output_0."""
+    message = model(
+        [node("MatMul", ["Input3", "w"], "Plus214")],
+        {"Input3": (np.float32, ["b", 3])},
+        ["Plus214"],
+        {"w": floats(3, 4)},
+    )
+    assert any("nothing marks this file as a policy" in note for note in compiled(message, tmp_path).signature.notes)
+    marked = model([node("MatMul", ["obs", "w"], "y")], {"obs": (np.float32, ["b", 3])}, ["y"], {"w": floats(3, 4)})
+    assert compiled(marked, tmp_path).signature.notes == ()
+
+
+def test_a_constant_of_mlagents_that_nothing_makes_is_left_out(tmp_path: Path) -> None:
+    """Unity's own SoccerTwos: an output by name alone."""
+    nodes = [node("MatMul", ["obs_0", "w"], "action")]
+    message = model(nodes, {"obs_0": (np.float32, ["b", 3])}, ["action", "memory_size"], {"w": floats(3, 2)})
+    signature = compiled(message, tmp_path).signature
+    assert [n for n in signature.notes if "memory_size" in n and "nothing in the file makes it" in n]
 
 
 def test_a_value_may_be_set(tmp_path: Path) -> None:
