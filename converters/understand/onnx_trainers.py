@@ -165,17 +165,23 @@ def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
         return dict(zip(model.outputs.values(), (Role.ACTION, Role.VALUE, Role.LOG_PROB), strict=False))
     roles: dict[str, Role | None] = {}
     for name, node in model.outputs.items():
-        base = node.rpartition("/")[2].lower()
+        base = _base(node)
         known = OUTPUT_NAMES.get(base)
         roles[node] = known or (Role.ACTION if _ACTION.fullmatch(base) else None)
         if known is None and _VALUE.fullmatch(base) and _columns(model, name) == 1:
             roles[node] = Role.VALUE
     actions = [n for n, role in roles.items() if role is Role.ACTION]
+    if len(actions) > 1:  # beside one that is called so, a mean or logits are what it was made of
+        called = [[n for n in actions if _base(n) == name] for name in ("action", "actions")]
+        plain = next((c for c in (*called, [n for n in actions if not _is_scores(n)]) if len(c) == 1), None)
+        if plain is not None:
+            roles |= {n: None for n in actions if n not in plain}
+            actions = plain
     if len(actions) != 1:  # none, or more than one: names and structure decide, or ask
         return dict.fromkeys(roles)
     width = (model.shapes.get(actions[0]) or ())[1:]
     for node in (n for n, role in roles.items() if role is None):
-        base, shape = node.rpartition("/")[2].lower(), model.shapes.get(node) or ()
+        base, shape = _base(node), model.shapes.get(node) or ()
         if shape[-1:] == width and shape[1:] in ((), width):  # [size], as a parameter of the network has it, too
             roles[node] = Role.STD if _STD.fullmatch(base) else Role.LOG_STD if _LOG_STD.fullmatch(base) else None
         if (
@@ -187,6 +193,14 @@ def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
         ):
             roles[node] = Role.LOG_PROB
     return roles
+
+
+def _is_scores(node: str) -> bool:
+    return _SCORES.fullmatch(_base(node)) is not None
+
+
+def _base(node: str) -> str:
+    return node.rpartition("/")[2].lower()
 
 
 def _positional(model: OnnxModel) -> bool:
@@ -237,9 +251,7 @@ def _notes_of_others(model: OnnxModel, roles: Mapping[str, Role | None]) -> tupl
                 "nothing marks this file as a policy: no input or output has a name that trainers give "
                 f"({', '.join((*model.inputs, *model.outputs))}); what it computes is exported all the same",
             )
-        scores = [
-            n for n, role in roles.items() if role is Role.ACTION and _SCORES.fullmatch(n.rpartition("/")[2].lower())
-        ]
+        scores = [n for n, role in roles.items() if role is Role.ACTION and _is_scores(n)]
         return tuple(f"{n} are scores of a choice, not normalised: the best is the largest" for n in scores)
     names = list(model.outputs)
     order = f"{names[0]} is the action, {names[1]} the value"

@@ -243,6 +243,16 @@ def test_logits_beside_a_value_are_the_action(tmp_path: Path) -> None:
     assert any("scores of a choice" in note for note in signature.notes)
 
 
+@pytest.mark.parametrize("other", ["logits", "mean", "policy"])
+def test_beside_an_action_nothing_else_is_one_and_nothing_is_lost(other: str, tmp_path: Path) -> None:
+    nodes = [node("MatMul", ["obs", n], o) for n, o in (("w", "action"), ("u", other), ("v", "value"))]
+    weights = {"w": floats(3, 2), "u": floats(3, 2), "v": floats(3, 1)}
+    message = model(nodes, {"obs": (np.float32, ["b", 3])}, ["action", other, "value"], weights)
+    (policy,) = read_source(save(message, tmp_path)).policies()
+    roles = {s.source: s.role.value for s in policy.signature.outputs if s.source is not None}
+    assert roles == {"action": "continuous", "value": "value_estimate", other: "other"}
+
+
 def test_a_file_that_nothing_marks_as_a_policy_says_so(tmp_path: Path) -> None:
     """As mnist-8.onnx: Input3 and Plus214_Output_0."""
     message = model(
