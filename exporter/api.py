@@ -8,55 +8,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from converters.graph.options import CompileOptions, NoiseMode
 from converters.source import ReadOptions
 from exporter.export.again import verify_folder
 from exporter.export.labels import Labels
+from exporter.export.options import compile_options
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
 from signatures.errors import ParityError, UsageError
-from signatures.roles import Role, parse_role
+from signatures.roles import Role
 
 _LOG = logging.getLogger(__name__)
-
-
-def _roles(given: Mapping[str, str | Role] | None, flag: str) -> dict[str, Role]:
-    roles: dict[str, Role] = {}
-    for name, role in (given or {}).items():
-        parsed = role if isinstance(role, Role) else parse_role(role)
-        if parsed is None:
-            known = ", ".join(r.value for r in Role)
-            raise UsageError(f"{flag} {name}={role}: there is no such role", fix=f"the roles are {known}")
-        roles[name] = parsed
-    return roles
-
-
-def _compile_options(
-    names: str,
-    noise: str,
-    deterministic: bool,
-    brain: str | None,
-    inputs: Mapping[str, str | Role] | None,
-    outputs: Mapping[str, str | Role] | None,
-    values: Mapping[str, float] | None,
-) -> CompileOptions:
-    modes: dict[str, NoiseMode] = {"lift": "lift", "keep": "keep", "zero": "zero"}
-    if names not in ("canonical", "source"):
-        raise UsageError(f"names={names!r}", fix="one of: canonical, source")
-    if noise not in modes:
-        raise UsageError(f"noise={noise!r}", fix="one of: lift, keep, zero")
-    return CompileOptions(
-        names,
-        modes[noise],
-        deterministic,
-        brain,
-        _roles(inputs, "--input"),
-        _roles(outputs, "--output"),
-        dict(values or {}),
-    )
 
 
 def export_model(
@@ -129,7 +93,7 @@ def export_model(
         Path(out),
         [t for t in to.split(",") if t] if isinstance(to, str) else to,
         name,
-        _compile_options(names, noise, deterministic, brain, inputs, outputs, values),
+        compile_options(names, noise, deterministic, brain, inputs, outputs, values),
         ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation),
         opset,
         verify,
@@ -195,7 +159,7 @@ def inspect_model(
         for found in inspect_model("results/first_run").policies:
             print(found.policy.name, found.policy.signature.inputs, found.targets)
     """
-    options = _compile_options("canonical", "lift", False, brain, inputs, outputs, values)
+    options = compile_options("canonical", "lift", False, brain, inputs, outputs, values)
     return inspect_source(
         source, options, ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation)
     )

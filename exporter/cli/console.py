@@ -119,7 +119,7 @@ class Console:
         if result.report is not None:
             self._report(result.report)
             return
-        from exporter.cli.tables import size_text, table
+        from exporter.tables import size_text, table
 
         rows = [[kind, size_text(size)] for kind, size in result.sizes.items()]
         say_lines(table(("format", "size"), rows))
@@ -142,14 +142,14 @@ class Console:
 
     def _notes(self, notes: Sequence[str]) -> None:
         if not self.quiet:
-            from exporter.cli.tables import paragraph
+            from exporter.tables import paragraph
 
             for note in notes:
                 say_lines(paragraph(note, "  note: ", "    "))
 
     def _report(self, report: ParityReport) -> None:
-        from exporter.cli.summary import comparison_table, failure_lines, not_run_line, parity_table, verdict
-        from exporter.cli.tables import paragraph
+        from exporter.reports.summary import comparison_table, failure_lines, not_run_line, parity_table, verdict
+        from exporter.tables import paragraph
 
         if not self.quiet and report.comparisons:
             for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
@@ -167,8 +167,8 @@ class Console:
         """What came of several policies, in one line."""
         if len(reports) < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
             return
-        from exporter.cli.summary import whole_summary
-        from exporter.cli.tables import paragraph
+        from exporter.reports.summary import whole_summary
+        from exporter.tables import paragraph
 
         verdicts = {r.passed for r in reports}
         colour = _COLOURS[False if False in verdicts else None if None in verdicts else True]
@@ -221,9 +221,9 @@ class Console:
 
 def _next(results: Sequence[ExportResult]) -> str:
     """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
-    from exporter.cli.summary import to_verify
-    from exporter.cli.tables import hint
+    from exporter.reports.summary import to_verify
     from exporter.serve.scenes import scene_of
+    from exporter.tables import hint
 
     last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), results[-1])
     if last.report is None:

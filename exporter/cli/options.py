@@ -98,9 +98,9 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     def collected(
         *args: Any, brain: str | None, inputs: Sequence[str], outputs: Sequence[str], values: Sequence[str], **rest: Any
     ) -> Any:
-        from exporter.api import _compile_options
+        from exporter.export.options import compile_options
 
-        compiling = _compile_options(
+        compiling = compile_options(
             rest.pop("names", "canonical"),
             rest.pop("noise", "lift"),
             bool(rest.pop("deterministic", False)),

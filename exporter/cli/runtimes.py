@@ -25,7 +25,7 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
         return
     from converters.runtimes.confinement import in_force
     from converters.runtimes.registry import available_runtimes
-    from exporter.cli.tables import table
+    from exporter.tables import table
 
     found = available_runtimes()
     kept = in_force()

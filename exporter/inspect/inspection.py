@@ -16,9 +16,9 @@ from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
 from converters.source import ReadOptions
-from exporter.cli.tables import paragraph, size_text, table
 from exporter.export.sources import read_source
 from exporter.reports.layers import blocks_of, chain
+from exporter.tables import paragraph, size_text, table
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError, naming
 from signatures.fields import printable

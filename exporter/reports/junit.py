@@ -10,8 +10,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 
 from converters.formats import FORMATS
-from exporter.cli.summary import verdict
 from exporter.reports.entry import Entry
+from exporter.reports.summary import verdict
 from exporter.verify.findings import Failure, Finding
 from signatures.fields import printable
 

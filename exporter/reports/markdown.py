@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from exporter.cli.summary import verdict
-from exporter.cli.tables import size_text
 from exporter.reports.entry import Entry
 from exporter.reports.matrix import matrix
+from exporter.reports.summary import verdict
+from exporter.tables import size_text
 from signatures.fields import printable
 
 #: Behind an @, so that no user is called by it.

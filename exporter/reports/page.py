@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from exporter.cli.summary import verdict
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.markup import Markup, el
+from exporter.reports.summary import verdict
 from exporter.version import __version__
 
 _CHIPS = {

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from exporter.cli.tables import size_text
 from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
 from exporter.reports.matrix import Cell, matrix
+from exporter.tables import size_text
 from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
 

@@ -19,9 +19,9 @@ from converters.formats import DEFAULTS, WRITTEN
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
-from exporter.cli.summary import failure_lines
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
+from exporter.reports.summary import failure_lines
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.errors import BundleError, DamagedFileError
 from signatures.roles import Role

@@ -12,8 +12,8 @@ import pytest
 from converters.format import WriteOptions
 from converters.formats import WRITTEN
 from converters.runtimes.pool import RuntimePool
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
+from exporter.reports.summary import failure_lines
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import BROKEN, genuine_files, params, public_files
 from tests.barracuda.test_layers import expected_of, feeds_of, policy_of

@@ -12,9 +12,9 @@ import pytest
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
-from exporter.cli.summary import failure_lines
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
+from exporter.reports.summary import failure_lines
 from exporter.verify.options import VerifyOptions
 from fixtures import FIXTURES
 from fixtures import path as fixture

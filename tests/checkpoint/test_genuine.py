@@ -12,9 +12,9 @@ import pytest
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 from tests.conftest import NEEDED

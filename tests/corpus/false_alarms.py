@@ -17,8 +17,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from converters.runtimes.pool import RuntimePool
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
+from exporter.reports.summary import failure_lines
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
 from signatures.errors import SourceError

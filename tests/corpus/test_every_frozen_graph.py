@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from converters.runtimes.pool import RuntimePool
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.inspect.inspection import inspect_source
+from exporter.reports.summary import failure_lines
 from tests.conftest import NEEDED
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
 

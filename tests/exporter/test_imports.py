@@ -108,6 +108,12 @@ def test_no_module_imports_itself_round_a_corner() -> None:
     assert not left, f"these modules import each other: {left}"
 
 
+def test_nothing_below_the_command_line_asks_it() -> None:
+    modules = [m for m in MODULES if not m.is_relative_to(ROOT / "exporter/cli") and m.name != "__main__.py"]
+    asking = [name_of(m) for m in modules if "exporter.cli" in m.read_text(encoding="utf-8")]
+    assert asking == []
+
+
 def loaded_by(*arguments: object) -> set[str]:
     """Top-level modules that a command imports."""
     ran = python("-X", "importtime", *arguments)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from converters.graph.options import CompileOptions
-from exporter.cli.summary import (
+from exporter.export.pipeline import ExportResult
+from exporter.reports.summary import (
     comparison_table,
     failure_lines,
     not_run_line,
@@ -19,7 +20,6 @@ from exporter.cli.summary import (
     verdict,
     whole_summary,
 )
-from exporter.export.pipeline import ExportResult
 from exporter.verify.checks.numbers import plausible
 from exporter.verify.findings import Failure, Finding, Numbers
 from exporter.verify.options import VerifyOptions

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from converters.formats import WRITTEN
-from exporter.cli.summary import failure_lines
 from exporter.export.again import verify_folder
+from exporter.reports.summary import failure_lines
 from exporter.verify.findings import Finding
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport

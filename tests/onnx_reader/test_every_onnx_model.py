@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from exporter.verify.tolerances import Tolerance
 from tests.conftest import NEEDED
 from tests.corpus.conftest import SHARED

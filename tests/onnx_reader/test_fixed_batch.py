@@ -11,8 +11,8 @@ import pytest
 
 from converters.graph.types import BATCH, Symbols
 from converters.onnx.importer.fixed_batch import FixedBatch
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
+from exporter.reports.summary import failure_lines
 from tests.onnx_reader.models import Bench, floats, model, node
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

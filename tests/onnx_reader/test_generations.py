@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from converters.policy import Policy
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from tests.onnx_reader.mlagents import ACTIONS, HIDDEN, OBS, policy
 from tests.onnx_reader.models import Bench, floats, helper, node, save
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.inspect.inspection import inspect_source, inspection_text
+from exporter.reports.summary import failure_lines
 from fixtures import path as fixture
 from signatures.sampling import draw_cases
 from tests.onnx_reader.models import Array, Bench, constant, model, node, save

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.reports.summary import failure_lines
 from tests.onnx_reader.models import Bench, floats, model, node
 
 F = np.float32

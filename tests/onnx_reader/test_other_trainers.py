@@ -11,9 +11,9 @@ import pytest
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.policy import Policy
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from fixtures.goldens import read_npz
 from fixtures.sb3 import FOLDER, POLICIES
 from signatures.errors import SignatureError, UsageError

@@ -14,9 +14,9 @@ from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.onnx.writer import CONTRACT_KEY, write
 from converters.policy import Policy
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
 from signatures.contract import Contract, Origin
 from signatures.errors import DamagedFileError

@@ -22,9 +22,9 @@ from converters.onnx.memories import separate_memories
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.api import verify_bundle
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from exporter.verify import original
 from signatures.contract import parse_source_map
 from signatures.errors import SignatureError

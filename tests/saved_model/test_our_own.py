@@ -15,9 +15,9 @@ from converters import schema
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.contract import EMBEDDED, Contract, Origin, safe_name

@@ -11,9 +11,9 @@ import pytest
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.runtimes.pool import RuntimePool
 from converters.source import ReadOptions
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from signatures.errors import NotAPolicyError, RuntimeUnavailableError, SourceError
 from tests.saved_model.models import assert_agrees, roles, sources
 

@@ -15,9 +15,9 @@ import pytest
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.source import ReadOptions
-from exporter.cli.summary import failure_lines
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from fixtures.goldens import read_npz
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, Case

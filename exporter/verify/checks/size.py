@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from exporter.cli.tables import size_text
+from exporter.tables import size_text
 from exporter.verify.findings import Finding, Size
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import UsageError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from exporter.cli.tables import size_text, table
+from exporter.tables import size_text, table
 from exporter.verify.findings import Accepted, Size
 from exporter.verify.report import ParityReport
 
