@@ -5,6 +5,7 @@ Every policy.json and parity.json that a test in this process writes is held aga
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from hypothesis import settings
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
+
+# pytest-xdist gives its workers 80; what a command prints is not to depend on how the tests are run.
+os.environ.pop("COLUMNS", None)
 
 #: What the tests that compare all formats run them in.
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from converters.bundle.embed import runnable
 from converters.graph.nodes import Graph, ref
 from converters.graph.ops.table import traits
 from converters.graph.shapes import infer_types
@@ -43,6 +44,7 @@ class Allowance:
 
 def products(graph: Graph) -> int:
     """Multiplications that one row of a policy's inputs costs, about; whatever else an op computes counts as one."""
+    graph = runnable(graph)  # that of a bundle is spelled as it was written
     types = infer_types(graph)
     total = 0
     for node in graph.nodes:

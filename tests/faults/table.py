@@ -28,6 +28,8 @@ class Fault:
     kind: str = "numbers"
     words: str = ""
     cannot: Mapping[str, str] = field(default_factory=dict)
+    #: what a refusal must say, where a format with the fault is not even the bundle's any more
+    refused: Mapping[str, str] = field(default_factory=dict)
     #: what must be named instead, where a format has the fault elsewhere
     elsewhere: Mapping[str, tuple[tuple[str, ...], str]] = field(default_factory=dict)
 
@@ -153,6 +155,7 @@ FAULTS = (
         "deterministic_action",
         words="int32",
         cannot={"tfjs": "TensorFlow.js has no int64: its indices are int32, as they should be"},
+        refused={"bytes": "has 'deterministic_action' as int32"},
     ),
     Fault(
         "a memory that is not read",

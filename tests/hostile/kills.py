@@ -53,7 +53,9 @@ class Kills:
         temporary.mkdir(exist_ok=True)
         if chosen not in self.spans:
             begun = time.monotonic()
-            assert self._start(out, temporary, chosen, "whole").wait(600) == 0
+            whole = self._start(out, temporary, chosen, "whole")
+            whole.communicate(timeout=600)
+            assert whole.returncode == 0
             self.spans[chosen] = time.monotonic() - begun
         after = rng.uniform(0, self.spans[chosen] * 1.05)
         draw = f"#{number}: {how.name} {'to all' if group else 'to the command'} after {after:.3f} s, {chosen}"
