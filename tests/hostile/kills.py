@@ -53,9 +53,7 @@ class Kills:
         temporary.mkdir(exist_ok=True)
         if chosen not in self.spans:
             begun = time.monotonic()
-            whole = self._start(out, temporary, chosen, "whole")
-            whole.communicate(timeout=600)
-            assert whole.returncode == 0
+            assert _status(self._start(out, temporary, chosen, "whole")) == 0
             self.spans[chosen] = time.monotonic() - begun
         after = rng.uniform(0, self.spans[chosen] * 1.05)
         draw = f"#{number}: {how.name} {'to all' if group else 'to the command'} after {after:.3f} s, {chosen}"
@@ -84,7 +82,7 @@ class Kills:
         elif b"Traceback" in said or b"Exception" in said:
             self.faults.append(f"{draw}: {said.decode(errors='replace')[-800:]}")
         self._look(draw, out, temporary, killed=how is signal.SIGKILL)
-        if how is signal.SIGKILL and self._start(out, temporary, "numpy", "next").wait(600) != 0:
+        if how is signal.SIGKILL and _status(self._start(out, temporary, "numpy", "next")) != 0:
             self.faults.append(f"{draw}: the next run failed")
         self._look(f"{draw}: the next run", out, temporary, killed=False)
 
@@ -103,6 +101,12 @@ class Kills:
         return subprocess.Popen(
             command, cwd=ROOT, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
         )
+
+
+def _status(process: subprocess.Popen[bytes]) -> int:
+    """How a run ends that is let be."""
+    process.communicate(timeout=600)
+    return process.returncode
 
 
 def _alive(mark: str) -> list[str]:
