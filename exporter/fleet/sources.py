@@ -40,6 +40,8 @@ def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
     found: dict[Path, None] = {}
     for path in given:
         here = list(_expanded(path, out.resolve()))
+        if not here and path.is_dir():
+            recognised(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
                 f"{path} stands for no source",

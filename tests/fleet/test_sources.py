@@ -9,7 +9,7 @@ import pytest
 
 from exporter.fleet.sources import is_many, sources_in
 from fixtures import path as fixture
-from signatures.errors import UsageError
+from signatures.errors import ExportModelError
 from tests.commands import ROOT
 
 
@@ -67,8 +67,8 @@ def test_files_in_a_folder_are_one_source_each(place: Path) -> None:
     assert sources_in([Path("runs/a")], Path("out")) == [Path("runs/a/one.bytes"), Path("runs/a/two.bytes")]
 
 
-@pytest.mark.parametrize("given", ["*.onnx", "empty"])
-def test_what_stands_for_nothing_is_refused(given: str, place: Path) -> None:
+@pytest.mark.parametrize(("given", "words"), [("*.onnx", "stands for no source"), ("empty", "there is no model in")])
+def test_what_stands_for_nothing_is_refused(given: str, words: str, place: Path) -> None:
     (place / "empty").mkdir()
-    with pytest.raises(UsageError, match="stands for no source"):
+    with pytest.raises(ExportModelError, match=words):
         sources_in([Path(given)], Path("out"))
