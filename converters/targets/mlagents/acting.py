@@ -158,6 +158,21 @@ def _masked(dressing: Dressing, score: str, masks: str, at: int, size: int) -> s
     return builder.add("Add", [score, away], "masked")
 
 
+def _as_rows(dressing: Dressing, spec: TensorSpec, scores: str, width: int) -> str:
+    """Scores [B, n]; those of a policy that was made for one agent may be [B, 1, n]."""
+    builder = dressing.builder
+    shape = builder.shape(scores)
+    if len(shape) == 2:
+        return scores
+    if any(n != 1 for n in shape[1:-1]):
+        dressing.refuse(
+            f"the scores behind its discrete action {spec.name} have the shape {list(shape)}",
+            why="a branch has one row of scores for each agent",
+            fix="export the model with the logits or log-probabilities as its output: --output NAME=log_probs",
+        )
+    return builder.add("Reshape", [scores, builder.const(np.array([-1, width], INT32), "rows")], "scores")
+
+
 def _scores(dressing: Dressing, spec: TensorSpec) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """(scores per branch, sizes) of the discrete action, as they are in the policy."""
     builder, policy = dressing.builder, dressing.policy
@@ -172,6 +187,7 @@ def _scores(dressing: Dressing, spec: TensorSpec) -> tuple[tuple[str, ...], tupl
             fix="export the model with the logits or log-probabilities as its output: --output NAME=log_probs",
         )
     lengths = [w for w in widths if isinstance(w, int)]
+    found = tuple(_as_rows(dressing, spec, b, n) for b, n in zip(found, lengths, strict=True))
     if len(found) == 1 and sizes and len(sizes) > 1 and sum(sizes) <= lengths[0]:
         starts = [sum(sizes[:i]) for i in range(len(sizes))]
         found = tuple(builder.slice(found[0], 1, at, at + n) for at, n in zip(starts, sizes, strict=True))
