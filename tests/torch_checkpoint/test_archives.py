@@ -229,7 +229,7 @@ def test_pickles_that_are_wrong(payload: bytes, words: str | None, tmp_path: Pat
 
 def test_a_pickle_that_is_nested_deeply_is_only_data(tmp_path: Path) -> None:
     deep = b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."
-    with pytest.raises(NotAPolicyError, match="no checkpoint of ML-Agents"):
+    with pytest.raises(NotAPolicyError, match="no checkpoint of a policy"):
         read_source(saved(tmp_path, zipped({"a/data.pkl": deep})))
 
 
