@@ -40,7 +40,7 @@ class Console:
             raise UsageError("--quiet and --verbose contradict each other", fix="give one of them")
         if self.as_json and self._markdown_on_stdout:
             raise UsageError("--json and --markdown - both want stdout", fix="give --markdown a file")
-        if not self._reports:
+        if not self.wants_reports:
             return
         if not verifies:
             raise UsageError(
@@ -49,10 +49,6 @@ class Console:
         from exporter.reports.write import Destinations
 
         Destinations(self.junit, self.markdown, self.html).prepare()
-
-    @property
-    def _reports(self) -> bool:
-        return any(p is not None for p in (self.junit, self.markdown, self.html))
 
     @property
     def _markdown_on_stdout(self) -> bool:
@@ -88,7 +84,7 @@ class Console:
     @property
     def wants_reports(self) -> bool:
         """Whether a report is to be written."""
-        return self._reports
+        return any(p is not None for p in (self.junit, self.markdown, self.html))
 
     def progress_bar(self, length: int) -> Bar:
         """A bar for many sources."""
@@ -100,7 +96,7 @@ class Console:
 
     def write_reports(self, entries: Callable[[], Sequence[Entry]]) -> None:
         """Write the reports that were asked for; ``entries`` is not called where there are none."""
-        if self._reports:
+        if self.wants_reports:
             from exporter.reports.markdown import UNSEEN
             from exporter.reports.write import Destinations
 

@@ -39,11 +39,11 @@ def demo_command(out: Path, no_open: bool) -> None:
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(BALL, source)
-    _typed(export_command, str(source), "-o", str(out), "--html", str(report))
+    _typed(export_command, "", str(source), "-o", str(out), "--html", str(report))
     if no_open:
         return
     try:
-        _typed(serve_command, "serve", str(out / BALL.stem), "--port", "0", "--open")
+        _typed(serve_command, "serve ", str(out / BALL.stem), "--port", "0", "--open")
     except RuntimeUnavailableError as error:
         import webbrowser
 
@@ -52,7 +52,7 @@ def demo_command(out: Path, no_open: bool) -> None:
         webbrowser.open(report.resolve().as_uri())
 
 
-def _typed(command: click.Command, *words: str) -> None:
+def _typed(command: click.Command, name: str, *words: str) -> None:
     """Run a command, shown as a user would type it."""
-    say(f" {PROGRAM} {shlex.join(words)}", mark="$", colour="cyan")
-    command.main([w for w in words if w != command.name], PROGRAM, standalone_mode=False)
+    say(f" {PROGRAM} {name}{shlex.join(words)}", mark="$", colour="cyan")
+    command.main(list(words), PROGRAM, standalone_mode=False)

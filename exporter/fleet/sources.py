@@ -35,8 +35,11 @@ def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
     """The sources that the paths stand for, each once, in their order; those of a pattern or folder by name.
 
     ``**`` goes through all folders. A ``.txt`` has a path a line, from where the command is called; ``#`` begins a
-    comment. What lies in ``out`` is no source. Raises UsageError where a path stands for none.
+    comment. What lies in ``out`` is no source. Raises UsageError where there is none, or a path
+    stands for none.
     """
+    if not given:
+        raise UsageError("no source was given", fix="export-model FILE -o DIR")
     found: dict[Path, None] = {}
     for path in given:
         here = list(_expanded(path, out.resolve()))

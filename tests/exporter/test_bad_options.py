@@ -106,6 +106,7 @@ def test_what_the_option_parser_refuses_is_status_2_too(flags: list[str], word: 
 def test_no_source_is_refused(out: Path) -> None:
     is_refused(export_model("-o", out), "no source was given")
     is_refused(export_model("export"), "no source was given")
+    is_refused(export_model("-o", out, "--jobs", "2"), "no source was given")
 
 
 def test_a_name_goes_with_one_policy(out: Path) -> None:

@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 
 import exporter
+from exporter.cli.demo import _typed
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused, python
 
@@ -117,3 +119,17 @@ main(["--help"])
 def test_an_interrupt_while_the_program_itself_is_loaded_is_no_traceback() -> None:
     ran = python("-c", INTERRUPTED)
     assert (ran.status, ran.out, ran.err) == (130, "", "\nstopped\n")
+
+
+def test_a_command_of_the_demo_is_run_as_it_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder may be called as a command is."""
+    given: list[tuple[str, ...]] = []
+
+    @click.command("export")
+    @click.argument("words", nargs=-1)
+    def command(words: tuple[str, ...]) -> None:
+        given.append(words)
+
+    _typed(command, "export ", "export", "a b")
+    assert given == [("export", "a b")]
+    assert capsys.readouterr().out == "$ export-model export export 'a b'\n"
