@@ -88,24 +88,29 @@ def remove_all() -> None:
 def sweep(parent: Path, prefix: str) -> None:
     """Remove what killed runs have left in ``parent``."""
     for left in left_in(parent, prefix):
-        with contextlib.suppress(OSError):  # another run may sweep, too
-            held = is_held(left)
-            if held is None:
-                held = time.time() - left.stat().st_mtime < _STALE_SECONDS
-            if not held and not _holds_something_old(left):
+        with contextlib.suppress(OSError), taken(left) as ours:  # another run may sweep, too
+            if ours is None:
+                ours = time.time() - left.stat().st_mtime >= _STALE_SECONDS
+            if ours and not _holds_something_old(left):
                 shutil.rmtree(left, ignore_errors=True)
 
 
-def is_held(path: Path) -> bool | None:
-    """Whether a process that lives holds a folder of ours; None where that cannot be known. Raises OSError."""
+@contextlib.contextmanager
+def taken(path: Path) -> Iterator[bool | None]:
+    """Whether nobody who lives holds a folder of ours; then nobody else can until the block ends.
+
+    None where that cannot be known. Raises OSError.
+    """
     try:
         descriptor = _held(path)
     except FileExistsError:
-        return True
-    if descriptor is None:
-        return None
-    os.close(descriptor)
-    return False
+        yield False
+        return
+    try:
+        yield None if descriptor is None else True
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def left_in(parent: Path, prefix: str) -> Iterator[Path]:

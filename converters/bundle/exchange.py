@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters.folders import LeftoverWarning, OwnFolder, is_held, left_in, sweep
+from converters.folders import LeftoverWarning, OwnFolder, left_in, sweep, taken
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _PREFIX = ".export-model-"
@@ -52,9 +52,10 @@ def recover(place: Path) -> None:
     """Put back what a run that was killed between two renames had moved out of ``place``. Raises OSError."""
     if place.parent.is_dir() and not place.exists():
         for left in left_in(place.parent, _PREFIX):
-            if (left / "old" / place.name).is_dir() and not place.exists() and not is_held(left):
-                (left / "old" / place.name).rename(place)
-                shutil.rmtree(left, ignore_errors=True)
+            with taken(left) as ours:
+                if ours is not False and (left / "old" / place.name).is_dir() and not place.exists():
+                    (left / "old" / place.name).rename(place)
+                    shutil.rmtree(left, ignore_errors=True)
 
 
 def _two_renames(new: Path, place: Path) -> None:

@@ -19,7 +19,7 @@ _SHELLS = {
     "completion",
     cls=Command,
     short_help="Print the script for completion in a shell.",
-    examples=(("export-model completion bash >> ~/.bashrc", "bash"),),
+    examples=(("export-model completion bash", "its last line says how to use it"),),
 )
 @click.argument("shell", type=click.Choice(tuple(_SHELLS)))
 def completion_command(shell: str) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from exporter.export.pipeline import ExportOptions
     from exporter.reports.entry import Entry
 
-#: Failures that are told in full; of more, the number.
+#: Sources whose failure is told; of more, the number.
 _MOST_SHOWN = 50
 
 
@@ -59,7 +59,8 @@ class _Tally:
     def __init__(self, sources: int) -> None:
         self.sources, self.done, self.unchanged = sources, 0, 0
         self.policies, self.verified, self.disagree, self.refused = 0, 0, 0, 0
-        self.failures: list[str] = []
+        self.failed = 0
+        self._told: list[str] = []
         self._start = time.monotonic()
 
     @property
@@ -75,8 +76,16 @@ class _Tally:
         self.verified += sum(p.passed is True for p in outcome.policies)
         self.disagree += sum(p.passed is False for p in outcome.policies)
         self.refused += outcome.error is not None
-        if outcome.failed and len(self.failures) <= _MOST_SHOWN:
-            self.failures.extend(_lines(outcome, failed=True))
+        if outcome.failed:
+            self.failed += 1
+            if self.failed <= _MOST_SHOWN:
+                self._told.extend(_lines(outcome, failed=True))
+
+    @property
+    def failures(self) -> list[str]:
+        """What went wrong, a text each; of very many the first, and how many more."""
+        more = self.failed - _MOST_SHOWN
+        return [*self._told, *([f"… and {more} more sources; -v or --json tells all"] if more > 0 else [])]
 
     @property
     def summary(self) -> str:

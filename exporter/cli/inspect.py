@@ -73,10 +73,24 @@ def inspect_command(
 
     With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
     """
+    from converters.graph.options import CompileOptions
+
     if len(sources) > 1 and (logdir is not None or svg is not None):
         raise UsageError("--logdir and --svg are for one source", fix="name one")
     if not releases and (actions or brain_parameters is not None):
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
+    unasked = {
+        "--logdir": logdir is not None,
+        "--step": step is not None,
+        "--activation": activation is not None,
+        "--trust-source": trust_source,
+        "--brain, --input, --output or --set": compiling != CompileOptions(),
+    }
+    given = [flag for flag, value in unasked.items() if value]
+    if releases and given:
+        raise UsageError(
+            f"{given[0]} is not for --unity", why="the file is looked at as it is", fix=f"leave {given[0]} out"
+        )
     status, found = 0, list[dict[str, Any]]()
     for source in sources:
         try:
@@ -85,12 +99,12 @@ def inspect_command(
                 found.append(report)
                 status = max(status, answer)
             else:
-                given = read_options(step, sensors, trust_source, activation)
-                found.append(_inspected(source, compiling, given, logdir, svg, as_json))
+                read = read_options(step, sensors, trust_source, activation)
+                found.append(_inspected(source, compiling, read, logdir, svg, as_json))
         except ExportModelError as error:
             if len(sources) == 1:
                 raise
-            say(f"error: {error.message}", err=True)
+            say_lines(f"error: {error.message}", err=True)
             found.append({"path": str(source), **error.to_dict()})
             status = 2
     if as_json:

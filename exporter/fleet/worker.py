@@ -118,6 +118,8 @@ def work(pipe: Connection, options: ExportOptions, wanted: Wanted) -> None:
     """Take sources from the pipe until it says None; what they need is set up once. The program of a worker."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as a terminal does that is closed
     signal.signal(signal.SIGTERM, _stop)
     exporter = Exporter(options)
     try:

@@ -69,6 +69,8 @@ class SiteServer(ThreadingHTTPServer):
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         #: connection → when its request began to be said
         self.asking: dict[socket.socket, float] = {}
+        if ":" in host:
+            self.address_family = socket.AF_INET6
         super().__init__((host, port), _Handler)
 
     def answers_to(self, asked: str) -> bool:
@@ -115,7 +117,8 @@ class SiteServer(ThreadingHTTPServer):
     def url(self) -> str:
         """The page's address, with the port that was taken."""
         host, port = self.server_address[:2]
-        return f"http://{host if isinstance(host, str) else host.decode()}:{port}/"
+        name = host if isinstance(host, str) else host.decode()
+        return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
 
 
 @contextmanager
@@ -140,7 +143,9 @@ def listening(site: Mapping[str, bytes], host: str, port: int) -> Iterator[SiteS
         server = SiteServer(site, host, port)
     except (OSError, UnicodeError) as error:
         raise UsageError(
-            f"{host}:{port} cannot be listened on", why=str(error), fix="give another --port; 0 takes a free one"
+            f"{host}:{port} cannot be listened on",
+            why=str(error),
+            fix="give another --port (0 takes a free one), or another --host",
         ) from error
     with server:
         yield server

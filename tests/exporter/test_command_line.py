@@ -298,7 +298,7 @@ def test_of_several_sources_one_that_is_refused_does_not_stop_the_others(tmp_pat
     ran = export_model("inspect", "nothing.bytes", BALL)
     assert ran.status == 2
     assert "policy continuous" in ran.out
-    assert "nothing.bytes: no such file" in ran.err
+    assert "nothing.bytes: no such file\n  fix: " in ran.err  # its lines stay lines
     first, second = export_model("inspect", "nothing.bytes", BALL, "--json").json["sources"]
     assert (first["error"], second["policies"][0]["name"]) == ("SourceError", "continuous")
     is_refused(export_model("inspect", BALL, BALL, "--svg", tmp_path / "a.svg"), "for one source")

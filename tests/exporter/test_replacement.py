@@ -368,3 +368,18 @@ def test_names_that_fall_together_are_found() -> None:
 def test_names_are_made_safe(given: str, safe: str) -> None:
     assert safe_name(given) == safe
     assert safe_name(safe) == safe
+
+
+def test_what_is_swept_is_held_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a run that begins just then could have its new folder, empty yet, taken away."""
+    left = folders.OwnFolder(tmp_path, "x-")
+    folders._forget(left.path)  # its process has died
+    seen: list[bool | None] = []
+
+    def look(path: Path, **more: object) -> None:
+        with folders.taken(path) as ours:
+            seen.append(ours)
+
+    monkeypatch.setattr(folders.shutil, "rmtree", look)
+    folders.sweep(tmp_path, "x-")
+    assert seen == [False]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from exporter.cli.fleet import _Tally
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.worker import Outcome
@@ -155,3 +156,11 @@ def test_only_what_is_in_its_place_is_recorded(sources: list[Path], tmp_path: Pa
     assert {entry["source"] for entry in lines(tmp_path / "out" / ".exported.jsonl")} == {
         str(s) for s in sources if s.name != "broken.bytes"
     }
+
+
+def test_very_many_failures_are_counted() -> None:
+    tally = _Tally(80)
+    for i in range(80):
+        tally.count(Outcome(Path(f"p{i}"), error=UsageError("no", fix="yes")))
+    assert len(tally.failures) == 51
+    assert tally.failures[-1].startswith("… and 30 more sources")

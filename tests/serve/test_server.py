@@ -197,3 +197,13 @@ def test_a_signal_ends_it_cleanly(bundle: Bundle, number: signal.Signals, ignore
         out, err = process.communicate(timeout=30)
         connection.close()
     assert (process.returncode, out, err) == (0, "ended\n", "")
+
+
+def test_an_address_of_version_6_is_listened_on() -> None:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    with listening({"index.html": b"here"}, "::1", 0) as server:
+        assert server.url.startswith("http://[::1]:")
+        assert server.answers_to(server.url.removeprefix("http://").removesuffix("/"))

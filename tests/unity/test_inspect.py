@@ -16,6 +16,7 @@ from converters.targets.unity.consumers import CONSUMERS
 from converters.targets.unity.settings import Brain, sensors_of
 from exporter.cli.app import app
 from signatures.errors import UsageError
+from tests.commands import export_model, is_refused
 from tests.unity.policies import Draft
 
 
@@ -150,3 +151,8 @@ def test_a_square_camera_in_tensorflows_order_is_taken_for_a_camera(tmp_path: Pa
     verdict = check_file(draft.write(tmp_path), CONSUMERS["R22"])
     assert [s.shape for s in verdict.brain.sensors] == [(3, 24, 24), (5,)]
     assert not verdict.accepted["stochastic"]
+
+
+@pytest.mark.parametrize("flags", [["--logdir", "x"], ["--step", "5"], ["--trust-source"], ["--set", "a=1"]])
+def test_what_it_does_not_look_at_is_refused(flags: list[str], tmp_path: Path) -> None:
+    is_refused(export_model("inspect", Draft().write(tmp_path), "--unity", "R22", *flags), flags[0], "not for --unity")

@@ -95,9 +95,9 @@ def _command(name: str) -> list[str]:
             f"{what} is not installed",
             fix=INSTALL_NODE if node is None else f"{INSTALL_CHROMIUM}, or let {CHROMIUM_VARIABLE} name it",
         )
-    check_packages(js_home())
+    known = ["--known"] if check_packages(js_home()) else []
     script = str(JS_SOURCE / "browser.mjs")
-    return [node, script, "--runtime", name, "--modules", str(js_home()), "--chromium", chromium]
+    return [node, script, "--runtime", name, "--modules", str(js_home()), "--chromium", chromium, *known]
 
 
 def _runtime(name: str, kind: str, *packages: str, arithmetic: Arithmetic = "processor") -> Runtime:

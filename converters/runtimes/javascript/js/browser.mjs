@@ -1,10 +1,11 @@
 /**
  * Runs models in Chromium for a parent process, over the frames of converters/runtimes/wire.py on stdin and stdout.
  *
- *     node browser.mjs --runtime NAME --modules DIR --chromium FILE
+ *     node browser.mjs --runtime NAME --modules DIR --chromium FILE [--known]
  *
  * NAME is one of RUNTIMES; DIR holds node_modules with the packages of package.json; FILE is Chromium's program. The
- * commands are those of the runtimes in Node (runner.mjs); `path` in `load` is a folder with model.json or an .onnx.
+ * commands are those of the runtimes in Node (runner.mjs), and so is --known; `path` in `load` is a folder with model.json
+ * or an .onnx.
  *
  * Chromium starts with the first request, so that a missing package is an answer and not a dead process. What the page
  * needs comes from a server of this process on 127.0.0.1 (browser_server.mjs); no name is looked up, so a page that
@@ -25,6 +26,7 @@ import { parseArgs } from "node:util";
 
 import { PageServer } from "./browser_server.mjs";
 import { FramingError, takeStdout } from "./frames.mjs";
+import { onlyKnown } from "./installed.mjs";
 import { serve } from "./serve.mjs";
 import { readArtifacts } from "./tfjs_node.mjs";
 
@@ -174,7 +176,7 @@ class Browser {
 
 function commandLine() {
   const text = { type: "string" };
-  const { values } = parseArgs({ options: { runtime: text, modules: text, chromium: text } });
+  const { values } = parseArgs({ options: { runtime: text, modules: text, chromium: text, known: { type: "boolean" } } });
   if (!RUNTIMES.includes(values.runtime)) throw new Error(`--runtime must be one of ${RUNTIMES.join(", ")}`);
   for (const name of ["modules", "chromium"]) if (values[name] === undefined) throw new Error(`--${name} is missing`);
   return values;
@@ -192,6 +194,7 @@ async function main() {
   const browser = new Browser(options.runtime);
   let opening;
   const start = async () => {
+    if (options.known) onlyKnown(options.modules);
     opening = browser.open(options.modules, options.chromium);
     await opening;
     return browser;

@@ -11,6 +11,9 @@ import path from "node:path";
 export function onlyKnown(modules) {
   const known = JSON.parse(readFileSync(new URL("./installed.json", import.meta.url), "utf8"));
   const root = realpathSync(path.join(path.resolve(modules), "node_modules"));
+  Module._extensions[".node"] = (module, file) => {
+    throw new Error(`${file} is not among the files that were installed`);
+  };
   const compile = Module.prototype._compile;
   Module.prototype._compile = function compileKnown(content, file, ...rest) {
     const name = path.relative(root, file).split(path.sep).join("/");
