@@ -76,7 +76,7 @@ def export_model(
     - ``inputs``, ``outputs``: name → role, where it cannot be told from the graph; ``values``: placeholder → number.
     - ``step``: a run's checkpoint (default: the newest); ``sensors`` (``goals``: which of them),
       ``activation``: what a ``.pt`` does not tell.
-    - ``trust_source``: load a Keras model, which can run code.
+    - ``trust_source``: let Keras load what is not read as data; it can run code.
 
     How to verify:
 

@@ -140,6 +140,9 @@ class Network(Builder):
         weights = arrays.get(layer.name)
         if layer.model is not None:
             assert weights is not None
+            self._check(layer, path, args, kwargs)
+            if said := [k for k, v in kwargs.items() if v not in (None, False)]:
+                raise UnknownLayerError(f"its model {path!r} is called with {', '.join(said)}")
             tensors = [t for a in args for t in (a if isinstance(a, list) else [a])]
             inputs = dict(zip(layer.model.inputs, tensors, strict=True))
             return self.model(layer.model, weights, inputs, f"{path}/", depth + 1)
@@ -155,6 +158,8 @@ class Network(Builder):
             raise UnknownLayerError(
                 f"its layer {path!r} ({layer.kind}) is not read: {error.what}", why=error.why, fix=error.fix
             ) from error
+        if layer.operation and (unread := step.unread()):
+            raise UnknownLayerError(f"its operation {path!r} ({layer.kind}) has {', '.join(unread)}")
         if step.left:
             raise DamagedFileError(
                 f"its layer {path!r} ({layer.kind}) has {len(step.left)} weights more than such a layer",
@@ -165,18 +170,19 @@ class Network(Builder):
     def _check(self, layer: Layer, path: str, args: Any, kwargs: Mapping[str, Any]) -> None:
         """Raise UnknownLayerError where a layer is called or computes in a way that would be left out in silence."""
         flat = [v for a in args for v in (a if isinstance(a, list) else [a])]
-        odd = [] if layer.operation else [str(v)[:60] for v in flat if not isinstance(v, str | None)]
+        odd = [str(v)[:60] for v in flat if not isinstance(v, str | None)]
         odd += [f"{k}={str(v)[:60]}" for k, v in kwargs.items() if v not in (None, False) and k not in _ARGUMENTS]
-        if odd and not layer.operation:
+        if odd and not layer.operation:  # an operation's are looked at when it is read
             raise UnknownLayerError(f"its layer {path!r} ({layer.kind}) is called with {', '.join(odd)}")
         policy = layer.config.get("dtype")
         if isinstance(policy, Mapping):
             if policy.get("class_name") not in ("DTypePolicy", "Policy"):
                 raise UnknownLayerError(f"its layer {path!r} ({layer.kind}) computes in {policy.get('class_name')}")
             policy = policy["config"]["name"]
-        note = "it was saved to compute in 16 bits; here it computes in 32"
-        if "float16" in str(policy) and note not in self.notes:
-            self.notes.append(note)
+        for word, bits in (("float16", 16), ("float64", 64)):
+            note = f"it was saved to compute in {bits} bits; here it computes in 32"
+            if word in str(policy) and note not in self.notes:
+                self.notes.append(note)
 
     # ------------------------------------------------------------------ states
 

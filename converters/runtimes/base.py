@@ -41,7 +41,7 @@ class Runtime:
     install: Callable[[Progress], object] | None = None
     #: It computes by itself; numpy is this project's own.
     independent: bool = True
-    #: How it approximates functions (converters/graph/jitter.py).
+    #: How it approximates functions (converters/graph/ops/approximations.py).
     arithmetic: Arithmetic = "processor"
     #: All sessions of a process begin to draw alike, whatever their models.
     sessions_alike: bool = False

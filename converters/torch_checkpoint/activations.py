@@ -37,16 +37,12 @@ def _log_sigmoid(b: Builder, x: str) -> str:
     return scaled(b, b.add("Softplus", [scaled(b, x, -1)]), -1)
 
 
-def _softsign(b: Builder, x: str) -> str:
-    return b.add("RealDiv", [x, b.add("Add", [b.add("Abs", [x]), b.number(x, 1)])])
-
-
 _KNOWN: dict[str, Activation] = {
     "relu": _plain("Relu"),
     "tanh": _plain("Tanh"),
     "sigmoid": _plain("Sigmoid"),
     "softplus": _plain("Softplus"),
-    "softsign": _softsign,
+    "softsign": _plain("Softsign"),
     "elu": elu,
     "selu": selu,
     "celu": celu,

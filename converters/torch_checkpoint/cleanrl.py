@@ -7,6 +7,7 @@ those scripts; the activation, which people change, must be said.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -130,6 +131,8 @@ def _layers(making: _Making, x: str, module: str, *, ends: bool) -> str:
     net, state = making.net, making.net.state
     found = state.indices(f"{module}.")
     ranks = {index: len(state.shape(f"{module}.{index}.weight")) for index in found}
+    if any(b == a + 1 and 1 not in (ranks[a], ranks[b]) for a, b in itertools.pairwise(found)):
+        raise state.unknown(module, "nothing stands between two of its layers")
     images = [index for index in found if ranks[index] == 4]
     for index in found:
         name = f"{module}.{index}"

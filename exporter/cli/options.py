@@ -84,7 +84,7 @@ def _numbers(values: Sequence[str]) -> dict[str, float]:
 
 def trusting(command: Callable[..., Any]) -> Callable[..., Any]:
     """The option for sources that only a loader of their own can read, which runs what they say."""
-    said = "Let Keras load a Keras model, which can run code."
+    said = "Let Keras load what is not read as data; it can run code."
     return click.option("--trust-source", is_flag=True, help=said)(command)
 
 

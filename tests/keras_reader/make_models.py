@@ -70,6 +70,7 @@ def with_states(x: Any) -> Any:
 def operations(x: Any) -> Any:
     value = keras.ops.clip(x, -1, 1) + keras.ops.mean(x, axis=1, keepdims=True)
     value = keras.ops.concatenate([value, x[:, :2], 1.0 - x[:, 2:5]], axis=-1) * 2.0
+    value = keras.ops.elu(value, alpha=0.3)
     return keras.ops.softmax(keras.ops.gelu(value)) / keras.ops.exp(keras.ops.reshape(value, (-1, 11)))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from converters.fetch import Fetched
 from converters.keras.config import config_of
 from converters.keras.layers.table import LAYERS
+from converters.keras.network import UnknownLayerError
 from converters.keras.source import read
 from converters.source import ReadOptions
 from tests.keras_reader.agreement import assert_agrees
@@ -41,3 +44,25 @@ def test_no_layer_is_left_out(models: Path) -> None:
         met |= {str(value["class_name"])} if isinstance(value, dict) and "class_name" in value else set()
         stack.extend(value.values() if isinstance(value, dict) else value if isinstance(value, list) else ())
     assert set(LAYERS) - met == set(NOT_MET)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [("nested", "Functional", "is called with training"), ("operations", "Mean", "has initial=5.0")],
+)
+def test_what_would_be_left_out_is_refused(name: str, kind: str, words: str, models: Path, tmp_path: Path) -> None:
+    """A model inside that normalises by its batch; a largest that begins at a number."""
+    with zipfile.ZipFile(models / f"{name}.keras") as whole, zipfile.ZipFile(tmp_path / "a.keras", "w") as changed:
+        for entry in whole.namelist():
+            data = whole.read(entry)
+            if entry == "config.json":
+                config = json.loads(data)
+                layer = next(e for e in config["config"]["layers"] if e["class_name"] == kind)
+                if kind == "Functional":
+                    layer["inbound_nodes"][0]["kwargs"]["training"] = True
+                else:
+                    layer["config"]["initial"] = 5.0
+                data = json.dumps(config).encode()
+            changed.writestr(entry, data)
+    with pytest.raises(UnknownLayerError, match=words):
+        read(Fetched(tmp_path / "a.keras"), ReadOptions())

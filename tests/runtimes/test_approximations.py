@@ -1,4 +1,4 @@
-"""How far each runtime is from the functions it approximates: no farther than converters/graph/jitter.py says."""
+"""How far each runtime is from the functions it approximates: no farther than converters/graph/ops/approximations.py says."""
 
 from __future__ import annotations
 

@@ -124,3 +124,11 @@ def test_what_the_weights_do_not_tell_is_refused_and_named(tmp_path: Path) -> No
     (tmp_path / "policy.pth").write_bytes(writer.zip(state))
     with pytest.raises(NotAPolicyError, match=r"give the \.zip"):
         read_source(tmp_path / "policy.pth")
+    between = {
+        f"network.{i}.{part}": np.ones((size, 4) if part == "weight" else size, np.float32)
+        for i, size in ((0, 4), (1, 2))
+        for part in ("weight", "bias")
+    }
+    (tmp_path / "dqn.pt").write_bytes(writer.zip(writer.state(between)))
+    with pytest.raises(SourceError, match="nothing stands between"):
+        read_source(tmp_path / "dqn.pt", ReadOptions(activation="relu"))

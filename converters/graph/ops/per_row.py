@@ -1,4 +1,4 @@
-"""Every op of the table for any number of agents: the form in which it leaves an axis in front of all others alone."""
+"""Ops for any number of agents: the form in which one leaves an axis in front alone; one that has none is refused."""
 
 from __future__ import annotations
 

@@ -26,10 +26,7 @@ def _dense(step: Step) -> str:
     b, units = step.net, int(step.get("units"))
     step.refuse_unless("quantization_config", None)
     kernel = step.take(b.length(step.x, -1), units)
-    value = matmul(b, step.x, b.const(kernel, "kernel"))
-    if step.get("use_bias", True):
-        value = b.add("BiasAdd", [value, b.const(step.take(units), "bias")])
-    return activated(step, value)
+    return activated(step, step.biased(matmul(b, step.x, b.const(kernel, "kernel")), units))
 
 
 def _einsum_dense(step: Step) -> str:

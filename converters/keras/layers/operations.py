@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nn.activations import clip
+from converters.graph.nn.activations import clip, elu
 from converters.graph.nn.linear import matmul
 from converters.graph.ops.einsum import einsum
 from converters.graph.types import FLOAT32
@@ -21,7 +21,8 @@ def _argument(step: Step, at: int, key: str, default: Any = None) -> Any:
     """An argument of the call, by place or name, else a setting."""
     if at < len(step.args):
         return step.args[at]
-    return step.kwargs.get(key, step.get(key, default))
+    setting = step.get(key, default)
+    return step.kwargs.get(key, setting)
 
 
 def _operand(step: Step, value: Any) -> str:
@@ -55,7 +56,7 @@ def _softmax(step: Step, op: str) -> str:
 def _reduced(step: Step, kind: str) -> str:
     b, axis = step.net, _argument(step, 1, "axis")
     axes = range(b.rank(step.x)) if axis is None else [axis] if isinstance(axis, int) else axis
-    keep = bool(step.get("keepdims", step.kwargs.get("keepdims", False)))
+    keep = bool(_argument(step, 2, "keepdims", False))
     return b.reduce(kind, step.x, sorted(b.axis(step.x, int(a)) for a in axes), keep=keep)
 
 
@@ -152,7 +153,6 @@ _ACTIVATIONS = {
     "Relu": "relu",
     "Relu6": "relu6",
     "Sigmoid": "sigmoid",
-    "Elu": "elu",
     "Selu": "selu",
     "Softplus": "softplus",
     "Softsign": "softsign",
@@ -167,6 +167,7 @@ OPERATIONS: Mapping[str, Translate] = {
     **{name: partial(_unary, op=op) for name, op in _UNARY.items()},
     **{name: partial(_activation, name=own) for name, own in _ACTIVATIONS.items()},
     **{name: partial(_reduced, kind=kind) for name, kind in _REDUCTIONS.items()},
+    "Elu": lambda s: elu(s.net, s.x, float(_argument(s, 1, "alpha", 1.0))),
     "Gelu": lambda s: activation_of(s, "gelu_new" if _argument(s, 1, "approximate", True) else "gelu")(s.net, s.x),
     "Softmax": partial(_softmax, op="Softmax"),
     "LogSoftmax": partial(_softmax, op="LogSoftmax"),

@@ -31,6 +31,8 @@ class Step:
     ) -> None:
         self.net, self.layer, self.args, self.kwargs, self.path = net, layer, list(args), dict(kwargs or {}), path
         self.left = [*arrays]
+        #: settings and named arguments that were asked for
+        self.asked: set[str] = set()
 
     def inner(self, layer: Layer, args: Sequence[Any], arrays: Sequence[np.ndarray]) -> Step:
         """A call of a layer that this one wraps."""
@@ -38,6 +40,7 @@ class Step:
 
     def get(self, key: str, default: Any = None) -> Any:
         """A setting."""
+        self.asked.add(key)
         return self.layer.config.get(key, default)
 
     def refuse_unless(self, key: str, *values: Any) -> None:
@@ -90,8 +93,14 @@ class Step:
             )
         return array.astype(FLOAT32)
 
-    def biased(self, value: str, width: int | None, key: str = "use_bias") -> str:
+    def unread(self) -> list[str]:
+        """Settings and named arguments that say something and were never asked for."""
+        given = {**self.layer.config, **self.kwargs}
+        known = {*self.asked, "name", "trainable"}
+        return [f"{k}={str(v)[:60]}" for k, v in given.items() if k not in known and v is not None and v is not False]
+
+    def biased(self, value: str, width: int | None) -> str:
         """``value`` plus the next weight, where the layer has a bias."""
-        if not self.get(key, True):
+        if not self.get("use_bias", True):
             return value
         return self.net.add("BiasAdd", [value, self.net.const(self.take(width), "bias")])

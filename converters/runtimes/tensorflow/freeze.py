@@ -118,8 +118,14 @@ def keras_call(model: Any) -> tuple[Callable[..., Any], list[Any], list[str]]:
 
 
 def keras_outputs(model: Any, count: int) -> list[str]:
-    """What a Keras model calls its outputs."""
-    return list(getattr(model, "output_names", [])) or [f"output_{i}" for i in range(count)]
+    """What a Keras model calls its outputs, each its own name: several of one layer are called alike."""
+    found: list[str] = []
+    for wish in getattr(model, "output_names", None) or [f"output_{i}" for i in range(count)]:
+        name = wish
+        while name in found:  # as converters/keras/model.py calls them
+            name = f"{wish}_{len(found)}"
+        found.append(name)
+    return found
 
 
 def saved_function(function: Any, folder: str) -> FrozenFunction:
