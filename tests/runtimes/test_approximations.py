@@ -1,4 +1,4 @@
-"""How far each runtime is from the functions it approximates: no farther than converters/graph/ops/approximations.py says."""
+"""How far each runtime is from the functions it approximates: no farther than what the op table says of them."""
 
 from __future__ import annotations
 
