@@ -73,7 +73,7 @@ def read_rows(
         except ExportModelError:
             raise fault from None
     has_rows = batch is not None and _has_rows(importer, outputs)
-    fault = _fault(importer, outputs, said=True) if has_rows and batch == 1 else None
+    fault = _fault(importer, outputs, said=True) if has_rows else None
     plain = Reading(importer, importer.graph(), importer.types, batch)
     if has_rows and fault is None and not _broken(importer, outputs):
         return plain
@@ -217,7 +217,7 @@ def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
     judged = [o for o in outputs if not graph.ancestors([o]) & chance]
     if not judged:
         return
-    graph = normalise(graph.pruned(judged))
+    graph = normalise(graph.pruned(judged), judged)
     types = infer_types(graph)
     axes = {name: _free(kind) for name, kind in types.items()}
     feeds = {n.name: _rows(n.attrs["shape"], n.attrs["dtype"]) for n in graph.nodes if n.op == "Placeholder"}

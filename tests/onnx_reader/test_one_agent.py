@@ -85,6 +85,27 @@ def test_a_model_for_one_row_whose_insides_are_for_one_row_is_computed_row_by_ro
     assert result.policy.signature.inputs[0].shape == (None, 4)
 
 
+@pytest.mark.parametrize("dims", [[1, 4], [4]])
+def test_scores_that_a_mask_hides_are_read_row_by_row(dims: list[int], bench: Bench, tmp_path: Path) -> None:
+    """The output's own op is one that has another form in TensorFlow 1.4: it keeps its name all the same."""
+    nodes = [
+        node("MatMul", ["obs", "w"], "z"),
+        node("Greater", ["action_masks", "zero"], "open"),
+        node("Where", ["open", "z", "far"], "logits"),
+    ]
+    constants = {"w": floats(4, 4), "zero": np.float32(0), "far": np.float32(-1e8)}
+    message = model(nodes, {"obs": (F, dims), "action_masks": (F, dims)}, {"logits": (F, dims)}, constants)
+    signature = exported(message, bench, tmp_path).policy.signature
+    assert [s.shape for s in signature.inputs] == [(None, 4)] * 2
+
+
+def test_frames_of_one_agent_are_not_taken_for_agents(bench: Bench, tmp_path: Path) -> None:
+    """[3, 4] in and out, with a mean over the three: rows that know of each other are no agents."""
+    nodes = [node("ReduceMean", ["obs"], "m", axes=[0]), node("Add", ["obs", "m"], "action")]
+    result = exported(model(nodes, {"obs": (F, [3, 4])}, {"action": (F, [3, 4])}, {}, opset=13), bench, tmp_path)
+    assert result.policy.signature.inputs[0].shape == (None, 3, 4)
+
+
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT16, TensorProto.DOUBLE])
 def test_half_and_double_precision_are_computed_in_float32(kind: int, bench: Bench, tmp_path: Path) -> None:
     dtype = helper.tensor_dtype_to_np_dtype(kind)

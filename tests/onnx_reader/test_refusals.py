@@ -85,6 +85,9 @@ REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array
         [constant("i", [0, -5], np.int64), node("Gather", ["x", "i"], axis=1)], X, {}, "an axis of 4 does not have",
     ),
     "an equation with traces": ([node("Einsum", ["x"], equation="bb->b")], {"x": (np.float32, [4, 4])}, {}, "plain"),
+    "an equation that repeats a row": (
+        [node("Einsum", ["x", "w"], equation="bi,bi->bi")], X, {"w": floats(1, 4)}, "'b' has length 1",
+    ),
 }  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Axes resampled to another length: each element of the result is a weighted sum of the axis' elements.
 
-The weights follow from the lengths alone (onnx/docs/Operators.md, Resize), so they are computed here, in float64, and
+The weights follow from the lengths alone (onnx/docs/Operators.md, Resize), so they are computed here, and
 what is left is a gather or a product with a matrix.
 """
 
@@ -19,6 +19,7 @@ from converters.graph.nn.linear import matmul
 from converters.graph.nn.shaping import taken
 from signatures.errors import UnsupportedOpError
 
+Places = npt.NDArray[np.float32]
 Weights = npt.NDArray[np.float64]
 _MAX_WEIGHTS = 1 << 22
 _WHOLE = 1e-4
@@ -61,31 +62,41 @@ def resampled(b: Builder, x: str, axis: int, length: int, scale: float, how: Res
 
 def _places(before: int, length: int, scale: float, how: Resampling) -> Weights:
     """Where the elements of the result lie among those that are there."""
-    at = np.arange(length, dtype=np.float64)
-    exact = scale * before
+    exact = abs(scale * before - length) <= _WHOLE
+    if not exact and (how.coordinates == "align_corners" or _is_symmetric_nearest(how)):
+        raise UnsupportedOpError(
+            f"{before} times {scale:g} is no whole number",
+            why=f"ONNX and onnxruntime differ on {how.coordinates} there",
+        )
+    # in float32, as onnxruntime has them: which of two neighbours is the nearest depends on it
+    return _ideal_places(np.arange(length, dtype=np.float32), np.float32(scale), before, how).astype(np.float64)
+
+
+def _is_symmetric_nearest(how: Resampling) -> bool:
+    return how.coordinates == "half_pixel_symmetric" and how.mode == "nearest"
+
+
+def _ideal_places(at: Places, scale: np.float32, before: int, how: Resampling) -> Places:
+    length, span = len(at), np.float32(before - 1)
     match how.coordinates:
         case "half_pixel":
             return (at + 0.5) / scale - 0.5
         case "half_pixel_symmetric":
-            shift = before / 2 * (1 - length / exact)
+            shift = np.float32(before / 2 * (1 - length / (scale * before)))
             return shift + (at + 0.5) / scale - 0.5
         case "pytorch_half_pixel":
-            return (at + 0.5) / scale - 0.5 if length > 1 else np.zeros(1)
+            return (at + 0.5) / scale - 0.5 if length > 1 else np.zeros(1, np.float32)
         case "align_corners":
-            if abs(exact - length) > _WHOLE:
-                raise UnsupportedOpError(
-                    f"{before} times {scale:g} is no whole number", why="ONNX and onnxruntime differ on its corners"
-                )
-            return at * (before - 1) / (length - 1) if length > 1 else np.zeros(1)
+            return at * span / np.float32(length - 1) if length > 1 else np.zeros(1, np.float32)
         case "asymmetric":
             return at / scale
         case "tf_half_pixel_for_nn":
             return (at + 0.5) / scale
         case "tf_crop_and_resize":
-            start, end = how.region
+            start, end = map(np.float32, how.region)
             if length > 1:
-                return start * (before - 1) + at * (end - start) * (before - 1) / (length - 1)
-            return np.full(1, 0.5 * (start + end) * (before - 1))
+                return at * (end - start) * span / np.float32(length - 1) + start * span
+            return at + (start + end) / 2 * span
         case other:
             raise UnsupportedOpError(f"its coordinates are {other!r}", why="the model is damaged")
 

@@ -7,7 +7,7 @@ flow), attributes are complete with their defaults, no attribute that TF 1.4 lac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,8 +22,10 @@ from converters.graph.types import FLOAT32, INT64
 from signatures.errors import GraphError, UnsupportedOpError
 
 
-def normalise(graph: Graph) -> Graph:
-    """See the module. Raises UnsupportedOpError that names every node whose op is unknown."""
+def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:
+    """See the module; a node in ``keep`` is there under its name afterwards, whatever its op became. Raises
+    UnsupportedOpError that names every node whose op is unknown.
+    """
     renamed = [replace(n, op=SPELLINGS.get(n.op, n.op)) for n in graph.nodes]
     unknown = [n for n in renamed if n.op not in TABLE and n.op not in CONTROL_FLOW]
     if unknown:
@@ -39,6 +41,9 @@ def normalise(graph: Graph) -> Graph:
                 raise misfit(given, error) from error
         else:
             _take(editor, _completed(node))
+    for name in keep:
+        if (now := editor.resolve(name)) != name:
+            editor.append(Node(name, "Identity", (now,), origin=graph[name].origin))
     return editor.graph()
 
 

@@ -20,9 +20,6 @@ from converters.graph.passes.fold import fold
 from converters.graph.passes.normalise import normalise
 from converters.graph.types import BATCH, TensorType
 
-#: What is drawn is drawn for each agent.
-_SAMPLERS = ("normal", "truncated normal", "uniform")
-
 
 def for_every_row(
     graph: Graph, outputs: Sequence[str], inputs: Mapping[str, int | None], ends: Mapping[str, int] | None = None
@@ -34,7 +31,7 @@ def for_every_row(
     place of a first axis of length 1 where an input's was one. Raises UnsupportedOpError where an op has no such form,
     or a shape is not known.
     """
-    return _Turned(fold(normalise(graph.pruned(outputs))), inputs, ends or {}).run(outputs)
+    return _Turned(fold(normalise(graph.pruned(outputs), outputs)), inputs, ends or {}).run(outputs)
 
 
 class _Turned(Rows):
@@ -50,10 +47,10 @@ class _Turned(Rows):
             self.b.prefix = node.name
             if node.name in self.inputs:
                 self._input(node)
-            elif not any(r in self.own for r in node.inputs) and op_of(node).sampler not in _SAMPLERS:
+            elif not any(r in self.own for r in node.inputs) and not op_of(node).sampler:
                 self.b.append(node.with_inputs(self.at[r] for r in node.inputs))
                 self._stand(node, [ref(node.name, i) for i in range(self.b.outputs(node.name))])
-            else:
+            else:  # what is drawn is drawn for each agent
                 self._node(node, results.get(node.name))
         for name, inner in results.items():
             if name in self.own:  # else it is the same for all agents, and stands there already

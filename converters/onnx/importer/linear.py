@@ -9,7 +9,7 @@ from converters.graph.nn import shaping as nn
 from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import matmul
 from converters.graph.ops.einsum import einsum
-from converters.graph.types import INT64, product
+from converters.graph.types import INT64, Dim, product
 from converters.onnx.importer.elementwise import is_bias
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
@@ -49,7 +49,14 @@ def _matmul(op: Op, net: Importer) -> str:
 
 
 def _einsum(op: Op, net: Importer) -> str:
-    return einsum(net, op.text("equation", ""), [op.need(i) for i in range(len(op.inputs))])
+    equation, tensors = op.text("equation", "").replace(" ", ""), [op.need(i) for i in range(len(op.inputs))]
+    lengths: dict[str, set[Dim]] = {}
+    for term, tensor in zip(equation.partition("->")[0].split(","), tensors, strict=False):
+        for label, dim in zip(term, net.shape(tensor), strict=False):
+            lengths.setdefault(label, set()).add(dim)
+    if repeated := [label for label, dims in lengths.items() if 1 in dims and len(dims) > 1]:
+        raise op.refused(f"{repeated[0]!r} has length 1 in one operand, and is repeated", "no policy needs that")
+    return einsum(net, equation, tensors)
 
 
 # ------------------------------------------------------------------ reductions

@@ -66,7 +66,8 @@ def _resize(op: Op, net: Importer) -> str:
 
 
 def _scaled(dim: Dim, scale: float) -> float:
-    return float(np.floor(dim * scale)) if isinstance(dim, int) else scale
+    """The length that comes out, in float32 as onnxruntime: 5 times 1.4 is 7 there, 6.999… in float64."""
+    return float(np.floor(np.float32(dim) * np.float32(scale))) if isinstance(dim, int) else scale
 
 
 def _stays(dim: Dim, number: float, scale: float | None) -> bool:
@@ -83,7 +84,7 @@ def _upsample(op: Op, net: Importer) -> str:
     how = Resampling(op.text("mode", "nearest"), "asymmetric", "floor")
     for axis, scale in enumerate(scales):
         if scale != 1:
-            x = resampled(net, x, axis, int(net.length(x, axis) * scale), float(scale), how)
+            x = resampled(net, x, axis, int(_scaled(net.length(x, axis), scale)), float(scale), how)
     return x
 
 

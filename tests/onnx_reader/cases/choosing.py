@@ -77,6 +77,14 @@ def upsampled(opset: int) -> Sequence[Any]:
     return [constant("s", [1, 1, 2, 3]), node("Upsample", ["x", "s"])]
 
 
+def fraction(side: int, scale: float, opset: int, **more: Any) -> Case:
+    """A scale whose product with the side is a whole number in float32 only."""
+    op = "Upsample" if opset < 10 else "Resize"
+    names = ["x", "s"] if opset < 11 else ["x", "", "s"]
+    build = lambda _: [constant("s", [1, 1, scale, scale], np.float32), node(op, names, **more)]  # noqa: E731
+    return Case(op, f"{side} times {scale} {more}", build, {"x": floats(1, 2, side, side)}, opsets=(opset,))
+
+
 def blocks(op: str, mode: str | None, x: Any) -> Case:
     more: dict[str, Any] = {} if mode is None else {"mode": mode}
     build: Callable[[int], Sequence[Any]] = lambda _: [node(op, ["x"], blocksize=2, **more)]  # noqa: E731
@@ -119,6 +127,10 @@ CASES = [
     resized("cubic, what is outside left out", sizes=[2, 3, 3, 9], mode="cubic", exclude_outside=1, cubic_coeff_a=-0.5),
     resized("antialiased", sizes=[2, 3, 2, 3], mode="linear", antialias=1, opsets=(18,)),
     Case("Upsample", "nearest", upsampled, {"x": IMAGE}, opsets=(7, 9)),
+    fraction(5, 1.4, 9),
+    fraction(5, 1.4, 13, coordinate_transformation_mode="asymmetric", nearest_mode="floor"),
+    fraction(10, 0.6, 13, coordinate_transformation_mode="asymmetric", nearest_mode="floor"),
+    fraction(10, 0.6, 13),
     blocks("DepthToSpace", None, floats(2, 8, 2, 3)),
     blocks("DepthToSpace", "CRD", floats(2, 8, 2, 3)),
     blocks("SpaceToDepth", None, floats(2, 3, 4, 6)),
