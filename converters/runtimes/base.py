@@ -39,7 +39,7 @@ class Runtime:
     find: Callable[[], RuntimeInfo]
     command: Callable[[], list[str]]
     install: Callable[[Progress], object] | None = None
-    #: It computes by itself; numpy is this project's own.
+    #: It computes by itself; numpy and js are this project's own.
     independent: bool = True
     #: How it approximates functions (converters/graph/ops/approximations.py).
     arithmetic: Arithmetic = "processor"
@@ -47,7 +47,7 @@ class Runtime:
     sessions_alike: bool = False
     #: Multiplications that a policy's products take a second on one core, about (measured).
     products_per_second: float = 1e9
-    #: ``auto`` takes it where it is installed; a browser is started only on request.
+    #: ``auto`` takes it where it is installed; a browser and js are started only on request.
     automatic: bool = True
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.
     confined: bool = True

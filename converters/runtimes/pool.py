@@ -11,13 +11,13 @@ from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError, UsageError
 
-#: Runtimes that compute by themselves; numpy is this project's own.
+#: Runtimes that compute by themselves; numpy and js are this project's own.
 INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
 #: Runtimes that read originals by themselves.
 _ORIGINALS = tuple(r.name for r in RUNTIMES if "source" in r.formats)
-#: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for.
+#: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for, and js shows little beside others.
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
-#: Runtimes that have a sandbox of their own.
+#: Runtimes that have a sandbox of their own: browsers.
 _FREE = frozenset(r.name for r in RUNTIMES if not r.confined)
 _COMMANDS = MappingProxyType({r.name: r.command for r in RUNTIMES})
 
@@ -41,8 +41,8 @@ def chosen_runtimes(
         return automatic, infos
     several = {
         "auto": automatic,
-        "browser": [n for n in known if n in _ON_REQUEST],
-        "full": [n for n in known if known[n].supported and (n in INDEPENDENT or n == "numpy")],
+        "browser": [n for n in known if n in _FREE],
+        "full": [n for n in known if known[n].supported],
     }
     names = [n for word in _names(wanted) for n in several.get(word, (word,))]
     for name in names:

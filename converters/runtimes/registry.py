@@ -7,14 +7,14 @@ whether it is here, how its child is started and how it is installed; and its na
 
 from __future__ import annotations
 
-from converters.runtimes import javascript, numpy, onnxruntime, tensorflow, tensorflow1
+from converters.runtimes import javascript, js, numpy, onnxruntime, tensorflow, tensorflow1
 from converters.runtimes.base import Runtime, RuntimeInfo
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 
 #: In the order in which they are reported.
 RUNTIMES: tuple[Runtime, ...] = tuple(
-    runtime for family in (numpy, tensorflow, tensorflow1, onnxruntime, javascript) for runtime in family.RUNTIMES
+    runtime for family in (numpy, tensorflow, tensorflow1, onnxruntime, javascript, js) for runtime in family.RUNTIMES
 )
 
 

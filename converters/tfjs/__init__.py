@@ -60,6 +60,7 @@ FORMATS = (
         runtimes=(
             *("tfjs-cpu", "tfjs-wasm", "tfjs-webgl"),
             *("tfjs-cpu@chromium", "tfjs-wasm@chromium"),
+            "js",
         ),
         predicts=True,
         dtypes=frozenset({"float32", "int32", "bool"}),

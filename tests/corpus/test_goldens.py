@@ -86,7 +86,7 @@ def answers(policy: Policy, folder: Path, pool: RuntimePool, source: Path) -> di
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        for runtime in (r for r in WRITTEN[target].runtimes if r in ("numpy", *NEEDED)):
+        for runtime in (r for r in WRITTEN[target].runtimes if r in ("numpy", *NEEDED, "js")):
             kind = {"kind": "saved_model"} if target == "saved_model" else {"kind": "graph"}
             model = pool.process(runtime).load(str(folder / artifact.main), **kind)
             feedable = runtime == "numpy"
@@ -136,6 +136,7 @@ def test_goldens_agree_in_every_runtime(folder: Path, case: dict[str, Any], tmp_
                 continue
             feeds, draws, expected = golden.feeds(), golden.draws(), golden.expected()
             scores: dict[str, np.ndarray] = {}
+            decisions: dict[int, dict[str, np.ndarray]] = {}
             for where, (answer, feedable) in named.items():
                 state = feeds[memory.input] if memory is not None and memory.input is not None else None
                 for step in range(steps):
@@ -153,5 +154,10 @@ def test_goldens_agree_in_every_runtime(folder: Path, case: dict[str, Any], tmp_
                         first = scores.setdefault(f"{step}", got["action_log_probs"])
                         close = compare(first, got["action_log_probs"], Tolerance())
                         assert close.passed, f"{run}, {where}: action_log_probs: {close}"
+                    if policy.signature.branches and where.startswith(("onnx in", "tfjs in js")):
+                        plain = (s.name for s in policy.signature.outputs if s.role is Role.DETERMINISTIC)
+                        decided = {n: got[n] for n in plain}
+                        first = decisions.setdefault(step, decided)
+                        assert all((first[n] == v).all() for n, v in decided.items()), f"{run}, {where}: decisions"
                     compared += 1
         assert compared >= 3 * len(named)

@@ -11,11 +11,10 @@
 
 import process from "node:process";
 import { parseArgs } from "node:util";
-import { Worker } from "node:worker_threads";
 
 import { FramingError, takeStdout } from "./frames.mjs";
 import { onlyKnown } from "./installed.mjs";
-import { serve } from "./serve.mjs";
+import { endWithParent, serve } from "./serve.mjs";
 
 /** Each is imported by the first request: a process holds one runtime and needs no other's code. */
 const RUNTIMES = {
@@ -31,14 +30,6 @@ function commandLine() {
   if (!Object.hasOwn(RUNTIMES, runtime)) throw new Error(`--runtime must be one of ${Object.keys(RUNTIMES)}`);
   if (modules === undefined) throw new Error("--modules DIR is missing: the folder that holds node_modules");
   return { runtime, modules, known };
-}
-
-/**
- * A parent that is killed closes stdin, which is noticed between requests only. A worker looks during one, too.
- */
-function endWithParent() {
-  const look = "if (process.ppid !== parent) process.kill(process.pid, 'SIGKILL')";
-  new Worker(`const parent = process.ppid; setInterval(() => { ${look}; }, 1000);`, { eval: true }).unref();
 }
 
 async function main() {

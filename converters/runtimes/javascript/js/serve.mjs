@@ -24,6 +24,7 @@
  */
 
 import process from "node:process";
+import { Worker } from "node:worker_threads";
 
 import { ByteReader, FramingError, readFrame, writeFrame } from "./frames.mjs";
 
@@ -105,4 +106,12 @@ export async function serve(start, write) {
     if (error instanceof FramingError) await writeFrame(write, { ok: false, error: `lost: ${error.message}` }, []);
     throw error;
   }
+}
+
+/**
+ * A parent that is killed closes stdin, which is noticed between requests only. A worker looks during one, too.
+ */
+export function endWithParent() {
+  const look = "if (process.ppid !== parent) process.kill(process.pid, 'SIGKILL')";
+  new Worker(`const parent = process.ppid; setInterval(() => { ${look}; }, 1000);`, { eval: true }).unref();
 }
