@@ -55,9 +55,9 @@ class Content:
             return []
 
     @cached_property
-    def fields(self) -> list[tuple[int, int, bytes]]:
+    def fields(self) -> list[tuple[int, int, memoryview]]:
         """(number, wire type, payload) of the first fields of a protobuf message; empty where it is none."""
-        return _fields(self.data) if self.text is None else []
+        return _fields(memoryview(self.data)) if self.text is None else []
 
     @property
     def numbers(self) -> set[tuple[int, int]]:
@@ -70,14 +70,14 @@ class Content:
         if not self.fields or self.fields[0][:2] != (1, 2):
             return False
         first = _fields(self.fields[0][2], 3)
-        return [field[:2] for field in first[:2]] == [(1, 2), (2, 2)] and _is_op_name(first[1][2])
+        return [field[:2] for field in first[:2]] == [(1, 2), (2, 2)] and _is_op_name(bytes(first[1][2][:100]))
 
 
 def _is_op_name(data: bytes) -> bool:
     return bool(data) and data[:1].isalpha() | data.startswith(b"_") and all(c < 128 for c in data) and len(data) < 100
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
     value = shift = 0
     while at < len(data) and shift < 64:
         byte = data[at]
@@ -89,8 +89,8 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
     return -1, at
 
 
-def _fields(data: bytes, limit: int = 64) -> list[tuple[int, int, bytes]]:
-    found: list[tuple[int, int, bytes]] = []
+def _fields(data: memoryview, limit: int = 64) -> list[tuple[int, int, memoryview]]:
+    found: list[tuple[int, int, memoryview]] = []
     at = 0
     while at < len(data) and len(found) < limit:
         tag, at = _varint(data, at)

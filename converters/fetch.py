@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterable
 from pathlib import Path
 
-from signatures.digest import sha256_hex
+from signatures.digest import sha256_hex, sha256_of_file
 from signatures.errors import DamagedFileError, SourceError
 
 #: Protobuf's own limit; no policy comes near it.
@@ -43,7 +43,7 @@ class Fetched:
 
     def digest(self, files: Iterable[Path]) -> str:
         """The sha256 of a single file, or of the hashes of several in the order of their names. Raises OSError."""
-        hashes = [sha256_hex(self._read[f] if f in self._read else f.read_bytes()) for f in sorted(set(files))]
+        hashes = [sha256_hex(self._read[f]) if f in self._read else sha256_of_file(f) for f in sorted(set(files))]
         return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())
 
 

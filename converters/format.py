@@ -12,9 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from signatures.contract import FileEntry
+
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
     from signatures.spec import PolicySignature
@@ -35,11 +38,11 @@ class WriteOptions:
 
 @dataclass(frozen=True, slots=True)
 class Artifact:
-    """One policy in one format, in memory: relative path (``/`` between parts) → bytes."""
+    """One policy in one format: relative path (``/`` between parts) → what the file is made of."""
 
     format: Format
     name: str
-    files: Mapping[str, bytes]
+    files: Mapping[str, Pieces]
 
     @property
     def main(self) -> str:
@@ -49,7 +52,16 @@ class Artifact:
     @property
     def size(self) -> int:
         """Bytes of all files together."""
-        return sum(len(data) for data in self.files.values())
+        return sum(data.size for data in self.files.values())
+
+    def write(self, folder: Path) -> dict[str, FileEntry]:
+        """Write its files to a folder; what each became, by its path. Raises OSError."""
+        written = {}
+        for relative, data in self.files.items():
+            place = folder / relative
+            place.parent.mkdir(parents=True, exist_ok=True)
+            written[relative] = FileEntry(data.write(place), data.size)
+        return written
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +143,7 @@ class Format:
     read: Callable[[Fetched, ReadOptions], list[SourceModel]] | None = None
     members: Callable[[Path, ReadOptions], list[Member]] | None = None
     takes: frozenset[str] = frozenset()
-    write: Callable[[Policy, WriteOptions], Mapping[str, bytes]] | None = None
+    write: Callable[[Policy, WriteOptions], Mapping[str, Pieces]] | None = None
     main: str = ""
     default: bool = False
     ports: Callable[[Path], Ports] | None = None

@@ -15,6 +15,8 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
+from converters.detached import LARGE_FILE, Detached, Fields
+from converters.pieces import Pieces
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Nodes of a file, training part and functions included.
@@ -136,8 +138,19 @@ TrackableObjectGraph = _CLASSES["TrackableObjectGraph"]
 Event = _CLASSES["Event"]
 
 
-def parse(message_class: Any, data: bytes, what: str) -> Any:
-    """The message in ``data``; raises DamagedFileError that calls it ``what``."""
+#: Where the contents of tensors lie: GraphDef.node.attr.value.tensor.tensor_content, in functions too.
+_NODE: Fields = {5: {2: {8: {4: None}}}}
+_GRAPH: Fields = {1: _NODE, 2: {1: {3: _NODE}}}
+_CONTENTS: dict[str, Fields] = {"GraphDef": _GRAPH, "MetaGraphDef": {2: _GRAPH}, "SavedModel": {2: {2: _GRAPH}}}
+
+
+def parse(message_class: Any, data: bytes, what: str, detached: Detached | None = None) -> Any:
+    """The message in ``data``; raises DamagedFileError that calls it ``what``. Of a large one ``detached`` is given the
+    tensors' contents.
+    """
+    fields = _CONTENTS.get(message_class.DESCRIPTOR.name)
+    if detached is not None and fields is not None and len(data) >= LARGE_FILE:
+        data = detached.without(data, fields)
     message = message_class()
     try:
         message.ParseFromString(data)
@@ -174,6 +187,11 @@ def serialise(message: Any) -> bytes:
     """Bytes with map entries in a fixed order."""
     data: bytes = message.SerializeToString(deterministic=True)
     return data
+
+
+def pieces(message: Any, detached: Detached) -> Pieces:
+    """As ``serialise``, with what is detached in its place."""
+    return detached.whole(serialise(message))
 
 
 # ------------------------------------------------------------------ dtypes (types.proto)

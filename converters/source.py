@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from converters import schema
+from converters.detached import Detached
 from converters.folders import scratch_folder
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph
@@ -28,6 +29,8 @@ class OriginalRun:
     path: Path
     options: Mapping[str, Any] = field(default_factory=dict)
     definition: Any = field(default=None, repr=False, compare=False)
+    #: what of the definition lies beside it
+    detached: Detached = field(default_factory=Detached, repr=False, compare=False)
 
     def narrowed(self, source_map: SourceMap) -> OriginalRun:
         """The same with no more of the definition than a policy asks for.
@@ -46,7 +49,7 @@ class OriginalRun:
             return
         with scratch_folder() as folder:
             file = folder / "source.pb"
-            file.write_bytes(schema.serialise(self.definition))
+            schema.pieces(self.definition, self.detached).write(file)
             yield str(file), {"kind": "graph"}
 
 

@@ -11,6 +11,7 @@ from converters.format import Format, WriteOptions
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
     from signatures.spec import PolicySignature
@@ -29,7 +30,7 @@ def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return read(given)
 
 
-def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     from converters.barracuda.writer import write
 
     return write(policy, options)

@@ -13,6 +13,7 @@ from converters.barracuda.encode import encode
 from converters.barracuda.format import Trailer, parse
 from converters.barracuda.lower import policy_model
 from converters.format import WriteOptions
+from converters.pieces import Pieces
 from converters.policy import Policy
 
 CONTRACT_KEY = "export_model_contract"
@@ -21,10 +22,10 @@ _NO_SOURCE, _NO_VERSION = "Script", "NA"
 PRODUCER = "export-model"
 
 
-def write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+def write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     """The ``.nn``. Raises UnsupportedOpError or SignatureError that names what the format cannot hold."""
     trailer = Trailer(_NO_SOURCE, _NO_VERSION, PRODUCER, metadata=((CONTRACT_KEY, options.contract),))
-    return {f"{policy.name}.nn": encode(replace(policy_model(policy), trailer=trailer))}
+    return {f"{policy.name}.nn": Pieces(encode(replace(policy_model(policy), trailer=trailer)))}
 
 
 def contract_text(data: bytes) -> str:

@@ -18,7 +18,7 @@ from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph
 from converters.graph.shapes import infer_types
 from signatures.contract import POLICY, Contract, FileEntry, json_of, parse
-from signatures.digest import sha256_hex
+from signatures.digest import sha256_of_file
 from signatures.errors import BundleError, UsageError
 from signatures.fields import FieldError
 from signatures.spec import PolicySignature
@@ -115,7 +115,7 @@ class Bundle:
                 fix=f"do not use this bundle; {_AGAIN}",
             )
         try:  # the size first: a file may be of any, and policy.json says which
-            found = sha256_hex(path.read_bytes()) if _file_size(path) == entry.size else None
+            found = sha256_of_file(path) if _file_size(path) == entry.size else None
         except FileNotFoundError as error:
             raise BundleError("is missing", where=str(path), why=f"{POLICY} names it", fix=_AGAIN) from error
         except OSError as error:
@@ -219,15 +219,12 @@ def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
 @contextlib.contextmanager
 def staged(place: Path, contract: Contract, artifacts: Sequence[Artifact]) -> Iterator[Path]:
     """A bundle in a new folder beside ``place``, gone afterwards unless it was put in its place. Raises BundleError."""
-    files = {path: data for artifact in artifacts for path, data in artifact.files.items()}
-    entries = {path: FileEntry(sha256_hex(data), len(data)) for path, data in sorted(files.items())}
-    whole = replace(contract, files=entries)
     with contextlib.ExitStack() as stack:
         with writing(place.parent, "the output folder cannot be written"):
             new = stack.enter_context(stage(place))
-            for relative, data in (*files.items(), (POLICY, dumps(whole.to_dict()))):
-                (new / relative).parent.mkdir(parents=True, exist_ok=True)
-                (new / relative).write_bytes(data)
+            files = {path: entry for artifact in artifacts for path, entry in artifact.write(new).items()}
+            whole = replace(contract, files=dict(sorted(files.items())))
+            (new / POLICY).write_bytes(dumps(whole.to_dict()))
         yield new
 
 

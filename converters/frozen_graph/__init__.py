@@ -10,6 +10,7 @@ from converters.format import Format, Ports, WriteOptions
 
 if TYPE_CHECKING:
     from converters.fetch import Fetched
+    from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
 
@@ -20,7 +21,7 @@ def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return read(given)
 
 
-def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     from converters.frozen_graph.writer import write
 
     return write(policy, options)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.detached import Detached
 from converters.frozen_graph.tensors import from_array
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.base import REQUIRED, Attr
@@ -25,8 +26,11 @@ PRODUCER = 24
 _RESOURCE = 20
 
 
-def encode(graph: Graph, *, explicit: bool = False) -> Any:
-    """A GraphDef message. Raises UnsupportedOpError when the portable dialect lacks an op."""
+def encode(graph: Graph, *, explicit: bool = False, detached: Detached | None = None) -> Any:
+    """A GraphDef message, its large constants in ``detached``.
+
+    Raises UnsupportedOpError when the portable dialect lacks an op.
+    """
     types = infer_types(graph)
     message = schema.GraphDef()
     message.versions.producer = PRODUCER
@@ -44,7 +48,7 @@ def encode(graph: Graph, *, explicit: bool = False) -> Any:
         if node.op == "Const":
             assert node.value is not None
             proto.attr["dtype"].type = schema.dtype_number(node.value.dtype)
-            proto.attr["value"].tensor.CopyFrom(from_array(node.value))
+            proto.attr["value"].tensor.CopyFrom(from_array(node.value, detached))
             continue
         for attr in entry.attrs:
             value = _value(node, attr, types)

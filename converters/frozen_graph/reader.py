@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.detached import Detached
 from converters.frozen_graph.tensors import Allowance, to_array
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.graph.ops.outside import CALLS
@@ -27,17 +28,18 @@ def read_graph(data: bytes) -> Graph:
     Raises DamagedFileError when it cannot be decoded, GraphError on dangling inputs or cycles, NotAPolicyError when
     it decodes to a graph without nodes.
     """
-    return from_graph_def(schema.parse(schema.GraphDef, data, "TensorFlow graph"))
+    detached = Detached()
+    return from_graph_def(schema.parse(schema.GraphDef, data, "TensorFlow graph", detached), detached)
 
 
-def from_graph_def(graph_def: Any) -> Graph:
-    """A Graph of a GraphDef message (ours, or any object with the same fields)."""
+def from_graph_def(graph_def: Any, detached: Detached | None = None) -> Graph:
+    """A Graph of a GraphDef message (ours, or any object with the same fields), its constants views of the detached."""
     if not graph_def.node:
         raise NotAPolicyError("the graph has no nodes", fix="give the frozen graph that training wrote")
     schema.check_nodes(len(graph_def.node))
     calls = {f.signature.name for f in graph_def.library.function}
     allowance = Allowance()
-    nodes = [_node(n, graph_def.versions.producer, allowance) for n in graph_def.node]
+    nodes = [_node(n, graph_def.versions.producer, allowance, detached) for n in graph_def.node]
     for node in nodes:
         if node.op in calls or node.op in CALLS:
             raise NotAPolicyError(
@@ -48,7 +50,7 @@ def from_graph_def(graph_def: Any) -> Graph:
     return Graph(topological(nodes))
 
 
-def _node(proto: Any, producer: int, allowance: Allowance) -> Node:
+def _node(proto: Any, producer: int, allowance: Allowance, detached: Detached | None) -> Node:
     if not proto.name or not proto.op:
         raise DamagedFileError(
             "a node has no name or no op",
@@ -62,9 +64,9 @@ def _node(proto: Any, producer: int, allowance: Allowance) -> Node:
             continue
         try:
             if proto.op == "Const" and key == "value":
-                value = to_array(proto.attr[key].tensor, allowance)
+                value = to_array(proto.attr[key].tensor, allowance, detached)
             else:
-                attrs[key] = _attribute(proto.attr[key], allowance)
+                attrs[key] = _attribute(proto.attr[key], allowance, detached)
         except DamagedFileError as error:
             raise error.at(f"node {proto.name!r}, attribute {key!r}") from error
     if proto.op == "Const":
@@ -99,7 +101,7 @@ def _shape(proto: Any) -> TensorShape:
     return TensorShape(tuple(None if d.size < 0 else int(d.size) for d in proto.dim))
 
 
-def _attribute(proto: Any, allowance: Allowance) -> Any:
+def _attribute(proto: Any, allowance: Allowance, detached: Detached | None) -> Any:
     kind = proto.WhichOneof("value")
     if kind == "s":
         return _text(proto.s)
@@ -110,7 +112,7 @@ def _attribute(proto: Any, allowance: Allowance) -> Any:
     if kind == "shape":
         return _shape(proto.shape)
     if kind == "tensor":
-        return to_array(proto.tensor, allowance)
+        return to_array(proto.tensor, allowance, detached)
     if kind == "func":
         return proto.func.name
     if kind == "list":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from converters import schema
 from converters.bundle.embed import facts_of, recalled
+from converters.detached import Detached
 from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
 from converters.source import OriginalRun, SourceModel
@@ -11,7 +12,8 @@ from converters.source import OriginalRun, SourceModel
 
 def read(given: Fetched) -> list[SourceModel]:
     """The one graph in a file; one that this tool wrote is what its contract says."""
-    definition = schema.parse(schema.GraphDef, given.data, "TensorFlow graph")
-    graph, contract = recalled(from_graph_def(definition))
-    original = OriginalRun("tensorflow", given.path, definition=definition)
+    detached = Detached()
+    definition = schema.parse(schema.GraphDef, given.data, "TensorFlow graph", detached)
+    graph, contract = recalled(from_graph_def(definition, detached))
+    original = OriginalRun("tensorflow", given.path, definition=definition, detached=detached)
     return [SourceModel(graph, (given.path,), facts_of(graph, contract), original=original)]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.detached import LARGE, Detached
 from converters.schema import TensorProto, dtype_number, dtype_of
 from signatures.errors import DamagedFileError
 
@@ -45,8 +46,8 @@ class Allowance:
             raise _damaged(f"it claims {elements} elements that the file does not hold")
 
 
-def to_array(proto: Any, allowance: Allowance | None = None) -> np.ndarray:
-    """The array of a TensorProto; raises DamagedFileError."""
+def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached | None = None) -> np.ndarray:
+    """The array of a TensorProto, a view of what is ``detached``; raises DamagedFileError."""
     dtype = dtype_of(proto.dtype)
     shape = tuple(int(d.size) for d in proto.tensor_shape.dim)
     if proto.tensor_shape.unknown_rank or any(n < 0 for n in shape):
@@ -58,10 +59,12 @@ def to_array(proto: Any, allowance: Allowance | None = None) -> np.ndarray:
         return _strings(list(proto.string_val) or [b""], shape, count)
     if dtype.kind == "O":
         raise _damaged("it is a resource, which has no value outside of a session")
-    if proto.tensor_content:
-        if len(proto.tensor_content) != count * dtype.itemsize:
-            raise _damaged(f"it holds {len(proto.tensor_content)} bytes for {count} elements of {dtype}")
-        return np.frombuffer(proto.tensor_content, dtype.newbyteorder("<")).astype(dtype, copy=False).reshape(shape)
+    if content := proto.tensor_content:
+        held = None if detached is None else detached.array(content)
+        data = np.frombuffer(content, np.uint8) if held is None else held.reshape(-1).view(np.uint8)
+        if data.size != count * dtype.itemsize:
+            raise _damaged(f"it holds {data.size} bytes for {count} elements of {dtype}")
+        return data.view(dtype.newbyteorder("<")).astype(dtype, copy=False).reshape(shape)
     values = _values(proto, dtype)
     if values.size > count:
         raise _damaged(f"it holds {values.size} values for {count} elements")
@@ -98,13 +101,15 @@ def _damaged(why: str) -> DamagedFileError:
     return DamagedFileError("the tensor cannot be read", why=why, fix="freeze the graph again; this file is damaged")
 
 
-def from_array(array: np.ndarray) -> Any:
-    """A TensorProto with the array's raw little-endian bytes (strings as values)."""
+def from_array(array: np.ndarray, detached: Detached | None = None) -> Any:
+    """A TensorProto with the array's raw little-endian bytes (strings as values); large ones go to ``detached``."""
     proto = TensorProto(dtype=dtype_number(array.dtype))
     for size in array.shape:
         proto.tensor_shape.dim.add(size=int(size))
     if array.dtype.kind == "S":
         proto.string_val.extend(array.reshape(-1).tolist())
+    elif detached is not None and array.nbytes >= LARGE:
+        proto.tensor_content = detached.mark(array)
     else:
         little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
         proto.tensor_content = little.tobytes()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from converters import schema
+from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.subgraph import subgraph
@@ -17,9 +18,11 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
 
     Raises UnsupportedOpError where an op does more than compute, DamagedFileError, GraphError.
     """
-    definition = schema.parse(schema.GraphDef, read_bytes(path), "TensorFlow graph")
-    from_graph_def(definition)  # its constants are bounded, its names are names
+    detached = Detached()
+    definition = schema.parse(schema.GraphDef, read_bytes(path), "TensorFlow graph", detached)
+    from_graph_def(definition, detached)  # its constants are bounded, its names are names
     there = {n.name for n in definition.node}
     copy = folder / path.name
-    copy.write_bytes(schema.serialise(subgraph(definition, [w for w in wanted if node_of(w) in there])))
+    part = subgraph(definition, [w for w in wanted if node_of(w) in there])
+    schema.pieces(part, detached).write(copy)
     return copy

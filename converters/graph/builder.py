@@ -273,7 +273,7 @@ class Builder:
             return reference
         value = self.constant(reference)
         if value is not None:
-            return self.const(np.ascontiguousarray(value.transpose(permutation)), "transposed")
+            return self.const(value.transpose(permutation), "transposed")  # a view: weights are not copied
         return self.add("Transpose", [reference, self.ints(list(permutation), "perm")])
 
     def expand_dims(self, reference: str, axis: int) -> str:

@@ -11,6 +11,7 @@ from converters.format import Format, Ports, WriteOptions
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
 
@@ -26,7 +27,7 @@ def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return read(given)
 
 
-def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     from converters.onnx.writer import write
 
     return write(policy, options)

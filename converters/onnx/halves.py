@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.onnx.proto import tensors
+from converters.detached import LARGE, Detached
+from converters.onnx.proto import raw_of, tensors
 
 _FLOAT, _FLOAT16, _BFLOAT16 = 1, 10, 16  # TensorProto.DataType
 _HALVES = (_FLOAT16, _BFLOAT16)
@@ -19,14 +20,17 @@ _HALVES = (_FLOAT16, _BFLOAT16)
 _TYPES = ("to", "dtype", "output_datatype", "stash_type")
 
 
-def widen(model: Any) -> bool:
-    """Make a ModelProto float32 in place, whose tensors hold their data; whether anything of it was half precision."""
+def widen(model: Any, detached: Detached | None = None) -> bool:
+    """Make a ModelProto float32 in place, whose tensors hold their data, or ``detached`` does.
+
+    Returns whether anything of it was half precision.
+    """
     found = False
     for part in (model.graph, *model.functions):
         for tensor in tensors(part):
             if tensor.data_type in _HALVES:
                 found = True
-                _widen_tensor(tensor)
+                _widen_tensor(tensor, detached)
         for body in _bodies(part):
             values = (*body.input, *body.output, *body.value_info)
             for value in (v for v in values if not isinstance(v, str)):  # a function's are names
@@ -49,10 +53,10 @@ def _bodies(part: Any) -> Iterator[Any]:
                 yield from _bodies(attribute.g)
 
 
-def _widen_tensor(tensor: Any) -> None:
-    bits = tensor.raw_data if tensor.HasField("raw_data") else np.array(tensor.int32_data, "<u2").tobytes()
-    raw = np.frombuffer(bits, "<u2")
+def _widen_tensor(tensor: Any, detached: Detached | None) -> None:
+    whole = tensor.HasField("raw_data")
+    raw = raw_of(tensor, detached).view("<u2") if whole else np.array(tensor.int32_data, "<u2")
     wide = raw.view(np.float16).astype("<f4") if tensor.data_type == _FLOAT16 else (raw.astype("<u4") << 16).view("<f4")
     tensor.ClearField("int32_data")
-    tensor.raw_data = wide.tobytes()
+    tensor.raw_data = wide.tobytes() if detached is None or wide.nbytes < LARGE else detached.mark(wide.view(np.uint8))
     tensor.data_type = _FLOAT

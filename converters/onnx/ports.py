@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.format import Port, Ports
 from converters.onnx.proto import decoded, dtype_name
@@ -12,7 +13,7 @@ from converters.onnx.proto import decoded, dtype_name
 
 def ports(path: Path) -> Ports:
     """The ports of a file. Raises SourceError, DamagedFileError."""
-    graph = decoded(read_bytes(path)).graph
+    graph = decoded(read_bytes(path), Detached()).graph
     stored = {t.name for t in graph.initializer}
     inputs = tuple(_port(v) for v in graph.input if v.name not in stored)
     return Ports(path, inputs, tuple(_port(v) for v in graph.output))

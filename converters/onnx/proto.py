@@ -13,12 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from converters.detached import LARGE, LARGE_FILE, Detached, Fields
 from converters.fetch import MAX_BYTES, read_bytes
 from converters.graph.types import FLOAT32
 from converters.schema import check_nodes
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 _MAX_AXES = 32
+#: Where the bytes of weights lie: ModelProto.graph.initializer.raw_data.
+_CONTENTS: Fields = {7: {5: {9: None}}}
 _EXTERNAL = 1  # TensorProto.DataLocation
 #: How often all bytes of the files beside a model may be named as weights: layers share some.
 _MAX_TIMES = 4
@@ -42,11 +45,16 @@ _STORED = {
 _FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "strings"}
 
 
-def decoded(data: bytes) -> Any:
-    """The ModelProto in ``data``, all of whose names are text. Raises DamagedFileError."""
+def decoded(data: bytes, detached: Detached | None = None) -> Any:
+    """The ModelProto in ``data``, all of whose names are text. Of a large one ``detached`` is given the weights' bytes.
+
+    Raises DamagedFileError.
+    """
     import onnx
     from google.protobuf.message import DecodeError
 
+    if detached is not None and len(data) >= LARGE_FILE:
+        data = detached.without(data, _CONTENTS)
     try:
         model = onnx.ModelProto.FromString(data)
     except DecodeError as error:
@@ -86,8 +94,11 @@ def _check_texts(model: Any) -> None:
                     )
 
 
-def array_of(tensor: Any) -> np.ndarray:
-    """The values of a TensorProto, float64 narrowed to float32. Raises DamagedFileError, UnsupportedOpError."""
+def array_of(tensor: Any, detached: Detached | None = None) -> np.ndarray:
+    """The values of a TensorProto, a view of what is ``detached``; float64 narrowed to float32.
+
+    Raises DamagedFileError, UnsupportedOpError.
+    """
     name = tensor.name or "(constant)"
     if tensor.data_type not in _STORED:
         raise UnsupportedOpError(
@@ -104,9 +115,10 @@ def array_of(tensor: Any) -> np.ndarray:
     array: np.ndarray
     if tensor.HasField("raw_data"):
         size = count * np.dtype(dtype).itemsize
-        if len(tensor.raw_data) != size:
-            raise _damaged(name, f"it holds {len(tensor.raw_data)} bytes where its shape needs {size}")
-        array = np.frombuffer(tensor.raw_data, np.dtype(dtype).newbyteorder("<")).astype(dtype)
+        data = raw_of(tensor, detached)
+        if data.size != size:
+            raise _damaged(name, f"it holds {data.size} bytes where its shape needs {size}")
+        array = data.view(np.dtype(dtype).newbyteorder("<")).astype(dtype, copy=False)
     else:
         values = getattr(tensor, field)
         if len(values) != count:
@@ -117,6 +129,13 @@ def array_of(tensor: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
             return array.astype(FLOAT32)
     return array
+
+
+def raw_of(tensor: Any, detached: Detached | None = None) -> np.ndarray:
+    """A TensorProto's raw bytes."""
+    content = tensor.raw_data
+    held = None if detached is None else detached.array(content)
+    return np.frombuffer(content, np.uint8) if held is None else held
 
 
 def dtype_name(kind: int) -> str | None:
@@ -185,8 +204,9 @@ def _dense(sparse: Iterable[Any]) -> Iterator[Any]:
         yield from (tensor.values, tensor.indices)
 
 
-def load_external(graph: Any, folder: Path) -> list[Path]:
-    """Bring data that lies in files beside the model into the tensors of a graph; returns the files.
+def load_external(graph: Any, folder: Path, detached: Detached | None = None) -> list[Path]:
+    """Bring data that lies in files beside the model into the tensors of a graph (large ones are ``detached``); returns
+    the files.
 
     Raises DamagedFileError where a file is missing, too short, too large, or outside of ``folder``.
     """
@@ -194,7 +214,7 @@ def load_external(graph: Any, folder: Path) -> list[Path]:
     total = 0
     for tensor in tensors(graph):
         if tensor.data_location == _EXTERNAL:
-            total += _bring(tensor, folder, files)
+            total += _bring(tensor, folder, files, detached)
             if total > MAX_BYTES:
                 raise _damaged(tensor.name, "the model's weights together are larger than 2 GiB")
             if total > _MAX_TIMES * sum(map(len, files.values())):
@@ -202,7 +222,7 @@ def load_external(graph: Any, folder: Path) -> list[Path]:
     return sorted(files)
 
 
-def _bring(tensor: Any, folder: Path, files: dict[Path, bytes]) -> int:
+def _bring(tensor: Any, folder: Path, files: dict[Path, bytes], detached: Detached | None) -> int:
     entries = {e.key: e.value for e in tensor.external_data}
     path = _inside(folder, entries.get("location", ""), tensor.name)
     if path not in files:
@@ -215,7 +235,10 @@ def _bring(tensor: Any, folder: Path, files: dict[Path, bytes]) -> int:
         raise _damaged(tensor.name, f"it says to lie at {entries}") from error
     if offset < 0 or length < 0 or offset + length > len(data):
         raise _damaged(tensor.name, f"{path.name} has {len(data)} bytes, it wants {length} from {offset} on")
-    tensor.raw_data = data[offset : offset + length]
+    if detached is None or length < LARGE:
+        tensor.raw_data = data[offset : offset + length]
+    else:
+        tensor.raw_data = detached.mark(np.frombuffer(data, np.uint8, length, offset))
     del tensor.external_data[:]
     tensor.data_location = 0
     return length

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.detached import Detached
 from converters.fetch import Fetched
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import BATCH, Dim, TensorType
@@ -69,8 +70,9 @@ class OnnxModel:
 
 def read_onnx(given: Fetched) -> OnnxModel:
     """Read a model. Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError."""
-    model, files = parse(given)
-    halves = widen(model)
+    detached = Detached()
+    model, files = parse(given, detached)
+    halves = widen(model, detached)
     opsets = opsets_of(model)
     graph = model.graph
     constants = {t.name for t in graph.initializer}
@@ -78,7 +80,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
     memories, axes = _memories(graph, declared)
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
     ends = {m.output: m.axis for m in memories}
-    reading = read_rows(partial(_imported, graph, opsets, declared, axes), declared, graph.output, axes, ends)
+    reading = read_rows(partial(_imported, graph, detached, opsets, declared, axes), declared, graph.output, axes, ends)
     importer, types = reading.importer, reading.types
     outputs, left_out = _outputs(importer, [v.name for v in graph.output])
     return OnnxModel(
@@ -106,6 +108,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
 
 def _imported(
     graph: Any,
+    detached: Detached,
     opsets: Mapping[str, int],
     declared: Sequence[Any],
     axes: Mapping[str, int],
@@ -119,14 +122,14 @@ def _imported(
     for value in declared:
         _input(importer, value, batch, axes.get(value.name, 0), alone=alone)
     for tensor in graph.initializer:
-        importer.initializer(tensor.name, array_of(tensor))
+        importer.initializer(tensor.name, array_of(tensor, detached))
     importer.run(graph.node)
     return importer
 
 
-def parse(given: Fetched) -> tuple[Any, list[Path]]:
+def parse(given: Fetched, detached: Detached | None = None) -> tuple[Any, list[Path]]:
     """(ModelProto without functions and with all its data, the files of that data). Raises DamagedFileError."""
-    model = decoded(given.data)
+    model = decoded(given.data, detached)
     if not model.graph.node and not model.graph.output:
         raise NotAPolicyError("the model has no nodes", fix="give the model that training exported")
     if model.graph.sparse_initializer:
@@ -134,7 +137,7 @@ def parse(given: Fetched) -> tuple[Any, list[Path]]:
             "the model has sparse weights", issues=[(model.graph.sparse_initializer[0].values.name, "Constant")]
         )
     model = inlined(model)
-    return model, load_external(model.graph, given.path.parent)
+    return model, load_external(model.graph, given.path.parent, detached)
 
 
 def _check_names(names: Sequence[str]) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.onnx.proto import decoded, load_external
 from signatures.errors import UnsupportedOpError
@@ -27,17 +28,18 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     Raises UnsupportedOpError where an op is of another domain, DamagedFileError where weights lie elsewhere.
     """
     copy = folder / path.name
-    copy.write_bytes(contained(path).SerializeToString())
+    detached = Detached()
+    detached.whole(contained(path, detached).SerializeToString()).write(copy)
     return copy
 
 
-def contained(path: Path) -> Any:
-    """The ModelProto with the data of all its files. Raises what ``vetted`` raises."""
-    model = decoded(read_bytes(path))
+def contained(path: Path, detached: Detached | None = None) -> Any:
+    """The ModelProto with the data of all its files, or ``detached`` with it. Raises what ``vetted`` raises."""
+    model = decoded(read_bytes(path), detached)
     model.ClearField("training_info")
     own = {(f.domain, f.name) for f in model.functions}
     for part in (model.graph, *model.functions):
-        load_external(part, path.parent)
+        load_external(part, path.parent, detached)
         for node in _nodes(part):
             known = node.domain in _DOMAINS and node.op_type not in _LOADING
             if not known and (node.domain, node.op_type) not in own:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.detached import LARGE, Detached
 from converters.format import WriteOptions
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.table import op_of, unsupported
@@ -20,6 +21,7 @@ from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
+from converters.pieces import Pieces, equal
 from converters.policy import Policy
 from signatures.errors import GraphError, UsageError
 from signatures.spec import TensorSpec
@@ -73,7 +75,8 @@ class _Builder:
         self.initializers: list[Any] = []
         self.turned: dict[str, View] = {}
         self._values: dict[str, str] = {}
-        self._constants: dict[tuple[Any, ...], str] = {}
+        self._constants: dict[tuple[Any, ...], list[tuple[np.ndarray, str]]] = {}
+        self.detached = Detached()
         self._taken: set[str] = set()
         self._prefix = ""
 
@@ -134,14 +137,24 @@ class _Builder:
         return str(self.emit("Transpose", [moved], perm=list(turned[0][1])))
 
     def const(self, array: np.ndarray, hint: str = "const") -> str:
-        key = (array.dtype.str, array.shape, array.tobytes())
-        if key not in self._constants:
-            name = self.fresh("/".join(part for part in (self._prefix, hint) if part))
-            self._constants[key] = name
-            if array.size == 1 and array.ndim < 2:
-                self._scalars.add(name)
-            self.initializers.append(self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
-        return self._constants[key]
+        # Of a large one the first numbers tell it from nearly all others.
+        beginning = array if array.nbytes < LARGE else array[(0,) * (array.ndim - 1)][:16]
+        alike = self._constants.setdefault((array.dtype.str, array.shape, beginning.tobytes()), [])
+        for known, name in alike:
+            if array.nbytes < LARGE or equal(known, array):
+                return name
+        name = self.fresh("/".join(part for part in (self._prefix, hint) if part))
+        alike.append((array, name))
+        if array.size == 1 and array.ndim < 2:
+            self._scalars.add(name)
+        self.initializers.append(self._tensor(array, name))
+        return name
+
+    def _tensor(self, array: np.ndarray, name: str) -> Any:
+        if array.nbytes < LARGE:
+            return self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name)
+        kind = self.onnx.helper.np_dtype_to_tensor_dtype(array.dtype)
+        return self.onnx.TensorProto(dims=array.shape, data_type=kind, name=name, raw_data=self.detached.mark(array))
 
     def begin(self, prefix: str) -> None:
         """Let the names of what is made from here on begin with ``prefix``."""
@@ -241,7 +254,7 @@ def _constant_info(onnx: Any, name: str, value: np.ndarray) -> Any:
     return onnx.helper.make_tensor_value_info(name, kind, list(value.shape))
 
 
-def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
+def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The ONNX artefact. Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering,
     GraphError when the checker refuses the result (a fault of this tool).
     """
@@ -289,14 +302,22 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
     present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
     tensors = builder.tensors(policy.graph, present).dumps()
     onnx.helper.set_model_props(model, {CONTRACT_KEY: options.contract, **({TENSORS_KEY: tensors} if tensors else {})})
-    data: bytes = model.SerializeToString(deterministic=True)
-    _check(onnx, data, policy.name)
-    return {f"{policy.name}.onnx": data}
+    _check(onnx, model, builder.detached, policy.name)
+    return {f"{policy.name}.onnx": builder.detached.whole(model.SerializeToString(deterministic=True))}
 
 
-def _check(onnx: Any, data: bytes, name: str) -> None:
+def _check(onnx: Any, model: Any, detached: Detached, name: str) -> None:
+    """Raise GraphError where the checker refuses a model; weights that are detached are inputs for it."""
+    plain = onnx.ModelProto()
+    plain.CopyFrom(model)
+    del plain.graph.initializer[:]
+    for tensor in model.graph.initializer:
+        if detached.array(tensor.raw_data) is None:
+            plain.graph.initializer.append(tensor)
+        else:
+            plain.graph.input.append(onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, tensor.dims))
     try:
-        onnx.checker.check_model(data, full_check=True)
+        onnx.checker.check_model(plain.SerializeToString(), full_check=True)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
         raise GraphError(
             f"the ONNX model made of {name!r} is not valid",

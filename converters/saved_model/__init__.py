@@ -11,6 +11,7 @@ from converters.format import Format, Ports, WriteOptions
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
 
@@ -19,7 +20,7 @@ def _sniff(file: Content) -> bool:
     """It begins with its version (1), which is 1, and graphs (2); an ONNX model has fields 7 and 8 beside them."""
     if [field[:2] for field in file.fields[:2]] != [(1, 0), (2, 2)] or file.numbers & {(7, 2), (8, 2)}:
         return False
-    return file.fields[0][2] == b"\x01"
+    return bytes(file.fields[0][2]) == b"\x01"
 
 
 def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -28,7 +29,7 @@ def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return read(given)
 
 
-def _write(policy: Policy, options: WriteOptions) -> Mapping[str, bytes]:
+def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     from converters.saved_model.writer import write
 
     return write(policy, options)

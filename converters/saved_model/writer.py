@@ -13,9 +13,11 @@ import numpy as np
 
 from converters import schema
 from converters.bundle.embed import with_contract
+from converters.detached import Detached
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.graph.ops.samplers import SAMPLERS
+from converters.pieces import Pieces
 from converters.policy import Policy
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -52,15 +54,16 @@ def _fill(entries: Any, specs: Iterable[TensorSpec]) -> None:
             info.tensor_shape.dim.add(size=-1 if size is None else size)
 
 
-def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
+def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The SavedModel artefact."""
+    detached = Detached()
     message = schema.SavedModel(saved_model_schema_version=1)
     meta = message.meta_graphs.add()
     meta.meta_info_def.tags.append("serve")
-    meta.graph_def.CopyFrom(encode(with_contract(policy.graph, options.contract)))
+    meta.graph_def.CopyFrom(encode(with_contract(policy.graph, options.contract), detached=detached))
     for key, (inputs, outputs) in signatures_of(policy).items():
         definition = meta.signature_def[key]
         definition.method_name = METHOD
         _fill(definition.inputs, inputs)
         _fill(definition.outputs, outputs)
-    return {PATH: schema.serialise(message)}
+    return {PATH: schema.pieces(message, detached)}

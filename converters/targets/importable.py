@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from converters.pieces import Pieces
 from converters.targets.profile import Profile
 from converters.targets.unity.constructs import constructs
 from converters.targets.unity.readings import MEASURED, misreadings
@@ -15,14 +16,14 @@ def _other_format(profile: Profile) -> str:
     return "".join(f"write a .{key} for the same one (--to {key}), or " for key in profile.undressed)
 
 
-def importable(profile: Profile, files: Mapping[str, bytes], name: str) -> None:
+def importable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None:
     """Raise ProfileError where an importer misreads or refuses a construct, or none is known to read it."""
     import onnx
 
     for path, data in files.items():
         if not path.endswith(".onnx"):
             continue
-        model = constructs(onnx.ModelProto.FromString(data))
+        model = constructs(onnx.ModelProto.FromString(data.joined()))
         found = list(misreadings(model, profile.importers))
         unknown = [c for c in model if c.op not in MEASURED]
         if found:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NoReturn
 
+from converters.pieces import Pieces
 from converters.policy import Policy
 from signatures.errors import ProfileError
 
@@ -31,7 +32,7 @@ class Profile:
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()
-    check: Callable[[Profile, Mapping[str, bytes], str], None] | None = None
+    check: Callable[[Profile, Mapping[str, Pieces], str], None] | None = None
 
 
 def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.detached import Detached
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.graph.editor import Editor
@@ -29,6 +30,7 @@ from converters.graph.ops.table import op_of
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
+from converters.pieces import Pieces
 from converters.policy import Policy
 from signatures.errors import UnsupportedOpError
 from signatures.spec import TensorSpec
@@ -59,8 +61,7 @@ def _narrowed(node: Node) -> np.ndarray:
             why="TensorFlow.js has no int64",
             fix="write the other formats: --to bytes,saved_model,onnx",
         )
-    # not ascontiguousarray, which makes a vector of a scalar
-    return np.asarray(value.astype(target, copy=False), order="C")
+    return value.astype(target, copy=False)
 
 
 def for_tfjs(graph: Graph) -> Graph:
@@ -112,7 +113,7 @@ def _shape(proto: Any) -> dict[str, Any]:
 
 def _topology(graph: Graph) -> dict[str, Any]:
     nodes = []
-    for proto in encode(graph, explicit=True).node:
+    for proto in encode(graph, explicit=True, detached=Detached()).node:
         entry: dict[str, Any] = {"name": proto.name, "op": proto.op}
         if proto.input:
             entry["input"] = list(proto.input)
@@ -141,27 +142,29 @@ def _tensor_info(spec: TensorSpec) -> dict[str, Any]:
     }
 
 
-def _weights(graph: Graph) -> tuple[list[dict[str, Any]], bytes]:
-    entries, blob = [], bytearray()
+def _weights(graph: Graph) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
+    entries, values = [], []
     for node in graph.nodes:
         if node.op != "Const":
             continue
         value = _narrowed(node)
         entries.append({"name": node.name, "shape": list(value.shape), "dtype": value.dtype.name})
-        blob += value.astype(value.dtype.newbyteorder("<"), copy=False).tobytes()
-    return entries, bytes(blob)
+        values.append(value)
+    return entries, values
 
 
-def _shards(blob: bytes) -> Mapping[str, bytes]:
-    count = max(-(-len(blob) // SHARD_BYTES), 1)
-    return {f"group1-shard{i + 1}of{count}.bin": blob[i * SHARD_BYTES : (i + 1) * SHARD_BYTES] for i in range(count)}
+def _shards(weights: Pieces) -> Mapping[str, Pieces]:
+    count = max(-(-weights.size // SHARD_BYTES), 1)
+    return {
+        f"group1-shard{i + 1}of{count}.bin": weights.part(i * SHARD_BYTES, (i + 1) * SHARD_BYTES) for i in range(count)
+    }
 
 
-def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
+def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
     graph = fuse(for_tfjs(policy.graph), policy.fetches.values(), activations=True)
-    entries, blob = _weights(graph)
-    shards = _shards(blob)
+    entries, values = _weights(graph)
+    shards = _shards(Pieces(*values))
     contract = json.loads(options.contract)
     model = {
         "format": "graph-model",
@@ -179,6 +182,6 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, bytes]:
         },
     }
     text = json.dumps(model, separators=(",", ":"), ensure_ascii=True).encode()
-    acting = {name: (_JS / name).read_bytes() for name in _ACTING}
-    files = {"model.json": text, **shards, **acting}
+    acting = {name: Pieces((_JS / name).read_bytes()) for name in _ACTING}
+    files = {"model.json": Pieces(text), **shards, **acting}
     return {f"tfjs/{name}": data for name, data in files.items()}

@@ -137,7 +137,7 @@ def compare_artefacts(
         check_rules(options.rules, outputs, {m.format.key: m.format.runtimes for m in matched}, used)
     with scratch_folder() as folder, _opened(pool) as pool:
         reference_file = Path(folder, "reference.bytes")
-        reference_file.write_bytes(frozen(policy))
+        frozen(policy).write(reference_file)
         copies = [_vetted(m, Path(folder, str(number))) for number, m in enumerate(matched)]
         tested = PolicyUnderTest(
             policy.name,

@@ -104,7 +104,7 @@ def verify_folder(
         copies = _vetted(artefacts, names, list(keys), scratch)
         if again is not None:
             reference = scratch / "reference.bytes"
-            reference.write_bytes(frozen(again.policy))
+            frozen(again.policy).write(reference)
         tested = PolicyUnderTest(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
             made_for, artefacts,

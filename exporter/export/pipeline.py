@@ -352,7 +352,7 @@ def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path)
     if reference is None:
         # The numpy reference reads a .bytes; one is made for it where none was asked for.
         reference = scratch / "reference.bytes"
-        reference.write_bytes(frozen(policy))
+        frozen(policy).write(reference)
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     return PolicyUnderTest(
         policy.name,
@@ -373,10 +373,7 @@ def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderT
     """A policy written to a folder that is thrown away."""
     artifacts = [f.artifact(job.policy, WriteOptions("{}")) for f in formats]
     for artifact in artifacts:
-        for relative, data in artifact.files.items():
-            target = folder / relative
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(data)
+        artifact.write(folder)
     return _tested(job, folder, artifacts, folder)
 
 

@@ -44,7 +44,7 @@ def agent_of(policy: Policy) -> Brain:
 def assert_accepted(policy: Policy, folder: Path) -> None:
     (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
     file = folder / "policy.nn"
-    file.write_bytes(data)
+    data.write(file)
     verdict = check_file(file, CONSUMERS["R20"], agent_of(policy))
     assert verdict.refused is None
     mode = verdict.modes["stochastic"]

@@ -43,7 +43,7 @@ def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str
         signature = policy.signature
         contract = WriteOptions(json.dumps(signature.to_dict()))
         (data,) = WRITTEN["nn"].artifact(policy, contract).files.values()
-        nn = NnPolicy(data)
+        nn = NnPolicy(data.joined())
         assert nn.signature.to_dict() == signature.to_dict()
         names = answered(signature)
         assert names == [s.name for s in signature.outputs if s.role is not Role.SAMPLED]
@@ -59,7 +59,7 @@ def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str
 def test_a_file_without_a_contract_says_so() -> None:
     policy = policies(FIXTURES[0])[0]
     (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
-    model = parse(data)
+    model = parse(data.joined())
     for other in (model, replace(model, trailer=None)):
         with pytest.raises(DamagedFileError, match="no contract"):
             contract_of(other)

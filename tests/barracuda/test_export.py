@@ -60,9 +60,7 @@ def test_every_layer_computes_the_same_in_every_runtime(cases: list[Case], tmp_p
         ):
             artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
             folder = tmp_path / case.name / runtime
-            for name, data in artifact.files.items():
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(data)
+            artifact.write(folder)
             model = pool.process(runtime).load(str(folder / artifact.main), kind="graph")
             got: Any = model.run(feeds, ["action"])["action"]
             model.unload()

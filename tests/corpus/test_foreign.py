@@ -120,9 +120,7 @@ def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path:
         if not WRITTEN[target].default:
             continue
         artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
-        for name, data in artifact.files.items():
-            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / name).write_bytes(data)
+        artifact.write(tmp_path)
         for runtime in (r for r in WRITTEN[target].runtimes if r in ("numpy", *NEEDED)):
             kind = {"kind": "saved_model"} if target == "saved_model" else {"kind": "graph"}
             models[f"{target} in {runtime}"] = pool.process(runtime).load(str(tmp_path / artifact.main), **kind)

@@ -82,10 +82,7 @@ def answers(policy: Policy, folder: Path, pool: RuntimePool, source: Path) -> di
     result: dict[str, tuple[Answer, bool]] = {}
     for target in DEFAULTS:
         artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
-        for name, data in artifact.files.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+        artifact.write(folder)
         for runtime in (r for r in WRITTEN[target].runtimes if r in ("numpy", *NEEDED, "js")):
             kind = {"kind": "saved_model"} if target == "saved_model" else {"kind": "graph"}
             model = pool.process(runtime).load(str(folder / artifact.main), **kind)

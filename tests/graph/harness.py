@@ -90,10 +90,7 @@ class Runtimes:
     def _load(self, runtime: str, policy: Policy, target: str, opset: int = 15) -> LoadedModel:
         artifact = WRITTEN[target].artifact(policy, WriteOptions('{"tool": {"version": "test"}}', opset))
         root = self._folder / str(next(self._numbers))
-        for name, data in artifact.files.items():
-            path = root / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+        artifact.write(root)
         return self._pool.process(runtime).load(str(root / artifact.main), kind=target)
 
 

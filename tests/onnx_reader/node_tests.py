@@ -194,7 +194,7 @@ def _fault(test: NodeTest, fed: Sequence[int], policy: Policy, folder: Path, poo
     if pool is not None:
         artifact = WRITTEN["onnx"].artifact(policy, WriteOptions("{}"))
         path = folder / "written.onnx"
-        path.write_bytes(artifact.files[artifact.main])
+        artifact.files[artifact.main].write(path)
         loaded = pool.process("onnxruntime").load(str(path))
         results["onnxruntime"] = loaded.run(feeds, ["action"])["action"]
         loaded.unload()

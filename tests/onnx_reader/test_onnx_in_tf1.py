@@ -39,7 +39,7 @@ def legacy(request: pytest.FixtureRequest, processes: RuntimePool) -> RuntimePro
 def test_runs_there_and_agrees(source: Path, legacy: RuntimeProcess, tmp_path: Path) -> None:
     (policy,) = read_source(source).policies()
     path = tmp_path / "policy.bytes"
-    path.write_bytes(frozen(policy))
+    frozen(policy).write(path)
     model = legacy.load(str(path))
     outputs = [s for s in policy.signature.outputs if s.role is not Role.SAMPLED]
     for case in draw_cases(policy.signature):

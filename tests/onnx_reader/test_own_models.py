@@ -36,7 +36,7 @@ def written(policy: Policy, folder: Path, opset: int = 15) -> Path:
         policy, WriteOptions(Contract(policy.name, policy.signature, ORIGIN, policy.source, TOOL).compact(), opset)
     ).values()
     place = folder / f"{policy.name}-{opset}.onnx"
-    place.write_bytes(data)
+    data.write(place)
     return place
 
 

@@ -86,9 +86,7 @@ def test_the_contract_of_every_public_and_genuine_graph_is_kept(target: str, tmp
                 {"name": "n", "version": "0"},
             ).compact()
             artifact = WRITTEN[target].artifact(policy, WriteOptions(text))
-            for relative, data in artifact.files.items():
-                (folder / relative).parent.mkdir(parents=True, exist_ok=True)
-                (folder / relative).write_bytes(data)
+            artifact.write(folder)
             (again,) = read_source(folder / artifact.main).policies()
             assert_same(again, policy)
             read += 1

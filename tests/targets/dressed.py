@@ -59,13 +59,13 @@ class Pair:
         artifact = written(form).artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
         if profile.check is not None:
             profile.check(profile, artifact.files, policy.name)
-        data = artifact.files[artifact.main]
+        data = artifact.files[artifact.main].joined()
         plain = written("onnx").artifact(policy, WriteOptions(CONTRACT))
         return cls(
             policy,
             profile,
             dressed,
-            onnx.ModelProto.FromString(plain.files[plain.main]),
+            onnx.ModelProto.FromString(plain.files[plain.main].joined()),
             onnx.ModelProto.FromString(data if form == "onnx" else b""),
             data,
         )

@@ -85,7 +85,7 @@ def test_no_lowering_of_an_op_is_misread(sample: Sample) -> None:
         files = write(policy_of(sample.graph, sample.fetches), WriteOptions('{"tool": {"version": "test"}}'))
     except UnsupportedOpError as error:
         pytest.skip(f"not written as ONNX: {error}")
-    model = constructs(onnx.ModelProto.FromString(next(iter(files.values()))))
+    model = constructs(onnx.ModelProto.FromString(next(iter(files.values())).joined()))
     assert [line for line in wrong_readings(model) if NO_POLICY not in line] == []
 
 

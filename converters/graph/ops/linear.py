@@ -65,7 +65,7 @@ def _lower_matmul(node: Node, builder: OnnxBuilder) -> Any:
             constant = builder.type_of(node.inputs[position]).constant
             rank = builder.type_of(node.inputs[position]).rank or 2
             if constant is not None:
-                value = builder.const(np.ascontiguousarray(np.swapaxes(constant, -1, -2)), "weights")
+                value = builder.const(np.swapaxes(constant, -1, -2), "weights")
             else:
                 value = builder.emit("Transpose", [value], perm=[*range(rank - 2), rank - 1, rank - 2])
         values.append(value)

@@ -1,0 +1,155 @@
+"""Large contents kept out of protobuf messages, in which a mark stands for each.
+
+protobuf copies what it parses, what is taken out of a message, what one message is given of another, and all of it
+again to serialise it: a graph of 200 MB was some gigabytes. With its weights detached it has some kilobytes. A reader
+parses the file without them (``without``) and takes them as views of the file's bytes (``array``), a writer puts the
+arrays' marks into its message (``mark``) and their bytes between the serialised parts (``whole``).
+
+A mark begins with bytes that were drawn when this process started, so no file can hold one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from converters.pieces import Pieces
+
+#: Field number → the fields of the message that it holds, or None where it is what is detached.
+Fields: TypeAlias = Mapping[int, "Fields | None"]
+#: Contents of fewer bytes stay where they are.
+LARGE = 1 << 12
+#: Files of fewer bytes are parsed as they are.
+LARGE_FILE = 1 << 20
+_SECRET = os.urandom(16)
+_MARK = re.compile(re.escape(_SECRET) + b".{8}", re.DOTALL)
+_MARK_BYTES = len(_SECRET) + 8
+_VARINT, _LONG, _BYTES, _SHORT = 0, 1, 2, 5
+
+
+class Detached:
+    """Arrays by their marks."""
+
+    def __init__(self) -> None:
+        self._arrays: list[np.ndarray] = []
+
+    def mark(self, array: np.ndarray) -> bytes:
+        """What stands for the bytes of an array in a message."""
+        self._arrays.append(array)
+        return _SECRET + (len(self._arrays) - 1).to_bytes(8, "little")
+
+    def array(self, content: bytes) -> np.ndarray | None:
+        """What a field's content is the mark of; None where it is no mark."""
+        if len(content) != _MARK_BYTES or not content.startswith(_SECRET):
+            return None
+        return self._arrays[int.from_bytes(content[len(_SECRET) :], "little")]
+
+    def without(self, data: bytes, fields: Fields) -> bytes:
+        """A serialised message with marks for the large contents of ``fields``. What is no message stays as it is."""
+        parts = self._without(memoryview(data), fields)
+        return data if parts is None else b"".join(parts)
+
+    def _without(self, view: memoryview, fields: Fields) -> list[bytes | memoryview] | None:
+        parts: list[bytes | memoryview] = []
+        kept = 0
+        try:
+            for number, tag_end, start, end in _large(view):
+                if number not in fields:
+                    continue
+                inner = fields[number]
+                content: Sequence[bytes | memoryview] | None
+                if inner is None:
+                    content = [self.mark(np.frombuffer(view[start:end], np.uint8))]
+                else:
+                    content = self._without(view[start:end], inner)
+                if content is None:
+                    continue
+                parts += [view[kept:tag_end], _varint(sum(map(len, content))), *content]
+                kept = end
+        except _NoMessageError:
+            return None
+        return [*parts, view[kept:]]
+
+    def whole(self, data: bytes) -> Pieces:
+        """The serialised message ``data`` with the arrays in place of their marks."""
+        places = [m.start() for m in _MARK.finditer(data)] if self._arrays else []
+        return Pieces(*self._whole(memoryview(data), places, 0)) if places else Pieces(data)
+
+    def _whole(self, view: memoryview, places: Sequence[int], offset: int) -> list[bytes | np.ndarray]:
+        """``places`` are where the marks in ``view`` lie, which begins at ``offset`` of the whole."""
+        if len(view) == _MARK_BYTES and list(places) == [offset]:
+            array = self.array(bytes(view))
+            assert array is not None
+            return [array]
+        parts: list[bytes | np.ndarray] = []
+        kept = next_place = 0
+        for _, tag_end, start, end in _delimited(view, _MARK_BYTES):
+            first = next_place
+            while next_place < len(places) and places[next_place] < offset + end:
+                next_place += 1
+            if first == next_place:
+                continue
+            content = self._whole(view[start:end], places[first:next_place], offset + start)
+            size = sum(len(p) if isinstance(p, bytes) else p.nbytes for p in content)
+            parts += [bytes(view[kept:tag_end]) + _varint(size), *content]
+            kept = end
+        return [*parts, bytes(view[kept:])]
+
+
+# ------------------------------------------------------------------ protobuf's wire format
+
+
+class _NoMessageError(Exception):
+    pass
+
+
+def _large(view: memoryview) -> Iterator[tuple[int, int, int, int]]:
+    return _delimited(view, LARGE)
+
+
+def _delimited(view: memoryview, least: int) -> Iterator[tuple[int, int, int, int]]:
+    """(number, end of the tag, start, end) of each field of bytes that has at least so many."""
+    at, size = 0, len(view)
+    while at < size:
+        tag, tag_end = _read_varint(view, at)
+        wire = tag & 7
+        if wire == _BYTES:
+            length, start = _read_varint(view, tag_end)
+            at = start + length
+            if at > size:
+                raise _NoMessageError
+            if length >= least:
+                yield tag >> 3, tag_end, start, at
+        elif wire == _VARINT:
+            _, at = _read_varint(view, tag_end)
+        elif wire in (_LONG, _SHORT):
+            at = tag_end + (8 if wire == _LONG else 4)
+        else:
+            raise _NoMessageError
+    if at != size:
+        raise _NoMessageError
+
+
+def _read_varint(view: memoryview, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while at < len(view) and shift < 64:
+        byte = view[at]
+        value |= (byte & 0x7F) << shift
+        at += 1
+        if byte < 0x80:
+            return value, at
+        shift += 7
+    raise _NoMessageError
+
+
+def _varint(value: int) -> bytes:
+    data = bytearray()
+    while value > 0x7F:
+        data.append(value & 0x7F | 0x80)
+        value >>= 7
+    data.append(value)
+    return bytes(data)
