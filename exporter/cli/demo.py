@@ -12,7 +12,6 @@ from exporter.cli.export import export_command
 from exporter.cli.group import PROGRAM, Command
 from exporter.cli.serve import serve_command
 from exporter.cli.terminal import say
-from signatures.errors import RuntimeUnavailableError
 
 
 @click.command(
@@ -42,14 +41,7 @@ def demo_command(out: Path, no_open: bool) -> None:
     _typed(export_command, "", str(source), "-o", str(out), "--html", str(report))
     if no_open:
         return
-    try:
-        _typed(serve_command, "serve ", str(out / BALL.stem), "--port", "0", "--open")
-    except RuntimeUnavailableError as error:
-        import webbrowser
-
-        say(f"the page needs TensorFlow.js, so this is the report: {report}")
-        say(f"next: {error.fix}    (then: {PROGRAM} serve {out / BALL.stem} --open)")
-        webbrowser.open(report.resolve().as_uri())
+    _typed(serve_command, "serve ", str(out / BALL.stem), "--port", "0", "--open")
 
 
 def _typed(command: click.Command, name: str, *words: str) -> None:

@@ -23,6 +23,7 @@ _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
     examples=(
         ("export-model serve exported/3DBall --open", "in your browser"),
         ("export-model serve 3DBall.onnx", "a source: exported for the page"),
+        ("export-model serve exported/3DBall -o page.html", "one file, opened from the disk or sent to somebody"),
         ("export-model serve exported/3DBall -o site", "files for any web server"),
     ),
 )
@@ -33,7 +34,7 @@ _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @click.option(
-    "-o", "--out", type=click.Path(path_type=Path), metavar="DIR", help="Write the page for static hosting, and end."
+    "-o", "--out", type=click.Path(path_type=Path), metavar="PAGE", help="Write the page and end; NAME.html: one file."
 )
 @click.option(
     "--scene",
@@ -44,10 +45,17 @@ _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
 )
 def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | None, scene: str) -> None:
     """A page where the policy acts in your browser: its environment if it is a known one, else a panel of sliders."""
-    from exporter.serve.site import assemble, write_site
+    from exporter.serve.site import assemble, assemble_one_file, write_file, write_site
 
     if out is not None and opens:
-        raise UsageError("--out and --open contradict each other", fix="host the folder, and open its address")
+        raise UsageError("--out and --open contradict each other", fix="open what is written, or leave --out out")
+    if out is not None and out.suffix.casefold() in (".html", ".htm"):
+        with _bundle_of(bundle) as folder:
+            page = assemble_one_file(folder, scene)
+        write_file(page, out)
+        say(f"wrote {out}: one file, {len(page) / 1e3:.0f} kB, which needs no server and no network")
+        say(f"next: open {out} in a browser, or send it to somebody")
+        return
     with _bundle_of(bundle) as folder:
         site = assemble(folder, scene)
     if out is not None:

@@ -14,6 +14,7 @@ from converters.bundle.embed import runnable
 from converters.bundle.exchange import exchange, stage
 from converters.formats import WRITTEN
 from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
+from converters.runtimes.js import KERNELS
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, TYPES
@@ -23,20 +24,29 @@ from signatures.errors import BundleError, RuntimeUnavailableError, naming
 
 PAGE = Path(__file__).resolve().parent / "page"
 POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
+#: All drawings; a page of one file has one.
+_VIEWS = "views/index.mjs"
 #: The file by which a folder is known as ours.
 SITE = "site.json"
 MADE_BY = "export-model serve"
+#: ... and a page of one file.
+MARK = f'<meta name="generator" content="{MADE_BY}">'.encode()
 
 _TFJS = "@tensorflow/tfjs"
 
 
+_ORT = "onnxruntime-web"
+
+
 @dataclass(frozen=True)
 class _Backend:
-    """A backend of TensorFlow.js; ``files`` of a ``package`` besides tf.es2017.min.js, the first one a script."""
+    """What runs a policy besides the page's own kernels: ``files`` of a ``package``, the first one its script."""
 
     name: str
     package: str
     files: tuple[str, ...] = ()
+    #: It weighs megabytes: loaded when a visitor chooses it.
+    large: bool = False
 
 
 _BACKENDS = (
@@ -53,47 +63,80 @@ _BACKENDS = (
     ),
     _Backend("webgl", _TFJS),
     _Backend("webgpu", "@tensorflow/tfjs-backend-webgpu", ("tf-backend-webgpu.es2017.min.js",)),
+    _Backend(
+        _ORT,
+        _ORT,
+        ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm"),
+        large=True,
+    ),
 )
-_REQUIRED = (_TFJS, "@tensorflow/tfjs-backend-wasm")
+_JS = {"name": "js", "script": None}
+"""The kernels that are part of the page."""
 
 
 def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     """The site of a bundle, by path; the same bytes for the same bundle.
 
-    Raises BundleError (its files are not those of policy.json, it holds no TensorFlow.js or no .bytes), UsageError (the
-    scene does not fit), RuntimeUnavailableError (the npm packages are not installed).
+    Without the npm packages the page runs on its own kernels alone, and says so. Raises BundleError (its files are not
+    those of policy.json, it holds no TensorFlow.js or no .bytes), UsageError (the scene does not fit).
     """
+    site, said = _content(folder, scene)
+    vendor, backends, absent = _vendor("onnx" in said["models"]["model"])
+    site.update(vendor)
+    site[SITE] = dumps({**said, "backends": [_JS, *backends], "absent": absent})
+    return site
+
+
+def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
+    """The page as one HTML file, which needs no server and no network, on its own kernels. Raises as ``assemble``."""
+    from exporter.serve.onefile import one_file
+
+    site, said = _content(folder, scene)
+    for place in said["models"].values():
+        site.pop(place.pop("onnx", ""), None)
+    if said["scene"] is not None:
+        site[_VIEWS] = (
+            f'import {{ viewOf as own }} from "./{said["scene"]}.mjs";\nexport const viewOf = own;\n'.encode()
+        )
+    absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
+    site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
+    return one_file(site)
+
+
+def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """(all files but those of npm packages and site.json, what site.json says of the policy)."""
     policy = _checked(folder)
     found = scene_of(policy.name, policy.signature, scene)
     opponent = None if found is None or found.side is None else _opponent(policy, found)
     site = {path.relative_to(PAGE).as_posix(): path.read_bytes() for path in sorted(PAGE.rglob("*")) if _ours(path)}
     site["policy.mjs"] = POLICY_MODULE.read_bytes()
-    vendor, backends, absent = _vendor()
-    site.update(vendor)
+    site.update({f"kernels/{path.name}": path.read_bytes() for path in sorted(KERNELS.glob("*.mjs"))})
     site.update(_model(policy, "model"))
+    size = sum(len(v) for k, v in site.items() if k.startswith("model/"))
+    models: dict[str, dict[str, str]] = {"model": {"folder": "model/"}}
+    if policy.has(WRITTEN["onnx"]):
+        models["model"]["onnx"] = "model/policy.bin"
+        site["model/policy.bin"] = policy.path(WRITTEN["onnx"]).read_bytes()
     if opponent is not None:
         site.update(_model(opponent, "opponent"))
+        models["opponent"] = {"folder": "opponent/"}
     with naming(policy.graph_file):
         graph = runnable(policy.graph())
         policy.check_graph(graph)
         said, data = golden(policy.signature, graph)
     site["golden.json"], site["golden.bin"] = f"{json.dumps(said, separators=(',', ':'))}\n".encode(), data
     site["policy.json"] = dumps(policy.content)
-    site[SITE] = dumps(
-        {
-            "made_by": MADE_BY,
-            "version": __version__,
-            "name": policy.name,
-            "scene": None if found is None else found.id,
-            "side": None if found is None else found.side,
-            "opponent": None if opponent is None else opponent.name,
-            "tfjs": package_version(js_home(), _TFJS),
-            "backends": backends,
-            "absent": absent,
-            "model_bytes": sum(len(v) for k, v in site.items() if k.startswith("model/")),
-        }
-    )
-    return site
+    return site, {
+        "made_by": MADE_BY,
+        "version": __version__,
+        "name": policy.name,
+        "scene": None if found is None else found.id,
+        "side": None if found is None else found.side,
+        "opponent": None if opponent is None else opponent.name,
+        "tfjs": package_version(js_home(), _TFJS),
+        "models": models,
+        "model_bytes": size,
+    }
 
 
 def write_site(site: Mapping[str, bytes], place: Path) -> None:
@@ -112,6 +155,22 @@ def write_site(site: Mapping[str, bytes], place: Path) -> None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(data)
             exchange(new, place)
+
+
+def write_file(page: bytes, place: Path) -> None:
+    """Write a page of one file, in place of an older one. Raises BundleError where something else is in the way."""
+    with writing(place):
+        if place.is_symlink() or (place.exists() and not (place.is_file() and MARK in place.read_bytes()[:2000])):
+            raise BundleError(
+                "is in the way and is not a page of ours",
+                where=str(place),
+                why=f"it does not say that {MADE_BY} wrote it",
+                fix="move it, or choose another name with --out",
+            )
+        place.parent.mkdir(parents=True, exist_ok=True)
+        beside = place.with_name(f".{place.name}.new")
+        beside.write_bytes(page)
+        beside.replace(place)
 
 
 def _replaceable(place: Path) -> bool:
@@ -166,21 +225,25 @@ def _opponent(first: Bundle, scene: Scene) -> Bundle | None:
     return None
 
 
-def _vendor() -> tuple[dict[str, bytes], list[dict[str, Any]], list[dict[str, str]]]:
-    """TensorFlow.js' files, its backends, and those that are not in the packages."""
+def _vendor(onnx: bool) -> tuple[dict[str, bytes], list[dict[str, Any]], list[dict[str, str]]]:
+    """Files of npm packages, the backends that they give, those that are not here; ``onnx``: whether a model is."""
     home = js_home()
-    missing = [name for name in _REQUIRED if package_version(home, name) is None]
-    if missing:
-        raise RuntimeUnavailableError(f"the npm package {missing[0]} is not installed", fix=INSTALL_TFJS)
-    check_packages(home)
-    files, backends, absent = {"vendor/tf.es2017.min.js": _dist(home, _TFJS, "tf.es2017.min.js")}, [], []
+    files: dict[str, bytes] = {}
+    backends: list[dict[str, Any]] = []
+    absent: list[dict[str, str]] = []
+    tfjs = package_version(home, _TFJS) is not None
+    if tfjs:
+        check_packages(home)
+        files["vendor/tf.es2017.min.js"] = _dist(home, _TFJS, "tf.es2017.min.js")
     for backend in _BACKENDS:
-        if package_version(home, backend.package) is None:
-            absent.append({"name": backend.name, "why": f"{backend.package} is not among the npm packages"})
+        if not tfjs or package_version(home, backend.package) is None:
+            absent.append({"name": backend.name, "why": f"its npm package is not installed ({INSTALL_TFJS})"})
+            continue
+        if backend.name == _ORT and not onnx:
             continue
         files.update({f"vendor/{file}": _dist(home, backend.package, file) for file in backend.files})
         script = f"vendor/{backend.files[0]}" if backend.files else None
-        backends.append({"name": backend.name, "script": script})
+        backends.append({"name": backend.name, "script": script, **({"large": True} if backend.large else {})})
     return files, backends, absent
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from exporter.acting.policy import load_policy
-from exporter.serve.site import assemble
+from exporter.serve.site import assemble, assemble_one_file, write_site
 from tests.serve.browsing import CHECKED, Visit, served, visit
 from tests.serve.conftest import Bundle
 
@@ -62,7 +62,7 @@ def see(bundle: Path, *steps: list[object], scene: str = "auto", **context: obje
 
 
 def test_the_policy_keeps_the_balls_up_for_20_seconds_on_each_backend(bundle: Bundle) -> None:
-    for backend in ("cpu", "wasm"):
+    for backend in ("js", "wasm"):
         seen = see(
             bundle("3DBall"),
             ["select", "#backend", backend],
@@ -78,8 +78,9 @@ def test_the_policy_keeps_the_balls_up_for_20_seconds_on_each_backend(bundle: Bu
         status, described, verdict, states = seen.results[-4:]
         assert (status["good"], status["bad"]) == ("12", "0")
         assert described.startswith("12 tilting platforms")
-        assert verdict.startswith("Yes. In your browser cpu, wasm, webgl give the reference's")
-        assert sorted(states) == [["cpu", "agrees"], ["wasm", "agrees"], ["webgl", "agrees"]]
+        names = ["js", "cpu", "wasm", "webgl"]
+        assert verdict.startswith("Yes. In your browser js, cpu, wasm, webgl give the reference's")
+        assert states == [[name, "agrees"] for name in names]
 
 
 def test_without_its_memory_the_hallway_is_a_guess(bundle: Bundle) -> None:
@@ -163,7 +164,7 @@ def test_a_wrong_answer_is_not_called_right(bundle: Bundle) -> None:
     data[at] = (np.frombuffer(bytes(data[at]), "<f4") + np.float32(0.25)).tobytes()
     with served({**site, "golden.bin": bytes(data)}) as server:
         seen = visit(server.url, [["wait", CHECKED], ["eval", VERDICT], ["eval", STATES]])
-    assert seen.results[1].startswith("No: cpu is off by 0.250 at value_estimate")
+    assert seen.results[1].startswith("No: js is off by 0.250 at value_estimate")
     assert {state for _, state in seen.results[2]} == {"differs"}
 
 
@@ -180,9 +181,40 @@ def test_a_backend_that_fails_says_why(bundle: Bundle) -> None:
                 ["eval", VERDICT],
             ],
         )
-    assert dict(seen.results[1]) == {"cpu": "agrees", "wasm": "did not run", "webgl": "agrees"}
+    assert dict(seen.results[1]) == {"js": "agrees", "cpu": "agrees", "wasm": "did not run", "webgl": "agrees"}
     assert seen.results[2]
-    assert "of 4 did not run" in seen.results[3]
+    assert "of 5 did not run" in seen.results[3]
+
+
+def test_one_file_plays_from_the_disk(bundle: Bundle, tmp_path: Path) -> None:
+    """By file://, with nothing beside it: the scene moves, the check passes, nothing is asked for or refused."""
+    page = tmp_path / "page.html"
+    page.write_bytes(assemble_one_file(bundle("3DBall")))
+    pixels = "document.querySelector('#canvas').toDataURL()"
+    seen = visit(
+        page.as_uri(),
+        [
+            ["wait", f"{STATUS}.seconds > 1"],
+            ["eval", pixels],
+            ["wait", f"{STATUS}.seconds > 2"],
+            ["eval", pixels],
+            ["wait", CHECKED],
+            ["eval", VERDICT],
+            ["eval", "document.querySelector('#loading')"],
+        ],
+    )
+    assert seen.results[1] != seen.results[3]
+    assert seen.results[-2].startswith("Yes. In your browser js")
+    assert seen.results[-1] is None
+    assert (seen.console, seen.requests) == ([], [page.as_uri()])
+
+
+def test_the_site_opened_as_a_file_says_what_to_do(bundle: Bundle, tmp_path: Path) -> None:
+    write_site(assemble(bundle("continuous")), tmp_path / "site")
+    seen = visit(
+        (tmp_path / "site" / "index.html").as_uri(), [["eval", "document.querySelector('#loading').innerText"]]
+    )
+    assert "export-model serve BUNDLE -o page.html" in seen.results[0]
 
 
 @pytest.mark.parametrize("name", ["3DBall", "recurrent", "visual"])

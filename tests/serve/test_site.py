@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import re
 import shutil
@@ -14,11 +16,12 @@ import pytest
 
 from converters.runtimes.javascript import node as javascript
 from exporter.acting.policy import load_policy
+from exporter.serve.onefile import one_file
 from exporter.serve.scenes import other_side
 from exporter.serve.server import TYPES
-from exporter.serve.site import PAGE, assemble, write_site
+from exporter.serve.site import PAGE, assemble, assemble_one_file, write_site
 from fixtures import path as fixture
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
+from signatures.errors import BundleError, UsageError
 from tests.commands import export_model, files_in, is_refused
 from tests.serve.conftest import Bundle
 
@@ -46,7 +49,7 @@ def test_every_file_that_is_named_is_there(bundle: Bundle) -> None:
     for found in re.findall(rb'(?:src|href)="([^"#]+)"', site["index.html"]):
         assert found.decode() in site
     said = json.loads(site["site.json"])
-    assert [b["name"] for b in said["backends"]] == ["cpu", "wasm", "webgl", "webgpu"]
+    assert [b["name"] for b in said["backends"]] == ["js", "cpu", "wasm", "webgl", "webgpu"]
     assert all(b["script"] is None or b["script"] in site for b in said["backends"])
     assert said["absent"] == []
     assert all(b"sourceMappingURL" not in data for name, data in site.items() if name.startswith("vendor/"))
@@ -143,15 +146,54 @@ def test_bundles_that_cannot_be_shown_are_refused(bundle: Bundle, tmp_path: Path
         assemble(changed)
 
 
-def test_without_the_npm_packages_it_says_what_to_install(
+def test_without_the_npm_packages_the_page_runs_on_its_own_kernels(
     bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = bundle("continuous")
     monkeypatch.setenv(javascript.JS_VARIABLE, str(tmp_path))
-    with pytest.raises(RuntimeUnavailableError, match="export-model runtimes install tfjs"):
-        assemble(folder)
-    is_refused(export_model("serve", folder, "--out", tmp_path / "page"), "runtimes install tfjs", status=3)
-    assert files_in(tmp_path) == set()
+    site = assemble(folder)
+    said = json.loads(site["site.json"])
+    assert [b["name"] for b in said["backends"]] == ["js"]
+    assert all("export-model runtimes install tfjs" in a["why"] for a in said["absent"])
+    assert not any(name.startswith("vendor/") for name in site)
+
+
+# ---- one file --------------------------------------------------------------------------------------------------------
+
+FILES = re.compile(rb'<script type="application/json" id="files">(.*?)</script>', re.S)
+
+
+def test_one_file_is_small_and_holds_nothing_that_runs_but_one_script(bundle: Bundle) -> None:
+    page = assemble_one_file(bundle("3DBall"))
+    assert page == assemble_one_file(bundle("3DBall"))
+    assert len(page) <= 200_000
+    (script,) = re.findall(rb"<script>(.*?)</script>", page, re.S)
+    digest = base64.b64encode(hashlib.sha256(script).digest()).decode()
+    assert f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'sha256-".encode() in page
+    assert not re.search(rb'(?:src|href)="(?!data:|#)', page)
+    files = json.loads(FILES.findall(page)[0])
+    assert files["policy.json"] == json.loads(assemble(bundle("3DBall"))["policy.json"])
+
+
+def test_what_a_bundle_says_stays_data_in_one_file(bundle: Bundle) -> None:
+    site = assemble(bundle("continuous"))
+    evil = "</script><script>alert(1)</script><!--\u2028"
+    site["policy.json"] = json.dumps({"labels": evil}).encode()
+    page = one_file(site)
+    assert page.count(b"</script>") == 2
+    assert b"<!--" not in FILES.findall(page)[0]
+    assert json.loads(FILES.findall(page)[0])["policy.json"] == {"labels": evil}
+
+
+def test_one_file_replaces_only_its_own(bundle: Bundle, tmp_path: Path) -> None:
+    place = tmp_path / "deep" / "page.html"
+    for _ in range(2):
+        ran = export_model("serve", bundle("continuous"), "-o", place)
+        assert ran.status == 0, ran.err
+        assert place.read_bytes() == assemble_one_file(bundle("continuous"))
+    place.write_text("mine")
+    is_refused(export_model("serve", bundle("continuous"), "-o", place), "is in the way")
+    assert files_in(tmp_path / "deep") == {"page.html"}
 
 
 # ---- --out -----------------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 /** Puts the page together: the policy, its scene or its panel, and the check. */
 
 import { $, h } from "./dom.mjs";
+import { isOneFile, json } from "./files.mjs";
 import { Host } from "./host.mjs";
 import { Names } from "./names.mjs";
 import { Panel } from "./panel.mjs";
@@ -8,17 +9,11 @@ import { Stage } from "./stage.mjs";
 import { Verdict } from "./verdict.mjs";
 import { viewOf } from "./views/index.mjs";
 
-async function fetched(name) {
-  const answer = await fetch(name);
-  if (!answer.ok) throw new Error(`${name} is not there (HTTP status ${answer.status})`);
-  return answer.json();
-}
-
-/** Small networks are fastest on the processor; images are not. */
+/** The page's own kernels play at once; images are too much for them. */
 function preferred(contract, backends) {
   const images = contract.inputs.some(({ role }) => role === "visual_observation");
   const names = backends.map(({ name }) => name);
-  return [...new Set([...(images ? ["wasm"] : []), "cpu", ...names])].filter((name) => names.includes(name));
+  return [...new Set([...(images ? ["wasm"] : []), "js", ...names])].filter((name) => names.includes(name));
 }
 
 async function started(host, backends) {
@@ -31,7 +26,7 @@ async function started(host, backends) {
       failed.push(`${backend}: ${error.message}`);
     }
   }
-  throw new Error(`no backend of TensorFlow.js runs the policy here (${failed.join("; ")})`);
+  throw new Error(`nothing runs the policy here (${failed.join("; ")})`);
 }
 
 function header(site, contract) {
@@ -46,8 +41,8 @@ function header(site, contract) {
     `${(site.model_bytes / 1000).toFixed(0)} kB`,
   ];
   $("facts").textContent = facts.filter(Boolean).join(" · ");
-  $("footer").textContent =
-    `Written by export-model ${site.version}, runs TensorFlow.js ${site.tfjs} in this page. Nothing leaves your browser.`;
+  const runs = site.tfjs === null || isOneFile ? "its own kernels" : `its own kernels and TensorFlow.js ${site.tfjs}`;
+  $("footer").textContent = `Written by export-model ${site.version}, runs ${runs} in this page. Nothing leaves your browser.`;
 }
 
 function chooser(site, host, after) {
@@ -76,24 +71,24 @@ function problem(words) {
 }
 
 async function main() {
-  if (globalThis.tf === undefined) throw new Error("TensorFlow.js did not load (vendor/tf.es2017.min.js)");
-  const [site, contract] = await Promise.all([fetched("site.json"), fetched("policy.json")]);
+  const [site, contract] = await Promise.all([json("site.json"), json("policy.json")]);
   header(site, contract);
-  const models = { model: "model/model.json", ...(site.opponent !== null && { opponent: "opponent/model.json" }) };
-  const host = new Host(globalThis.tf, site.backends, models);
-  await host.fetch();
+  const host = new Host(site.backends);
+  await host.fetch(site.models);
   await started(host, preferred(contract, site.backends));
+  $("loading").remove();
   const view = site.scene === null ? null : viewOf(site);
   const names = new Names(contract, contract.labels, view?.labels);
   const stage = view === null ? null : new Stage(view, host, names);
   const panel = new Panel(host, names, { folded: view !== null });
   const verdict = new Verdict(host, site.backends, site.absent);
   chooser(site, host, () => panel.decide());
-  const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  await verdict.run(() => calm || stage?.play());
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) stage?.play();
+  await verdict.run();
 }
 
 main().catch((error) => {
+  $("loading")?.remove();
   $("verdict").textContent = "Not checked.";
   problem(`The policy cannot be shown: ${error.message}`);
 });

@@ -1,7 +1,7 @@
 /** The section that says whether the policy acts the same in this browser, and how fast. */
 
 import { $, h, milliseconds, text } from "./dom.mjs";
-import { check, fetchGolden, visitor } from "./golden.mjs";
+import { check, readGolden, visitor } from "./golden.mjs";
 
 const RULE = "|a − b| ≤ 1e-5 + 1e-5·|b|";
 
@@ -14,7 +14,7 @@ export class Verdict {
 
   constructor(host, backends, absent) {
     this.host = host;
-    this.backends = backends.map(({ name }) => name);
+    this.backends = backends;
     const head = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name))));
     const table = (caption, columns, body, extra = "") => {
       return h(
@@ -38,27 +38,26 @@ export class Verdict {
         table("Worst difference of each output", ["Output", "Backend", "Worst |Δ|", "Allowed", "At the input"], this.#outputs),
       ),
       h("p", { class: "soft", id: "check-how" }),
+      ...backends.filter(({ large }) => large).map(({ name }) => h("p", { class: "soft" }, `${name} weighs megabytes and is checked once it is chosen above.`)),
       ...absent.map(({ name, why }) => h("p", { class: "soft" }, `${name} is left out: ${why}.`)),
     );
   }
 
-  /** Checks the backends in this order; `after` is called when the first is done. */
-  async run(after = () => {}) {
+  /** Checks the backends: the one that is used first, then the others; what costs megabytes, where it has been chosen. */
+  async run() {
     this.#button.disabled = true;
     this.#results = [];
     this.#rows.replaceChildren();
     this.#outputs.replaceChildren();
-    const first = this.host.backend ?? this.backends[0];
-    const order = [first, ...this.backends.filter((name) => name !== first)];
+    const first = this.host.backend;
+    const order = [first, ...this.backends.filter(({ name, large }) => name !== first && !large).map(({ name }) => name)];
     try {
-      this.#golden ??= await fetchGolden();
+      this.#golden ??= await readGolden();
       this.#golden.memory = this.host.policy()?.contract.memory ?? null;
       this.#explain();
       for (const backend of order) {
         this.#say(`Checking ${backend} …`);
         this.#add(await check(this.host, backend, this.#golden));
-        if (backend === first) after();
-        await new Promise((resolve) => setTimeout(resolve, 50)); // let the page breathe
       }
       this.#conclude();
     } catch (error) {

@@ -10,7 +10,7 @@ const GROUND = -1.7; // m, where the shadow falls
 const PITCH = 0.62; // rad, of the camera above the horizon
 const CORNERS = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map((corner) => corner.map((n) => n * HALF_SIDE));
 
-export const view = {
+const view = {
   name: "3DBall",
   story: "Each platform keeps its ball up by tilting. An episode is 20 seconds; a ball that rolls off starts the next.",
   poke: "Nudge the balls",
@@ -43,6 +43,8 @@ export const view = {
   },
   draw,
 };
+
+export const viewOf = () => view;
 
 function draw(context, { width, height }, before, after, share, colours, chosen) {
   const columns = width < 560 ? 3 : 4;

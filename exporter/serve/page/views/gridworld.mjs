@@ -5,7 +5,7 @@ import { between, disc, places, rounded } from "./drawing.mjs";
 
 const AGENTS = 6;
 
-export const view = {
+const view = {
   name: "GridWorld",
   story: "Each walker (blue) goes to the goal (+) and around the pit (×). Moves into walls are masked.",
   poke: "Move the goals",
@@ -31,6 +31,8 @@ export const view = {
   },
   draw,
 };
+
+export const viewOf = () => view;
 
 function draw(context, { width, height }, before, after, share, colours, chosen) {
   places(AGENTS, width, height).forEach((place, i) => room(context, place, i, before, after, share, colours, i === chosen));

@@ -6,7 +6,7 @@ import { between, disc, places, rounded } from "./drawing.mjs";
 const AGENTS = 4;
 const COLUMNS = LONGEST + 3; // the hall, a place for the cue, the doors
 
-export const view = {
+const view = {
   name: "Hallway",
   story:
     "A sign (an arrow) at the start says which door is right. It is seen for one step only, so the policy must remember it. " +
@@ -35,6 +35,8 @@ export const view = {
   },
   draw,
 };
+
+export const viewOf = () => view;
 
 function draw(context, { width, height }, before, after, share, colours, chosen) {
   const all = places(AGENTS, width, height, { ratio: 3.4, gap: 20 });

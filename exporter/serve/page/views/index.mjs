@@ -1,11 +1,10 @@
 /** The views by the scene that site.json names. */
 
-import { view as ball3d } from "./ball3d.mjs";
-import { view as gridworld } from "./gridworld.mjs";
-import { view as hallway } from "./hallway.mjs";
-import { tennisView } from "./tennis.mjs";
+import { viewOf as ball3d } from "./ball3d.mjs";
+import { viewOf as gridworld } from "./gridworld.mjs";
+import { viewOf as hallway } from "./hallway.mjs";
+import { viewOf as tennis } from "./tennis.mjs";
 
-export function viewOf(site) {
-  const views = { ball3d: () => ball3d, gridworld: () => gridworld, hallway: () => hallway, tennis: () => tennisView(site) };
-  return views[site.scene]();
-}
+const VIEWS = { ball3d, gridworld, hallway, tennis };
+
+export const viewOf = (site) => VIEWS[site.scene](site);

@@ -6,7 +6,7 @@ import { between, disc, rounded } from "./drawing.mjs";
 const OBSERVATIONS = ["own racket y", "ball's distance", "ball y", "ball's approach", "ball speed y"];
 
 /** @param {{side: "left" | "right", opponent: string | null}} site which brain the page's policy is */
-export function tennisView({ side, opponent }) {
+export function viewOf({ side, opponent }) {
   const other = side === "left" ? "right" : "left";
   const players = opponent === null ? ["model"] : ["model", "opponent"];
   const against = opponent ?? "a player that follows the ball (the other brain's bundle lies not beside this one)";

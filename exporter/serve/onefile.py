@@ -1,0 +1,106 @@
+"""The page as one HTML file: modules, style and the policy's files in it, nothing else loaded.
+
+A browser loads no modules from ``file:``, so they are put into one script, each as a function of its own. The policy's
+files are data in a ``<script type="application/json">``, in which no ``<`` is left: nothing that a bundle says can end
+that element. The security policy names the script and the style by their hashes, and allows no connection.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+
+from exporter.serve.server import DATA, INDEX
+
+_IMPORT = re.compile(r'^import \{([^}]*)\} from "(\.[^"]+)";$', re.M)
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) ([\w$]+))", re.M)
+_MAIN = "main.mjs"
+
+
+def one_file(site: Mapping[str, bytes]) -> bytes:
+    """The files of a site (by path) as one HTML file."""
+    script = f'"use strict";\n{_bundled(site)}'
+    style = _without_comments(site["page.css"].decode())
+    files = {name: _embedded(name, data) for name, data in sorted(site.items()) if PurePosixPath(name).suffix in DATA}
+    held = json.dumps(files, separators=(",", ":")).replace("<", "\\u003c")
+    icon = f"data:image/svg+xml;base64,{base64.b64encode(site['icon.svg']).decode()}"
+    policy = (
+        f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data: blob:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    page = site[INDEX].decode()
+    for pattern, text in (
+        (r'(?<=<meta http-equiv="Content-Security-Policy" content=")[^"]*', policy),
+        (r'<link rel="icon"[^>]*>', f'<link rel="icon" href="{icon}">'),
+        (r'<link rel="stylesheet"[^>]*>', f"<style>{style}</style>"),
+        (r'<script type="module"[^>]*></script>\n', ""),
+        (r"</body>", f'<script type="application/json" id="files">{held}</script>\n<script>{script}</script>\n</body>'),
+    ):
+        parts = re.split(pattern, page)
+        assert len(parts) == 2, pattern
+        page = text.join(parts)
+    return page.encode()
+
+
+def _embedded(name: str, data: bytes) -> object:
+    return json.loads(data) if name.endswith(".json") else base64.b64encode(data).decode()
+
+
+def _hash(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def _bundled(site: Mapping[str, bytes]) -> str:
+    """All modules that main.mjs needs, each after what it imports, as functions that give what they export."""
+    done: dict[str, str] = {}
+
+    def visit(name: str) -> None:
+        if name in done:
+            return
+        done[name] = ""  # a circle would find this, and its functions are not made yet
+        text = site[name].decode()
+        for _, path in _IMPORT.findall(text):
+            visit(_beside(name, path))
+        del done[name]
+        done[name] = _as_function(name, _without_comments(text))
+
+    visit(_MAIN)
+    return "\n".join(done.values())
+
+
+def _as_function(name: str, text: str) -> str:
+    def taken(found: re.Match[str]) -> str:
+        names = re.sub(r" as ", ": ", " ".join(found[1].split()))
+        return f"const {{ {names} }} = {_variable(_beside(name, found[2]))};"
+
+    exported = _EXPORT.findall(text)
+    body = _EXPORT.sub("", _IMPORT.sub(taken, text))
+    assert not re.search(r"^(?:import|export)\b", body, re.M), name
+    assert "</script" not in body and "<!--" not in body, name
+    return f"const {_variable(name)} = (() => {{\n{body}return {{ {', '.join(exported)} }};\n}})();"
+
+
+def _variable(name: str) -> str:
+    return "m_" + re.sub(r"\W", "_", name)
+
+
+def _beside(name: str, path: str) -> str:
+    """What a module means by a relative path: ``views/a.mjs`` and ``../b.mjs`` are ``b.mjs``."""
+    parts = list(PurePosixPath(name).parent.parts)
+    for part in PurePosixPath(path).parts:
+        if part == "..":
+            parts.pop()
+        else:
+            parts.append(part)
+    return "/".join(parts)
+
+
+def _without_comments(text: str) -> str:
+    """Without the comments that begin a line, and without indentation (the page has no text that spans lines)."""
+    text = re.sub(r"^[ \t]*/\*.*?\*/[ \t]*\n", "", text, flags=re.M | re.S)
+    text = re.sub(r"^[ \t]*//.*\n", "", text, flags=re.M)
+    return re.sub(r"^[ \t]+|^\n", "", text, flags=re.M)
