@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,18 @@ def compiled(path: Path) -> list[Policy]:
     return [policy for _, policy in read_source(path, ReadOptions()).compiled(CompileOptions())]
 
 
+class Plain:
+    """A policy as it is, in onnxruntime: made once, and held against what each profile makes of it."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    @cached_property
+    def run(self) -> Callable[[Mapping[str, Any]], Feeds]:
+        plain = written("onnx").artifact(self.policy, WriteOptions(CONTRACT))
+        return runner_of(onnx.ModelProto.FromString(plain.files[plain.main].joined()))
+
+
 @dataclass
 class Pair:
     """A policy and what a profile makes of it, both as ONNX."""
@@ -46,13 +59,13 @@ class Pair:
     policy: Policy
     profile: Profile
     dressed: Policy
-    plain: onnx.ModelProto
-    #: the ModelProto, None where the profile's format is .bytes
+    plain: Plain
+    #: the ModelProto, an empty one where the profile's format is .bytes
     made: onnx.ModelProto
     data: bytes
 
     @classmethod
-    def of(cls, policy: Policy, profile: Profile) -> Pair:
+    def of(cls, policy: Policy, profile: Profile, plain: Plain | None = None) -> Pair:
         """Raises ProfileError where the profile cannot hold the policy."""
         dressed = profile.dress(policy)
         form = profile.formats[0]
@@ -60,15 +73,8 @@ class Pair:
         if profile.check is not None:
             profile.check(profile, artifact.files, policy.name)
         data = artifact.files[artifact.main].joined()
-        plain = written("onnx").artifact(policy, WriteOptions(CONTRACT))
-        return cls(
-            policy,
-            profile,
-            dressed,
-            onnx.ModelProto.FromString(plain.files[plain.main].joined()),
-            onnx.ModelProto.FromString(data if form == "onnx" else b""),
-            data,
-        )
+        made = onnx.ModelProto.FromString(data if form == "onnx" else b"")
+        return cls(policy, profile, dressed, plain or Plain(policy), made, data)
 
     def brain(self) -> Brain:
         """Behavior Parameters of an agent that the dressed policy is for."""
@@ -107,15 +113,31 @@ class Pair:
             expected = run_graph(self.policy.graph, own, [s.name for s in self.policy.signature.outputs])
             noise = [own[s.name] for s in self.policy.signature.noise]
             return self._frozen_difference(expected, theirs, noise, runner, atol)
-        expected = run(self.plain, own, None)
-        draws = [n.output[0] for n in self.made.graph.node if n.op_type == "RandomNormalLike"]
+        expected = self.plain.run(own)
+        draws, scores = self._draws, self._scores
         noise = {s.name: own[s.name] for s in self.policy.signature.noise}
         if len(draws) == 1 and len(noise) == 1:
             theirs[draws[0]] = next(iter(noise.values()))
-        scores = [n.input[0] for n in self.made.graph.node if n.op_type == "Multinomial"]
-        model = lifted(_copied(self.made), draws) if len(draws) == 1 and len(noise) == 1 else self.made
-        actual = run(model, theirs, scores)
+        actual = self._run_made(theirs)
         return self._compared(expected, actual, scores, drawn=len(draws) != len(noise) or len(draws) > 1)
+
+    @cached_property
+    def _draws(self) -> list[str]:
+        return [n.output[0] for n in self.made.graph.node if n.op_type == "RandomNormalLike"]
+
+    @cached_property
+    def _scores(self) -> list[str]:
+        return [n.input[0] for n in self.made.graph.node if n.op_type == "Multinomial"]
+
+    @cached_property
+    def _run_made(self) -> Callable[[Mapping[str, Any]], Feeds]:
+        """What was made, with its one draw as an input where the policy has noise, and with what is drawn from."""
+        fed = len(self._draws) == 1 and len(self.policy.signature.noise) == 1
+        model = lifted(_copied(self.made), self._draws) if fed else _copied(self.made)
+        known = {o.name for o in model.graph.output}
+        inner = (n for n in dict.fromkeys(self._scores) if n not in known)
+        model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in inner)
+        return runner_of(model)
 
     def _frozen_difference(
         self, expected: Feeds, theirs: Feeds, noise: list[np.ndarray], runner: Runner | None, atol: float
@@ -260,15 +282,16 @@ def _sample(spec: TensorSpec, policy: Policy, rows: int, rng: np.random.Generato
     return rng.standard_normal(shape).astype(spec.dtype)
 
 
-def run(model: onnx.ModelProto, feeds: Mapping[str, Any], inner: list[str] | None) -> Feeds:
-    if inner:
-        model = _copied(model)
-        known = {o.name for o in model.graph.output}
-        model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in dict.fromkeys(inner) if n not in known)
+def runner_of(model: onnx.ModelProto) -> Callable[[Mapping[str, Any]], Feeds]:
+    """All outputs of a model in onnxruntime, by name; of what is fed, the inputs are taken."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     taken = {i.name for i in session.get_inputs()}
-    values = session.run(None, {k: v for k, v in feeds.items() if k in taken})
-    return {o.name: v for o, v in zip(session.get_outputs(), values, strict=True)}
+    names = [o.name for o in session.get_outputs()]
+
+    def run(feeds: Mapping[str, Any]) -> Feeds:
+        return dict(zip(names, session.run(None, {k: v for k, v in feeds.items() if k in taken}), strict=True))
+
+    return run
