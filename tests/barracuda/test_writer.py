@@ -7,7 +7,6 @@ lowering; with the recorded outputs of the trainers' TensorFlow (golden.npz) the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,10 +25,11 @@ from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from converters.policy import Policy
 from exporter.export.sources import read_source
-from signatures.errors import ExportModelError, SignatureError, UnsupportedOpError
+from signatures.errors import SignatureError, UnsupportedOpError
 from signatures.roles import Role
 from signatures.spec import Memory, PolicySignature, TensorSpec
-from tests.barracuda.conftest import SHARED, params
+from tests import known
+from tests.barracuda.accepted import assert_accepted
 from tests.barracuda.nn_running import answered, fed, some, wanted
 from tests.barracuda.nn_safety import assert_safe
 from tests.barracuda.reference import evaluate
@@ -37,7 +37,6 @@ from tests.corpus.conftest import genuine_cases
 from tests.corpus.test_goldens import Golden, rows
 
 FIXTURES = sorted((Path(__file__).resolve().parents[2] / "fixtures").glob("*.bytes"))
-SUFFIXES = (".bytes", ".nn", ".onnx", ".pb", ".pt")
 
 
 def written(policy: Policy, contract: str = "{}") -> NnModel:
@@ -77,9 +76,11 @@ def assert_answers(policy: Policy, model: NnModel, batches: tuple[int, ...] = (1
 
 @pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
 @pytest.mark.parametrize("options", [{}, {"names": "source"}, {"deterministic": True}, {"noise": "zero"}], ids=str)
-def test_a_policy_answers_as_its_graph_does(path: Path, options: dict[str, Any]) -> None:
+def test_a_policy_answers_as_its_graph_does(path: Path, options: dict[str, Any], tmp_path: Path) -> None:
     for policy in policies(path, **options):
         assert_answers(policy, written(policy))
+        if not options:
+            assert_accepted(policy, tmp_path)
 
 
 @pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
@@ -223,13 +224,7 @@ def test_a_memory_has_its_parts_in_the_policys_order(
 # ------------------------------------------------------------------ public and genuine policies
 
 
-def sources() -> Iterator[Path]:
-    for room in ("corpus", "genuine", "foreign"):
-        for path in sorted((SHARED / room).rglob("*")):
-            if path.suffix in SUFFIXES and path.name != "raw_graph_def.pb":
-                yield path
-
-
+SOURCES = [p for p in known.sources() if p.suffix != ".keras" and p.name != "raw_graph_def.pb"]
 #: Files of ../shared that a ``.nn`` cannot hold, and the node, op or output that the error names.
 REFUSED = {
     "corpus/onnx/AliBharwani+ml-agents__CustomResidualAttentionWithLayerNorm.onnx": "'entities_0' (Placeholder)",
@@ -246,13 +241,11 @@ REFUSED = {
 
 @pytest.mark.corpus
 @pytest.mark.slow
-@pytest.mark.parametrize("path", params(list(sources()), lambda p: "/".join(p.relative_to(SHARED).parts)[-90:]))
-def test_every_policy_is_written_and_answers_the_same_or_is_refused_by_name(path: Path, shared: Path) -> None:
-    try:
-        found = policies(path)
-    except ExportModelError:
-        pytest.skip("the file is no policy, or is damaged: its own tests say which")
-    name = path.relative_to(SHARED).as_posix()
+@pytest.mark.parametrize("path", known.params(SOURCES))
+def test_every_policy_is_written_accepted_and_answers_the_same_or_is_refused_by_name(
+    path: Path, tmp_path: Path
+) -> None:
+    found, name = known.policies_or_skip(path), path.relative_to(known.SHARED).as_posix()
     for policy in found:
         try:
             model = written(policy)
@@ -263,6 +256,7 @@ def test_every_policy_is_written_and_answers_the_same_or_is_refused_by_name(path
             continue
         assert name not in REFUSED
         assert_answers(policy, model)
+        assert_accepted(policy, tmp_path)
 
 
 GENUINE = [pytest.param(f, c, id=f.name) for f, c in genuine_cases()] or [
@@ -277,7 +271,7 @@ def test_a_genuine_graph_as_nn_answers_what_its_trainer_recorded(
 ) -> None:
     """Golden decides, two of the genuine ``.nn`` being other than their own graphs."""
     archive = dict(np.load(folder / "golden.npz"))
-    for policy in policies(folder / case["frozen"]["file"]):
+    for policy in known.policies_or_skip(folder / case["frozen"]["file"]):
         if folder.name == "0.3.0-bc-continuous-recurrent":
             continue  # it has lost its memory's output, see REFUSED
         model, memory, compared = written(policy), policy.signature.memory, 0

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from converters.frozen_graph.reader import read_graph
+from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.tensorflow1.found import RELEASES
 from converters.targets import tfsharp
 from converters.targets.profile import Profile
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.errors import ExportModelError, ProfileError
+from signatures.errors import ProfileError
+from tests import known
 from tests.legacy.installed import ensure
 from tests.targets.dressed import Pair, compiled
 
 pytestmark = [pytest.mark.legacy, pytest.mark.slow]
-SHARED = Path(__file__).resolve().parents[3] / "shared"
 #: Generation → the TensorFlow of its plugin. That of 0.1 and 0.2 had 1.1 or 1.2, which are not here.
 TENSORFLOW = {"0.2": "tf1.4", "0.3": "tf1.4", "0.4": "tf1.7", "0.5": "tf1.7", "0.6": "tf1.7"}
 #: File → (atol, why): float32 rounding that a policy makes larger, measured against the same graph in float64.
@@ -46,11 +49,11 @@ def runtime_of(wanted: Profile) -> str:
     return ensure(next(r for r in RELEASES if r.runtime == name))
 
 
-def held(path: Path, wanted: Profile, pool: RuntimePool, folder: Path) -> int:
+def held(path: Path, policies: Sequence[Policy], wanted: Profile, pool: RuntimePool, folder: Path) -> int:
     """Run each policy of a file as the generation does; returns how many are held."""
     runtime, count = runtime_of(wanted), 0
     atol, _ = ATOL.get(path.name, (1e-5, ""))
-    for policy in compiled(path):
+    for policy in policies:
         try:
             pair = Pair.of(policy, wanted)
         except ProfileError as error:
@@ -69,27 +72,23 @@ def held(path: Path, wanted: Profile, pool: RuntimePool, folder: Path) -> int:
 @pytest.mark.parametrize("wanted", tfsharp.PROFILES, ids=lambda p: p.name)
 @pytest.mark.parametrize("name", FIXTURES)
 def test_a_fixture_acts_the_same(name: str, wanted: Profile, pool: RuntimePool, tmp_path: Path) -> None:
-    assert held(fixture(name), wanted, pool, tmp_path) > 0 or name in ("discrete", "recurrent", "sampled")
+    assert held(fixture(name), compiled(fixture(name)), wanted, pool, tmp_path) > 0 or name in (
+        "discrete",
+        "recurrent",
+        "sampled",
+    )
 
 
-def _known() -> list[Any]:
-    files = [p for room in ("genuine", "corpus", "foreign") for p in sorted((SHARED / room).rglob("*"))]
-    files = [p for p in files if p.suffix in (".bytes", ".pb", ".nn", ".onnx", ".pt") and p.is_file()]
-    turns = [(p, tfsharp.PROFILES[i % len(tfsharp.PROFILES)]) for i, p in enumerate(files)]
-    return [pytest.param(p, w, id=f"{p.parent.name}/{p.name}-{w.name}") for p, w in turns] or [
-        pytest.param(Path("absent"), tfsharp.PROFILES[0], id="shared-is-absent")
-    ]
+def _in_turns() -> list[Any]:
+    files = known.params([p for p in known.sources() if p.suffix != ".keras"])
+    turns = zip(files, itertools.cycle(tfsharp.PROFILES), strict=False)
+    return [pytest.param(file.values[0], wanted, id=f"{file.id}-{wanted.name}") for file, wanted in turns]
 
 
 @pytest.mark.corpus
-@pytest.mark.parametrize(("path", "wanted"), _known())
+@pytest.mark.parametrize(("path", "wanted"), _in_turns())
 def test_a_known_policy_acts_the_same(path: Path, wanted: Profile, pool: RuntimePool, tmp_path: Path) -> None:
-    if not path.is_file():
-        pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
-    try:
-        held(path, wanted, pool, tmp_path)
-    except ExportModelError as error:
-        pytest.skip(f"no policy: {error.what}")
+    held(path, known.policies_or_skip(path), wanted, pool, tmp_path)
 
 
 def test_the_constants_of_0_6_are_int32_nodes(tmp_path: Path) -> None:

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 
+from converters.policy import Policy
 from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES, profile
 from exporter import export_model
-from signatures.errors import ExportModelError, ProfileError, UsageError
+from signatures.errors import ProfileError, UsageError
 from signatures.roles import Role
-from tests import commands
+from tests import commands, known
 from tests.handmade import constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, Plain, compiled, runner_of
 
 pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).resolve().parents[2]
-SHARED = ROOT.parent / "shared"
 FIXTURES = [
     *sorted((ROOT / "fixtures").glob("*.bytes")),
     *(p for room in ("sb3", "torch_checkpoint") for p in sorted((ROOT / "fixtures" / room).glob("*.onnx"))),
@@ -73,12 +73,8 @@ CANNOT_IN = {
 }
 
 
-def held(path: Path, folder: Path) -> dict[str, int]:
-    """Hold each policy of a file under every profile: profile → how many it holds; none where it is no policy."""
-    try:
-        policies = compiled(path)
-    except ExportModelError:
-        return {}  # other tests say which files are no policies
+def held(path: Path, policies: Sequence[Policy], folder: Path) -> dict[str, int]:
+    """Hold each policy of a file under every profile: profile → how many it holds."""
     counts = dict.fromkeys((p.name for p in UNITY), 0)
     for policy in policies:
         plain = Plain(policy)
@@ -117,30 +113,18 @@ WITHOUT_MEMORY_OUT = ("ppo_0_21_discrete_lstm.onnx", "ppo_0_22_lstm.onnx")
 
 @pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
 def test_a_fixture_acts_the_same_and_is_accepted(path: Path, tmp_path: Path) -> None:
-    counts = held(path, tmp_path)
-    assert counts
-    for name, count in counts.items():
+    for name, count in held(path, compiled(path), tmp_path).items():
         # ML-Agents 0.20 to 0.24 exported no recurrent_out; version 2 holds no memory
         lost = path.name in WITHOUT_MEMORY_OUT or (path.name, name) in CANNOT_IN
         lost = lost or (name == "barracuda-1.0" and ("lstm" in path.name or path.name == "recurrent.bytes"))
         assert (count == 0) == lost, name
 
 
-def _known() -> list[Any]:
-    files = [p for room in ("genuine", "corpus", "foreign") for p in sorted((SHARED / room).rglob("*"))]
-    wanted = [p for p in files if p.suffix in (".bytes", ".pb", ".nn", ".onnx", ".pt", ".keras") and p.is_file()]
-    return [pytest.param(p, id=f"{p.parent.name}/{p.name}") for p in wanted] or [
-        pytest.param(Path("absent"), id="shared-is-absent")
-    ]
-
-
 @pytest.mark.corpus
 @pytest.mark.slow
-@pytest.mark.parametrize("path", _known())
+@pytest.mark.parametrize("path", known.params(known.sources()))
 def test_every_known_policy_acts_the_same_and_is_accepted_under_every_profile(path: Path, tmp_path: Path) -> None:
-    if not path.is_file():
-        pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
-    held(path, tmp_path)
+    held(path, known.policies_or_skip(path), tmp_path)
 
 
 # ------------------------------------------------------------------ what is supplied
@@ -217,8 +201,8 @@ def test_the_draws_of_a_continuous_policy_are_put_back() -> None:
 def test_help_lists_every_profile_with_its_purpose() -> None:
     ran = commands.export_model("--for", "help")
     assert ran.status == 0
-    for known in PROFILES:
-        assert known.name in ran.out and known.purpose in ran.out
+    for each in PROFILES:
+        assert each.name in ran.out and each.purpose in ran.out
     assert [p["name"] for p in commands.export_model("--for", "help", "--json").json["profiles"]] == [
         p.name for p in PROFILES
     ]

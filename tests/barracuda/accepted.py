@@ -5,18 +5,13 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import pytest
-
 from converters.format import WriteOptions
 from converters.formats import WRITTEN
 from converters.policy import Policy
 from converters.targets.unity.checker import check_file
 from converters.targets.unity.consumers import CONSUMERS
 from converters.targets.unity.settings import Brain, sensors_of
-from signatures.errors import ExportModelError, SignatureError, UnsupportedOpError
 from signatures.roles import Role
-from tests.barracuda.conftest import SHARED, params
-from tests.barracuda.test_writer import FIXTURES, policies, sources
 
 _MEMORY = "Models from com.unity.ml-agents 1.x that use recurrent neural networks are not supported"
 
@@ -56,24 +51,3 @@ def assert_accepted(policy: Policy, folder: Path) -> None:
         return
     assert mode.accepted, [f.message for f in mode.checks]
     assert mode.fetched
-
-
-@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
-def test_release_20_accepts_a_policy_of_ours(path: Path, tmp_path: Path) -> None:
-    for policy in policies(path):
-        assert_accepted(policy, tmp_path)
-
-
-@pytest.mark.corpus
-@pytest.mark.slow
-@pytest.mark.parametrize("path", params(list(sources()), lambda p: "/".join(p.relative_to(SHARED).parts)[-90:]))
-def test_release_20_accepts_every_policy_that_is_written(path: Path, shared: Path, tmp_path: Path) -> None:
-    try:
-        found = policies(path)
-    except ExportModelError:
-        pytest.skip("the file is no policy, or is damaged: its own tests say which")
-    for policy in found:
-        try:
-            assert_accepted(policy, tmp_path)
-        except (UnsupportedOpError, SignatureError):
-            continue  # tests/barracuda/test_writer.py says which, and why

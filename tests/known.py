@@ -1,0 +1,48 @@
+"""Every policy of ../shared by path, for the tests that go over all of them; each is read and compiled once."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from converters.policy import Policy
+from exporter.export.sources import read_source
+from signatures.errors import ExportModelError
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+ABSENT = "../shared (public models, genuine graphs) is not beside this checkout"
+SUFFIXES = (".bytes", ".pb", ".nn", ".onnx", ".pt", ".keras")
+
+
+def sources() -> list[Path]:
+    """The model files; what is no policy is among them."""
+    files = [p for room in ("genuine", "corpus", "foreign") for p in sorted((SHARED / room).rglob("*"))]
+    return [p for p in files if p.suffix in SUFFIXES and p.is_file()]
+
+
+def params(found: list[Path]) -> list[Any]:
+    """Pytest parameters with the files' names; one that stands for their absence."""
+    named = [pytest.param(p, id="/".join(p.relative_to(SHARED).parts)[-90:]) for p in found]
+    return named or [pytest.param(Path("absent"), id="shared-is-absent")]
+
+
+@functools.cache
+def policies(path: Path) -> tuple[Policy, ...] | ExportModelError:
+    """The policies of a source, as every export has them, or why it is none."""
+    if not path.is_file():
+        pytest.skip(ABSENT)
+    try:
+        return tuple(read_source(path).policies())
+    except ExportModelError as error:
+        return error
+
+
+def policies_or_skip(path: Path) -> tuple[Policy, ...]:
+    """The same; what is no policy, or is damaged, is skipped: other tests say which files are."""
+    found = policies(path)
+    if isinstance(found, ExportModelError):
+        pytest.skip(f"no policy: {found.what}")
+    return found
