@@ -7,6 +7,8 @@ length is 1; N is the batch. A vector [B, C] is [N, 1, 1, C], an image of Tensor
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -28,6 +30,8 @@ Axes = tuple[int | None, ...]
 Dims = tuple[int, int, int, int]
 
 FREE = -1
+#: Tensors that a tensor is joined from.
+MAX_PIECES = 1 << 10
 #: What ML-Agents' converter writes where a layer has no pads.
 NO_PADS = (0, 0, 0, 0)
 _UNFIT = re.compile(r"[^\x21-\x7e]")
@@ -145,6 +149,9 @@ class NnBuilder:
         self._dims: dict[str, Dims] = {}
         self._constants: dict[tuple[Dims, bytes], str] = {}
         self._joined: dict[tuple[Piece, ...], str] = {}
+        #: the pieces that were cut last, and where each ends: a Split cuts the same ones again and again
+        self._cut: tuple[Piece, ...] = ()
+        self._ends: list[int] = []
         self._spread: dict[str, str] = {}
 
     # ------------------------------------------------------------------ what is known of the graph
@@ -349,19 +356,37 @@ class NnBuilder:
 
     def cut(self, value: Value, start: int, stop: int, shape: tuple[Dim, ...]) -> Value:
         """Channels ``start`` to ``stop``: of the pieces, so that what was only joined is not cut."""
+        if self._cut is not value.pieces:
+            self._cut = value.pieces
+            self._ends = list(itertools.accumulate(p.stop - p.start for p in value.pieces))
         pieces: list[Piece] = []
-        at = 0
-        for piece in value.pieces:
-            width = piece.stop - piece.start
-            first, last = max(start - at, 0), min(stop - at, width)
+        for index in range(bisect.bisect_right(self._ends, start), len(self._ends)):
+            piece = value.pieces[index]
+            at = self._ends[index] - (piece.stop - piece.start)
+            if at >= stop:
+                break
+            first, last = max(start - at, 0), min(stop, self._ends[index]) - at
             if first < last:
                 pieces.append(replace(piece, start=piece.start + first, stop=piece.start + last))
-            at += width
-        return Value(shape, value.axes, _merged(pieces))
+        return Value(shape, value.axes, self._merged(pieces))
 
     def join(self, values: Sequence[Value], shape: tuple[Dim, ...]) -> Value:
         """Tensors one after the other along C."""
-        return Value(shape, values[0].axes, _merged([p for v in values for p in v.pieces]))
+        return Value(shape, values[0].axes, self._merged([p for v in values for p in v.pieces]))
+
+    def _merged(self, pieces: Sequence[Piece]) -> tuple[Piece, ...]:
+        """Pieces, those that follow each other in one tensor as one."""
+        merged: list[Piece] = []
+        for piece in pieces:
+            if merged and merged[-1].name == piece.name and merged[-1].stop == piece.start:
+                merged[-1] = replace(merged[-1], stop=piece.stop)
+            else:
+                merged.append(piece)
+        if len(merged) > MAX_PIECES:
+            raise self.refused(
+                f"{len(merged)} tensors are joined", f"no more than {MAX_PIECES} are; a policy has a few"
+            )
+        return tuple(merged)
 
     def placed(self, array: npt.NDArray[np.generic], axes: Axes) -> Array:
         """A constant of the graph as [N, H, W, C], its axes (aligned at the end, as they broadcast) at ``axes``."""
@@ -410,14 +435,3 @@ class NnBuilder:
     def rows(self, value: Value) -> str:
         """The tensor of a value [B, …], flattened in the graph's order: a name of [N, …] whose rows are the rows."""
         return self.stored(self.in_usual_place(value))
-
-
-def _merged(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
-    """Pieces, those that follow each other in one tensor as one."""
-    merged: list[Piece] = []
-    for piece in pieces:
-        if merged and merged[-1].name == piece.name and merged[-1].stop == piece.start:
-            merged[-1] = replace(merged[-1], stop=piece.stop)
-        else:
-            merged.append(piece)
-    return tuple(merged)

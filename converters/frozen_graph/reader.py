@@ -13,7 +13,7 @@ import numpy as np
 from converters import schema
 from converters.detached import Detached
 from converters.frozen_graph.tensors import Allowance, to_array
-from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
+from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
 from converters.graph.ops.outside import CALLS
 from converters.graph.ops.table import is_fed
 from signatures.errors import DamagedFileError, NotAPolicyError
@@ -56,6 +56,12 @@ def _node(proto: Any, producer: int, allowance: Allowance, detached: Detached | 
             "a node has no name or no op",
             why="the bytes decode as protobuf but not as a TensorFlow graph",
             fix="give the frozen graph (.bytes, frozen_graph_def.pb) that training wrote",
+        )
+    if node_of(proto.name) != proto.name:
+        raise DamagedFileError(
+            f"a node is called {proto.name!r}",
+            why="that is how the output of a node is called: a node's own name has no colon",
+            fix="freeze the graph again; this file is damaged",
         )
     attrs: dict[str, Any] = {}
     value: np.ndarray | None = None

@@ -8,6 +8,7 @@ from typing import Any
 
 from converters.graph.compilation import Compilation, Pass, on_graph, on_inputs, on_tensors
 from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
+from converters.graph.ops.table import is_fed
 from converters.graph.options import CompileOptions
 from converters.graph.passes import conditions as has
 from converters.graph.passes.fold import fold
@@ -58,8 +59,8 @@ PASSES = (
 )
 
 
-#: Nodes upstream of a policy's outputs.
-MAX_NODES = 1 << 14
+#: Nodes upstream of a policy's outputs; placeholders among them, and outputs.
+MAX_NODES, MAX_PORTS = 1 << 14, 1 << 10
 
 
 def compile_graph(
@@ -97,6 +98,13 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
                 why=f"no more than {MAX_NODES} are converted; a policy has some hundreds",
                 fix="give the policy alone, or say which node is its action: --output NODE=action",
             )
+        for what, count in (("inputs", sum(map(is_fed, upstream.nodes))), ("outputs", len(outputs))):
+            if count > MAX_PORTS:
+                raise NotAPolicyError(
+                    f"the policy has {count} {what}",
+                    why=f"no more than {MAX_PORTS} are converted; a policy has a few",
+                    fix="give the policy alone, or say which node is its action: --output NODE=action",
+                )
         sources = {out: _source_of(graph, reference) for out, reference in outputs}
         # Outputs are pinned by nodes of their own, which every pass keeps.
         fetches = {out: f"__output_{i}" for i, (out, _) in enumerate(outputs)}

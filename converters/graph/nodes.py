@@ -131,6 +131,14 @@ class Graph:
                 stack.extend(node_of(r) for r in self._index[name].inputs)
         return seen
 
+    def descendants(self, names: Iterable[str]) -> set[str]:
+        """Names of all nodes downstream of those called ``names``, themselves included, in a graph without loops."""
+        found = set(names)
+        for node in self.nodes:
+            if any(node_of(r) in found for r in node.inputs):
+                found.add(node.name)
+        return found
+
     def pruned(self, references: Iterable[str]) -> Graph:
         """Only what is upstream of ``references``, in the same order."""
         keep = self.ancestors(references)
@@ -223,12 +231,26 @@ class NameScope:
 
     def __init__(self, taken: Iterable[str]) -> None:
         self._taken = set(taken)
+        self._numbers: dict[str, int] = {}
 
     def fresh(self, wish: str) -> str:
         """``wish``, or ``wish_1``, ``wish_2``… if it is taken."""
-        name, number = wish, 0
+        name, number = wish, self._numbers.get(wish, 0)
         while name in self._taken:
             number += 1
             name = f"{wish}_{number}"
         self._taken.add(name)
+        self._numbers[wish] = number
         return name
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._taken
+
+    def take(self, name: str) -> None:
+        """Hand ``name`` out to nobody else."""
+        self._taken.add(name)
+
+    def release(self, name: str) -> None:
+        """Let a name be taken again, as if it had never been."""
+        self._taken.discard(name)
+        self._numbers.clear()

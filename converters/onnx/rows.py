@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph, TensorShape
+from converters.graph.nodes import Graph, TensorShape, node_of
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.rows import for_every_row
@@ -213,8 +213,8 @@ def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) ->
 
 def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
     """Raise SignatureError that names the first output which is wrong for more rows than one."""
-    chance = {n.name for n in graph.nodes if n.op in SAMPLERS}
-    judged = [o for o in outputs if not graph.ancestors([o]) & chance]
+    drawn = graph.descendants(n.name for n in graph.nodes if n.op in SAMPLERS)
+    judged = [o for o in outputs if node_of(o) not in drawn]
     if not judged:
         return
     graph = normalise(graph.pruned(judged), judged)

@@ -15,7 +15,7 @@ import numpy as np
 
 from converters.detached import LARGE, Detached
 from converters.format import WriteOptions
-from converters.graph.nodes import Graph, Node, ref
+from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.table import op_of, unsupported
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
@@ -77,7 +77,7 @@ class _Builder:
         self._values: dict[str, str] = {}
         self._constants: dict[tuple[Any, ...], list[tuple[np.ndarray, str]]] = {}
         self.detached = Detached()
-        self._taken: set[str] = set()
+        self._names = NameScope(())
         self._prefix = ""
 
     def value(self, reference: str) -> str:
@@ -95,15 +95,10 @@ class _Builder:
     def bind(self, reference: str, value: str) -> None:
         """Let ``value`` stand for a tensor of the graph."""
         self._values[reference] = value
-        self._taken.add(value)
+        self._names.take(value)
 
     def fresh(self, wish: str) -> str:
-        name, number = wish, 0
-        while name in self._taken:
-            number += 1
-            name = f"{wish}_{number}"
-        self._taken.add(name)
-        return name
+        return self._names.fresh(wish)
 
     def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
         sunk = self._sunk(op, inputs, attributes) if self._sinks and outputs == 1 else ""
@@ -182,14 +177,15 @@ class _Builder:
             raise unsupported([node])
         before = len(self.nodes)
         result = entry.onnx(node, self)
-        values = result if isinstance(result, tuple) else (result,)
-        for index, value in enumerate(values):
+        made = {name for n in self.nodes[before:] for name in n.output}
+        renamed: dict[str, str] = {}
+        for index, value in enumerate(result if isinstance(result, tuple) else (result,)):
             reference = ref(node.name, index)
-            made = next((n for n in reversed(self.nodes[before:]) if value in n.output), None)
-            if made is not None and reference not in self._taken:
-                self._rename(before, value, reference)
-                value = reference
-            self.bind(reference, value)
+            if value in made and value not in renamed and reference not in self._names:
+                renamed[value] = reference
+                self._names.release(value)
+            self.bind(reference, renamed.get(value, value))
+        self._rename(before, renamed)
 
     def give(self, output: str) -> None:
         """Let an output be made: what is an input, a constant or another output as well is so by a node of its own.
@@ -203,21 +199,18 @@ class _Builder:
         inputs = list(maker.input) if maker is not None and maker.op_type == "Reshape" else [value]
         self.nodes.append(self.onnx.helper.make_node("Reshape" if len(inputs) == 2 else "Identity", inputs, [output]))
 
-    def _rename(self, start: int, old: str, new: str) -> None:
+    def _rename(self, start: int, renamed: Mapping[str, str]) -> None:
+        """Call the results of the nodes from ``start`` on otherwise."""
         for node in self.nodes[start:]:
+            if node.op_type == "Transpose" and (turned := self._transposed.pop(node.output[0], None)) is not None:
+                source, order = turned
+                value = renamed.get(node.output[0], node.output[0])
+                self._transposed[value] = (renamed.get(source, source), order)
             for names in (node.input, node.output):
                 for i, name in enumerate(names):
-                    if name == old:
-                        names[i] = new
-            if node.name == old:
-                node.name = new
-        if old in self._transposed:
-            self._transposed[new] = self._transposed.pop(old)
-        for value, (source, order) in self._transposed.items():
-            if source == old:
-                self._transposed[value] = (new, order)
-        self._taken.discard(old)
-        self._taken.add(new)
+                    if name in renamed:
+                        names[i] = renamed[name]
+            node.name = renamed.get(node.name, node.name)
 
     def tensors(self, graph: Graph, present: Collection[str]) -> TensorMap:
         """What of ``graph``, as it was before anything was fused, is in the model under another name or not at all."""

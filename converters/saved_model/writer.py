@@ -16,6 +16,7 @@ from converters.bundle.embed import with_contract
 from converters.detached import Detached
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
+from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
 from converters.pieces import Pieces
 from converters.policy import Policy
@@ -36,9 +37,9 @@ def signatures_of(policy: Policy) -> dict[str, tuple[list[TensorSpec], list[Tens
     signatures = {SERVING: (list(every.inputs), list(every.outputs))}
     noise = {policy.feeds[s.name] for s in every.inputs if s.role is Role.NOISE}
     samplers = {n.name for n in policy.graph.nodes if n.op in SAMPLERS}
-    needs = {s.name: policy.graph.ancestors([policy.fetches[s.name]]) for s in every.outputs}
-    outputs = [s for s in every.outputs if not needs[s.name] & (noise | samplers)]
-    upstream = set().union(*(needs[s.name] for s in outputs)) if outputs else set()
+    drawn = policy.graph.descendants(noise | samplers)
+    outputs = [s for s in every.outputs if node_of(policy.fetches[s.name]) not in drawn]
+    upstream = policy.graph.ancestors(policy.fetches[s.name] for s in outputs)
     inputs = [s for s in every.inputs if policy.feeds[s.name] in upstream]
     if outputs and inputs:
         signatures[DETERMINISTIC] = (inputs, outputs)

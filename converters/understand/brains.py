@@ -109,7 +109,7 @@ def find_brains(
     if Role.ACTION in given.values():
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
         scope = _scope_of(graph, [n for n, role in given.items() if role is Role.ACTION])
-        rest = [n for n in declared or () if n in fed - set(given)]
+        rest = [n for n in declared or () if n in fed and n not in given]
         return (Brain(scope, (*outputs, *_others(outputs, rest)), _constants(graph, scope)),)
     if declared:
         fed &= set(declared)

@@ -13,11 +13,11 @@ def normaliser(graph: Graph, name: str) -> dict[str, object] | None:
     The form is the same in every ML-Agents version: clip((x − mean) / sqrt(variance / steps), −5, 5), its square root
     folded to a constant here.
     """
-    for node in graph.nodes:
-        if node.op != "Sub" or node_of(node.inputs[0]) != name:
-            continue
+    centred = [n for n in graph.nodes if n.op == "Sub" and node_of(n.inputs[0]) == name]
+    readers = graph.consumers() if centred else {}
+    for node in centred:
         mean = graph.constant(node.inputs[1])
-        for reader in graph.consumers()[node.name]:
+        for reader in readers[node.name]:
             std = graph.constant(reader.inputs[1]) if reader.op == "RealDiv" else None
             if (
                 mean is not None

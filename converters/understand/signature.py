@@ -306,8 +306,9 @@ def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[st
 
 
 def _one_hot_depth(graph: Graph, types: Types, node: Node) -> int | None:
+    reached = graph.descendants([node.name])
     for reader in graph.nodes:
-        if reader.op == "OneHot" and node.name in graph.ancestors([reader.inputs[0]]):
+        if reader.op == "OneHot" and node_of(reader.inputs[0]) in reached:
             depth = types[reader.inputs[1]].constant
             return None if depth is None else int(depth)
     return None

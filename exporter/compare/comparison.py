@@ -288,16 +288,16 @@ def _match(
     found = {s.name: p for s in signature.outputs if (p := port_of(s, own.outputs)) is not None}
     lacking = [s for s in signature.inputs if s.name not in inputs]
     noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
-    reached = {s.name: policy.graph.ancestors([s.name]) for s in signature.outputs}
-    drawn = frozenset(name for name in found if reached[name] & noise)
+    drawn = frozenset(policy.graph.descendants(noise).intersection(found))
     # What was made for the reference may be missing where all of it is: then the candidate is of another maker.
     spared = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
     for spec in signature.outputs:
         if spec.name not in found and spec.name not in spared:
             text = f"there is no output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
             problems.append(_Problem(spec.name, text))
+    needed = policy.graph.ancestors(found)
     for spec in lacking:
-        if spec.role is not Role.NOISE and any(spec.name in reached[name] for name in found):
+        if spec.role is not Role.NOISE and spec.name in needed:
             text = f"there is no input {aliases[spec.name][0]!r}; there are {_names(own.inputs)}"
             problems.append(_Problem(spec.name, text, blocking=True))
     for spec in signature.inputs:

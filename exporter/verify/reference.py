@@ -69,5 +69,5 @@ class Reference:
 
 def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:
     """The outputs that depend on a sampler inside the graph."""
-    samplers = {n.name for n in graph.nodes if n.op in SAMPLERS}
-    return frozenset(name for name in names if graph.ancestors([name]) & samplers)
+    drawn = graph.descendants(n.name for n in graph.nodes if n.op in SAMPLERS)
+    return frozenset(name for name in names if name in drawn)

@@ -18,7 +18,7 @@ from converters.graph.passes.unroll import MAX_TURNS, unroll
 from converters.graph.run import run_graph
 from fixtures import path
 from fixtures.goldens import read_npz
-from signatures.errors import UnsupportedOpError
+from signatures.errors import GraphError, UnsupportedOpError
 from tests import handmade
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.samples import f32, floats, ints
@@ -195,6 +195,12 @@ def test_a_loop_without_a_known_end_names_its_condition(limit: Any, turns: str) 
 def test_a_loop_that_never_ends_is_refused(nodes: list[Any]) -> None:
     with pytest.raises(UnsupportedOpError, match="more than 64 turns"):
         straight(nodes, "x")
+
+
+@pytest.mark.parametrize("inside", ["loop/x", "loop/next_x"])
+def test_an_output_inside_of_a_loop_is_refused(inside: str) -> None:
+    with pytest.raises(GraphError, match="lies inside of it"):
+        straight(loop(constant("limit", 2)), inside)
 
 
 def test_a_loop_in_a_loop_names_the_inner_one() -> None:

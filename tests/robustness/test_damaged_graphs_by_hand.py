@@ -157,6 +157,11 @@ def test_a_node_without_a_name_or_op_is_refused(tmp_path: Path) -> None:
         refused([*continuous_policy(), broken], tmp_path, "no name or no op")
 
 
+@pytest.mark.parametrize("name", [":0", "mu:1"])
+def test_a_node_that_is_called_as_an_output_is_refused(name: str, tmp_path: Path) -> None:
+    refused([*continuous_policy()[:-1], node(name, "Tanh", "mu", T=np.float32)], tmp_path, f"a node is called {name!r}")
+
+
 def test_a_chain_of_thousands_of_nodes_is_no_trouble(tmp_path: Path) -> None:
     nodes = continuous_policy()
     last = nodes.pop()

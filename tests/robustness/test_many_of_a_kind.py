@@ -6,11 +6,15 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from converters import schema
 from converters.barracuda import format as nn
+from converters.barracuda import lower_base
+from converters.barracuda.writer import policy_model
 from converters.frozen_graph.reader import read_graph
+from converters.graph import compile
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.barracuda.nn_files import write_nn
@@ -53,8 +57,6 @@ def test_more_nodes_than_any_file_has_are_refused(
 
 
 def test_more_layers_than_any_nn_has_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    import numpy as np
-
     layers = tuple(nn.Layer(f"l{i}", 50) for i in range(MANY))
     data = write_nn(nn.NnModel(16, (), (), (), layers, np.zeros(0, np.float32)))
     assert len(nn.parse(data).layers) == MANY
@@ -119,3 +121,38 @@ def test_an_attribute_of_an_onnx_node_of_another_kind_is_named(tmp_path: Path) -
     path.write_bytes(zoo.onnx_policy([helper.make_node("LeakyRelu", ["obs_0"], ["continuous_actions"], alpha="much")]))
     with pytest.raises(UnsupportedOpError, match="its attribute alpha is 'much'"):
         read_source(path)
+
+
+@pytest.mark.parametrize("what", ["inputs", "outputs"])
+def test_more_inputs_or_outputs_than_any_policy_has_are_refused(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import onnx
+    from onnx import helper
+
+    more = [helper.make_tensor_value_info(f"x{i}", 1, ["batch", 2]) for i in range(MANY)]
+    read = helper.make_node("Sum", ["product", *(v.name for v in more)], ["continuous_actions"])
+    if what == "outputs":
+        read = helper.make_node("Relu", ["product"], ["continuous_actions"])
+    made = [helper.make_node("Relu", ["product"], [v.name]) for v in more if what == "outputs"]
+    product = helper.make_node("MatMul", ["obs_0", "kernel"], ["product"])
+    model = onnx.ModelProto.FromString(zoo.onnx_policy([product, read, *made]))
+    getattr(model.graph, "input" if what == "inputs" else "output").extend(more)
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(model.SerializeToString())
+    assert read_source(path).policies()
+    monkeypatch.setattr(compile, "MAX_PORTS", MANY)
+    with pytest.raises(NotAPolicyError, match=f"the policy has {MANY + 1} {what}"):
+        read_source(path).policies()
+
+
+def test_a_nn_of_more_joined_tensors_than_any_policy_has_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    join = node("join", "ConcatV2", *["mu"] * MANY, "axis", N=MANY, T=np.float32, Tidx=np.int32)
+    nodes = [*continuous_policy()[:-1], constant("axis", 1), join, node("action", "Tanh", "join", T=np.float32)]
+    (policy,) = read_source(zoo.frozen(tmp_path, nodes)).policies()
+    assert policy_model(policy)
+    monkeypatch.setattr(lower_base, "MAX_PIECES", MANY - 1)
+    with pytest.raises(UnsupportedOpError, match=f"{MANY} tensors are joined"):
+        policy_model(policy)

@@ -118,11 +118,7 @@ def without_noise(
     are copied under ``prefix``. A product with an all-zero constant is taken to be zero: true for every finite factor,
     and where a standard deviation overflows, the mean is what a policy without chance should give.
     """
-    touched: set[str] = set(noise)
-    for node in graph.nodes:
-        if any(r.rpartition(":")[0] in touched or r in touched for r in node.inputs):
-            touched.add(node.name)
-    wanted = graph.ancestors([reference]) & touched
+    wanted = graph.ancestors([reference]) & graph.descendants(noise)
     if not wanted:
         return graph, reference
     types = infer_types(graph)

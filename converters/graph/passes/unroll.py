@@ -83,8 +83,10 @@ class _Unroller:
     def run(self) -> Graph:
         read = {split_ref(r)[0] for n in self.graph.nodes for r in n.inputs}
         for node in self.graph.nodes:
-            if node.name in self.frames:
-                continue  # loop bodies are made on demand, once per turn
+            if node.name in self.frames:  # loop bodies are made on demand, once per turn
+                if node.name not in read:  # an output
+                    raise _broken(node, f"the output {node.origin!r} lies inside of it, which no Exit leads out of")
+                continue
             try:
                 self.tensor(node.name, None)
             except _DeadError:

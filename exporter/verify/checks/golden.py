@@ -15,7 +15,8 @@ def recorded(trial: Trial) -> Iterator[Finding]:
     """The reference's answers against what the user recorded; what hangs on noise that was not is left out."""
     golden, reference = trial.golden, trial.reference
     names = [s.name for s in trial.signature.outputs if s.name not in reference.drawn]
-    names = [n for n in names if not trial.tested.graph.ancestors([n]) & golden.noiseless]
+    noisy = trial.tested.graph.descendants(golden.noiseless)
+    names = [n for n in names if n not in noisy]
     participant = Participant("golden", reference.runtime, reference.model.run, names, reference.model)
     worst: dict[str, tuple[Difference, str]] = {}
     answers = trial.expected[len(trial.cases) - len(golden.cases) :]
