@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ _new = _sha256()
 
 def hasher(size: int) -> Any:
     """A sha256 in the making, for about ``size`` bytes: it has ``update`` and ``hexdigest``."""
-    if size < _LARGE:
+    if size < _LARGE and "_hashlib" not in sys.modules:
         return _new()
     import hashlib
 

@@ -42,7 +42,12 @@ class Editor(Builder):
 
     def keep(self, node: Node) -> None:
         """Take a node over, its inputs redirected."""
-        self.append(node.with_inputs(self.resolve(r) for r in node.inputs))
+        self.append(self._fed(node))
+
+    def _fed(self, node: Node) -> Node:
+        if self._redirected.keys().isdisjoint(node.inputs):
+            return node
+        return node.with_inputs(self.resolve(r) for r in node.inputs)
 
     def add(
         self,
@@ -65,7 +70,7 @@ class Editor(Builder):
 
     def graph(self) -> Graph:
         """The new graph, redirections applied to all nodes, in topological order; the old one where nothing changed."""
-        nodes = [n.with_inputs(self.resolve(r) for r in n.inputs) for n in self.nodes]
+        nodes = [self._fed(n) for n in self.nodes]
         if len(nodes) == len(self._old.nodes) and all(map(operator.is_, nodes, self._old.nodes)):
             return self._old
         return Graph(topological(nodes))

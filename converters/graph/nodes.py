@@ -42,6 +42,10 @@ class Node:
     attrs: Mapping[str, AttrValue] = field(default_factory=dict)
     value: np.ndarray | None = None
     origin: str | tuple[str, ...] | None = None
+    #: what ``shapes`` last inferred of it: the types that it read, and what came of them
+    inferred: tuple[Sequence[TensorType], Sequence[TensorType]] | None = field(
+        init=False, repr=False, compare=False, default=None
+    )
 
     def with_inputs(self, inputs: Iterable[str]) -> Node:
         """The same node fed from other tensors."""

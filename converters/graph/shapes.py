@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -52,8 +53,23 @@ def _inferred(graph: Graph, partial: bool) -> Types:
 
 def add_types(types: Types, node: Node, symbols: Symbols) -> None:
     """Extend ``types`` by the outputs of a node whose inputs are in it; raises as ``infer_types`` does."""
-    for index, result in enumerate(_results(op_of(node), node, _arguments(node, types), symbols)):
+    for index, result in enumerate(_known_results(node, _arguments(node, types), symbols)):
         types[ref(node.name, index)] = result
+
+
+def _known_results(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    """What a node gives. Most passes leave most nodes as they are: those are inferred once, unless new symbols come of
+    them, which must be the graph's own.
+    """
+    if node.inferred is not None:
+        before, results = node.inferred
+        if len(before) == len(args) and all(map(operator.is_, before, args)):
+            return results
+    made = symbols.count
+    results = _results(op_of(node), node, args, symbols)
+    if symbols.count == made:
+        object.__setattr__(node, "inferred", (args, results))
+    return results
 
 
 def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:

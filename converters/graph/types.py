@@ -46,12 +46,12 @@ class Symbols:
     """Makes symbols for free axes: ``?1``, ``?2``… in the order in which they are met."""
 
     def __init__(self) -> None:
-        self._count = 0
+        self.count = 0
 
     def fresh(self) -> str:
         """A symbol that equals no other."""
-        self._count += 1
-        return f"?{self._count}"
+        self.count += 1
+        return f"?{self.count}"
 
 
 def of_array(array: np.ndarray) -> TensorType:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +23,12 @@ from signatures.errors import ExportModelError, RuntimeUnavailableError
 
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
 TIMEOUT = 300.0
+#: Seconds after which it is looked at again whether one has taken too long.
+_LOOK = 5.0
+
+#: Of numpy's matrix products: what they give does not depend on the machine's processors, and many sources are
+#: exported by a process for each of these.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 
 
 class RunFailedError(ExportModelError):
@@ -44,6 +51,9 @@ class RuntimeProcess:
         self._scratch: OwnFolder | None = None
         #: it has been asked and has not answered
         self._busy = False
+        #: when it was asked
+        self._asked = 0.0
+        self._closed = threading.Event()
         self._memory: Memory | None = None
         self._loaded = 0
 
@@ -65,13 +75,15 @@ class RuntimeProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
-                env={**os.environ, **places},
+                env={**os.environ, **_ONE_THREAD, **places},
             )
         except OSError as error:
             self.close()
             raise RuntimeUnavailableError(
                 f"the runtime {self.name} did not start", why=str(error), fix="export-model runtimes shows what is here"
             ) from error
+        self._closed = threading.Event()
+        threading.Thread(target=self._watch, args=(self._process, self._closed), daemon=True).start()
         # Sent ahead: some runtimes start with the first request. One that ends at once is noticed by ``start``.
         with contextlib.suppress(BrokenPipeError):
             write_frame(self._streams[0], {"cmd": "hello"})
@@ -132,11 +144,8 @@ class RuntimeProcess:
         to, back = self._streams
         process = self._process
         assert process is not None
-        watchdog = threading.Timer(TIMEOUT, process.kill)
-        watchdog.daemon = True  # one that an interrupt leaves behind must not keep this process for TIMEOUT
         try:
-            watchdog.start()
-            self._busy = True
+            self._asked, self._busy = time.monotonic(), True
             if send is not None:
                 send(to)
             answer, results = read_frame(back)
@@ -150,13 +159,18 @@ class RuntimeProcess:
                 why=said or (str(error) if isinstance(error, FramingError) else "it printed nothing"),
                 fix="a native runtime aborts on some malformed graphs; the model is not safe to use there",
             ) from error
-        finally:
-            watchdog.cancel()
         if answer.get("broken"):  # a WebAssembly trap: the heap is not to be trusted any more
             self.close()
         if not answer.get("ok"):
             raise RunFailedError(f"{self.name} failed", why=str(answer.get("error", "no message")))
         return answer, results
+
+    def _watch(self, process: subprocess.Popen[bytes], closed: threading.Event) -> None:
+        """End a process whose answer takes too long. One thread for all requests: there are dozens for each policy."""
+        while not closed.wait(min(_LOOK, TIMEOUT)):
+            if self._busy and time.monotonic() - self._asked > TIMEOUT:
+                process.kill()
+                return
 
     def _last_errors(self) -> str:
         if self._errors is None:
@@ -174,6 +188,7 @@ class RuntimeProcess:
     def close(self) -> None:
         """End the process; one that is not ready yet, or computes (an interrupt came), is not waited for."""
         self.hang_up()
+        self._closed.set()
         process, ready = self._process, self.version is not None and not self._busy
         self._process, self.version, self._busy = None, None, False
         if process is not None:

@@ -56,6 +56,7 @@ class Bisector:
         self._stack = contextlib.ExitStack()
         self._sources: dict[str, str] | None = None
         self._compared: set[Path] = set()
+        self._own: Graph | None = None
 
     def close(self) -> None:
         """Free what was loaded to look inside."""
@@ -86,7 +87,7 @@ class Bisector:
         if participant.path is None or participant.fed is not None or participant.path in self._compared:
             return []
         self._compared.add(participant.path)
-        if not self._differing(runnable(self.tested.graph), participant, feeds):
+        if not self._differing(self._runnable(), participant, feeds):
             return []
         graph = self.graph()  # a bundle's graph is that of its .bytes, which may be what is wrong
         return [] if graph is None else self._differing(graph, participant, feeds)
@@ -116,13 +117,18 @@ class Bisector:
         return self._graph
 
     def _graphs(self) -> Iterator[Graph]:
-        yield runnable(self.tested.graph)
+        yield self._runnable()
         with contextlib.suppress(ExportModelError, OSError):
             yield runnable(read_graph(self.tested.reference.read_bytes()))
         saved = self.tested.artefacts.get("saved_model")
         if saved is not None:
             with contextlib.suppress(ExportModelError, OSError):
                 yield runnable(saved_graph(saved))
+
+    def _runnable(self) -> Graph:
+        if self._own is None:
+            self._own = runnable(self.tested.graph)
+        return self._own
 
     def _within(self, participant: Participant) -> InnerTensors:
         key = (participant.name, participant.runtime)

@@ -17,7 +17,7 @@ def decades(differences: np.ndarray) -> tuple[int, ...]:
     places = np.clip(np.floor(np.log10(positive)).astype(int), FIRST, LAST) - FIRST + 1
     counts = np.bincount(places, minlength=BINS)
     counts[0] = flat.size - positive.size
-    return tuple(int(n) for n in counts)
+    return tuple(counts.tolist())
 
 
 def added(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:

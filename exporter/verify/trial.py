@@ -104,7 +104,7 @@ class Trial:
         self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: Feeds | None = None
     ) -> Difference:
         return compare(
-            self._settled(expected)[name],
+            self._settled({name: expected[name]})[name],
             self._settled({name: got})[name],
             self.tolerance(name, participant),
             free=self._ties(name, expected, participant, rounding or {}),

@@ -26,7 +26,7 @@ def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:
     """See the module; a node in ``keep`` is there under its name afterwards, whatever its op became. Raises
     UnsupportedOpError that names every node whose op is unknown.
     """
-    renamed = [replace(n, op=SPELLINGS.get(n.op, n.op)) for n in graph.nodes]
+    renamed = [replace(n, op=SPELLINGS[n.op]) if n.op in SPELLINGS else n for n in graph.nodes]
     unknown = [n for n in renamed if n.op not in TABLE and n.op not in CONTROL_FLOW]
     if unknown:
         raise unsupported(unknown)
@@ -75,7 +75,8 @@ def _completed(node: Node) -> Node:
                 fix="please open an issue with the graph",
             )
         attrs[name] = given if attr.supported else attr.default
-    return replace(node, attrs=attrs)
+    same = attrs.keys() == node.attrs.keys() and all(attrs[name] is node.attrs[name] for name in attrs)
+    return node if same else replace(node, attrs=attrs)
 
 
 #: What an attribute of each kind is, or each item of a list of them.

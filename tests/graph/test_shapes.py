@@ -1,0 +1,48 @@
+"""What is kept of a node's types from graph to graph is what would be inferred anew."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.passes.normalise import normalise
+from converters.graph.shapes import infer_types
+from converters.graph.types import FLOAT32
+from exporter.export.sources import read_source
+from fixtures import path as fixture
+
+
+def test_a_node_that_reads_something_else_is_inferred_anew() -> None:
+    relu = Node("relu", "Relu", ("x",))
+    for width in (3, 5):
+        x = Node("x", "Placeholder", (), {"dtype": FLOAT32, "shape": TensorShape((None, width))})
+        assert infer_types(Graph((x, relu)))["relu"].shape == ("batch", width)
+
+
+def test_symbols_of_two_graphs_do_not_meet() -> None:
+    """A free axis behind the batch gets a symbol of its own in every graph, whatever was inferred before."""
+
+    def free(name: str) -> Node:
+        return Node(name, "Placeholder", (), {"dtype": FLOAT32, "shape": TensorShape((None, None))})
+
+    one, other = free("one"), free("other")
+    first, second = Node("first", "Relu", ("one",)), Node("second", "Relu", ("other",))
+    infer_types(Graph((one, first)))
+    infer_types(Graph((other, second)))
+    types = infer_types(Graph((one, other, first, second)))
+    assert types["first"].shape == types["one"].shape
+    assert types["first"].shape != types["second"].shape
+
+
+def test_types_of_a_compiled_graph_are_those_of_new_nodes() -> None:
+    for policy in read_source(fixture("recurrent")).policies():
+        graph = normalise(policy.graph)
+        assert graph is policy.graph  # so that nothing is inferred again
+        anew = Graph(tuple(Node(n.name, n.op, n.inputs, n.attrs, n.value, n.origin) for n in graph.nodes))
+        kept, fresh = infer_types(graph), infer_types(anew)
+        assert kept.keys() == fresh.keys()
+        for name, kind in kept.items():
+            assert (kind.dtype, kind.shape) == (fresh[name].dtype, fresh[name].shape)
+            assert (kind.value is None) == (fresh[name].value is None)
+            if kind.value is not None:
+                assert np.array_equal(kind.value, fresh[name].value)
