@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from converters.graph.nodes import Graph
+from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
 

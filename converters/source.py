@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from converters.folders import scratch_folder
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph
 from converters.understand.facts import SourceFacts
+from signatures.records import dataclass
 from signatures.spec import SourceMap
 
 

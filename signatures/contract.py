@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from signatures.fields import Field, FieldError
 from signatures.labels import parsed
 from signatures.memories import SourcePart
+from signatures.records import dataclass
 from signatures.roles import INPUT_ROLES, Constant, Role
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
 from signatures.memories import SourcePart
+from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Constant, Role
 
 

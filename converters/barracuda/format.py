@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from signatures.errors import DamagedFileError
+from signatures.records import dataclass
 
 VERSIONS = range(15, 21)
 #: The first version of each change; see the module.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 from converters.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
@@ -20,6 +20,7 @@ from converters.barracuda.vocabulary import LayerType
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
+from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, OUTPUT_NAMES, Role
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"

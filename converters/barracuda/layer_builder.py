@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +18,7 @@ from converters.barracuda.vocabulary import layer_label
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node
 from signatures.errors import GraphError, UnsupportedOpError
+from signatures.records import dataclass
 
 #: N, H, W, C; N is None where it is the batch.
 Shape = tuple[int | None, int, int, int]

@@ -20,7 +20,7 @@ chance is not where it is made here: it is the largest score of each branch, or 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH, Dim
 from converters.policy import Policy
 from signatures.errors import SignatureError
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 

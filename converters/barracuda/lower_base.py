@@ -12,7 +12,7 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from converters.graph.nodes import NameScope, Node
 from converters.graph.shapes import Types
 from converters.graph.types import BATCH, Dim, TensorType
 from signatures.errors import UnsupportedOpError
+from signatures.records import dataclass
 
 Array = npt.NDArray[np.float32]
 #: Where each axis of a tensor of the graph lies: N, H, W or C; None: nowhere, its length is 1.

@@ -7,7 +7,7 @@ import errno
 import json
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,6 +21,7 @@ from signatures.contract import POLICY, Contract, FileEntry, json_of, parse
 from signatures.digest import sha256_of_file
 from signatures.errors import BundleError, UsageError
 from signatures.fields import FieldError
+from signatures.records import dataclass
 from signatures.spec import PolicySignature
 
 #: Tensor → what its artefact says of it: dtype and shape.

@@ -7,7 +7,7 @@ slots of an optimizer make up most of a checkpoint, and nothing that a policy co
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from converters.graph.ops.outside import EFFECTS, VARIABLES
 from converters.graph.ops.table import hands_on
 from converters.understand.brains import depends_on_input, find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
+from signatures.records import dataclass
 from signatures.roles import CONSTANT_NAMES
 
 _IN_A_CHECKPOINT = "it is the graph that training started from; the values are in a checkpoint, and none lies beside it"

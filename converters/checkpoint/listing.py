@@ -16,8 +16,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+
+from signatures.records import dataclass
 
 RAW_GRAPH, FROZEN_GRAPH, LIST = "raw_graph_def.pb", "frozen_graph_def.pb", "checkpoint"
 #: Final exports, the one that is taken first: graphs hold most, and an ONNX has a runtime of its own to be verified in.

@@ -8,7 +8,7 @@ and length per axis; saver.py, checkpoint_ops.cc). Where there is no saver, a va
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +22,7 @@ from converters.frozen_graph.tensors import to_array
 from converters.graph.nodes import Graph, node_of, split_ref
 from converters.graph.ops.outside import ASSIGNS, RESTORES
 from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

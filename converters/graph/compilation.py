@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 from converters.graph.nodes import Graph
 from converters.graph.options import CompileOptions
@@ -11,6 +11,7 @@ from converters.understand.action import ActionMeaning
 from converters.understand.brains import Brain
 from converters.understand.facts import SourceFacts
 from signatures.memories import SourcePart
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 

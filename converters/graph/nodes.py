@@ -7,13 +7,14 @@ Graphs are immutable by convention: passes make new ones.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
 from converters.graph.types import TensorType
 from signatures.errors import GraphError
+from signatures.records import dataclass
 
 #: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
 AttrValue = Any

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
+from signatures.records import dataclass
 from signatures.roles import Role
 
 #: What becomes of the normals that are drawn inside the graph: an input, they stay, or zeros.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+
+from signatures.records import dataclass
 
 #: An axis: its length, or a symbol (equal symbols are equal lengths).
 Dim = int | str

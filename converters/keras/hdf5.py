@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.runtimes.python import child_command, module_origin
 from signatures.errors import DamagedFileError, RuntimeUnavailableError
+from signatures.records import dataclass
 
 _CHILD = "converters.keras.hdf5_child"
 

@@ -7,10 +7,11 @@ Three spellings are one form here: Keras 2 and TensorFlow.js (``inbound_nodes: [
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 from signatures.errors import DamagedFileError
+from signatures.records import dataclass
 
 #: Classes that are models themselves.
 MODELS = frozenset(("Functional", "Model", "Sequential"))

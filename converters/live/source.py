@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from converters.live.session import read_session
 from converters.source import SourceModel
 from signatures.digest import sha256_hex
 from signatures.errors import UsageError
+from signatures.records import dataclass
 
 _KINDS = {
     "session": (Format(key="session", label="a live session"), read_session),

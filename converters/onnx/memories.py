@@ -9,10 +9,10 @@ Operands and outputs by position: onnx/docs/Operators.md (LSTM, GRU).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from converters.onnx.importer.node import STANDARD
+from signatures.records import dataclass
 
 Dims = tuple[int | None, ...] | None
 

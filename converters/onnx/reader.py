@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from converters.onnx.proto import array_of, decoded, load_external, tensors
 from converters.onnx.rows import Reading, dims_of, read_rows
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
+from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
 
 _FLOAT, _DOUBLE = 1, 11

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from converters.graph.types import TensorType
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import DTYPES
 from signatures.errors import ExportModelError, NotAPolicyError, SignatureError
+from signatures.records import dataclass
 
 _ROWS = 3
 #: Numbers that the trial may make: all tensors of all rows together. A policy has some thousands, a camera's a million.

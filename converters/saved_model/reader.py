@@ -7,7 +7,6 @@ the signatures call functions of the graph's library (converters/saved_model/inl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from converters import schema
@@ -15,6 +14,7 @@ from converters.graph.nodes import TensorShape, node_of
 from converters.graph.ops.outside import CALLING
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.records import dataclass
 
 SERVING = "serving_default"
 _INIT = "__saved_model_"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from converters.understand.memories import float_rows, paired_memories
 from signatures.contract import EMBEDDED
 from signatures.errors import DamagedFileError
 from signatures.memories import SeparateMemory
+from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 

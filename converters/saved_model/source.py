@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from converters.saved_model.signature import ModelSignature, declared, expose, f
 from converters.source import OriginalRun, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.errors import NotAPolicyError
+from signatures.records import dataclass
 
 FILE = "saved_model.pb"
 _WITHOUT_VARIABLES = (

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from converters.torch_checkpoint.network import Network, rnn_sizes
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.records import dataclass
 from signatures.roles import Role
 
 _EXPORT_ONNX = "export the model to ONNX in its own project (torch.onnx.export), and give that"

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from signatures.errors import DamagedFileError, SourceError
+from signatures.records import dataclass
 
 _NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)", re.IGNORECASE)
 _MEMBER = re.compile(r"""(['"])((?:[^'"\\]|\\.)*)\1\s*[:,]\s*(Box|Discrete|MultiDiscrete|MultiBinary)\(""")

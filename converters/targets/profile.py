@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NoReturn
 
 from converters.pieces import Pieces
 from converters.policy import Policy
 from signatures.errors import ProfileError
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,7 +13,6 @@ import binascii
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from converters.graph.ops.outside import IFS, WHILES
 from converters.graph.ops.table import is_fed
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from signatures.records import dataclass
 
 MODEL = "model.json"
 _DTYPES = {

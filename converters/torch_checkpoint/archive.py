@@ -13,13 +13,13 @@ import math
 import struct
 import zipfile
 import zlib
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from converters.torch_checkpoint.unpickle import StorageType, Tensor, unpickle
 from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.records import dataclass
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from converters.graph.nn.normalisation import layer
@@ -22,6 +21,7 @@ from converters.torch_checkpoint.rsl_rl import per_action
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.records import dataclass
 from signatures.roles import Role
 
 USUAL = "CleanRL's scripts have tanh in PPO, relu in DQN, C51, PQN, SAC, TD3, DDPG and before images"

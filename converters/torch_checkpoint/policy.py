@@ -20,7 +20,6 @@ POCA (none at all in 0.20 and 0.21), tanh for SAC, which alone has a deviation t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from converters.torch_checkpoint.state import LET_IT_EXPORT, State
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import TORCH_VERSION_3
 from signatures.errors import DamagedFileError, SourceError
+from signatures.records import dataclass
 
 _BODY = "network_body"
 #: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.

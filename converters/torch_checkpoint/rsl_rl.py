@@ -8,7 +8,6 @@ runners/on_policy_runner.py of 2.3 and 3.1; rsl_rl/models/*.py and algorithms/pp
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from converters.torch_checkpoint.network import Network, rnn_sizes
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError
+from signatures.records import dataclass
 from signatures.roles import Role
 
 USUAL = "rsl_rl's default is elu"

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from converters.torch_checkpoint.state import LET_IT_EXPORT
 from converters.torch_checkpoint.weights import Weights
 from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.records import dataclass
 
 #: Larger sides are not looked for.
 _LONGEST = 1024

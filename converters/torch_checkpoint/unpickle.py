@@ -13,10 +13,10 @@ from __future__ import annotations
 import pickletools
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import IO, Any
 
 from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.records import dataclass
 
 #: A checkpoint has some thousands of opcodes; with a critic and an optimizer some ten thousands.
 MAX_OPCODES = 1 << 21

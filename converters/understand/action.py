@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import passes_on, traits
+from signatures.records import dataclass
 from signatures.roles import Role
 
 _MAX_LEAVES = 1024

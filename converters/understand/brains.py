@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
 from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.state_names import looks_like_state
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
+from signatures.records import dataclass
 from signatures.roles import (
     ACTION_NAMES,
     CANONICAL,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 from signatures.memories import SeparateMemory
+from signatures.records import dataclass
 from signatures.roles import Constant, Role
 
 

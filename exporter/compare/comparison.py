@@ -12,7 +12,7 @@ import difflib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -39,6 +39,7 @@ from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import verify
 from signatures.contract import POLICY
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, naming
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 from signatures.spec import TensorSpec

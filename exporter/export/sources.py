@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 
 from converters.format import Format
@@ -14,6 +14,7 @@ from converters.policy import Policy
 from converters.read import check_options, fetched, read_models
 from converters.source import ReadOptions, SourceModel
 from signatures.errors import naming
+from signatures.records import dataclass
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")

@@ -6,7 +6,6 @@ import hashlib  # noqa: F401  OpenSSL's sha256 is several times as fast, which o
 import signal
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
@@ -19,6 +18,7 @@ from exporter.export.pipeline import Exporter, ExportOptions, ExportResult
 from exporter.fleet.ledger import Stamp, stamps
 from exporter.reports.entry import Entry, of_result
 from signatures.errors import ExportModelError, SourceError
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from exporter.export.pipeline import ExportResult
 from exporter.verify.report import ParityReport
 from signatures.contract import Contract
 from signatures.errors import ExportModelError
+from signatures.records import dataclass
 from signatures.sampling import draw_cases, draw_rollout
 from signatures.spec import PolicySignature
 

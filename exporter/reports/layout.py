@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from signatures.records import dataclass
 
 _GAP, _ROW = 22.0, 70.0
 #: Width that an edge takes in a row that it only passes.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from exporter.verify.findings import Failure, Finding
 from exporter.verify.report import ParityReport
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

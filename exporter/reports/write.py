@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from exporter.reports.entry import Entry
 from signatures.errors import UsageError
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from signatures.errors import UsageError
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 

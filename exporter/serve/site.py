@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,6 +20,7 @@ from exporter.serve.server import DATA, TYPES
 from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
+from signatures.records import dataclass
 
 PAGE = Path(__file__).resolve().parent / "page"
 POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 
 from converters.bundle import bundle
 from converters.formats import WRITTEN
 from converters.frozen_graph.reader import read_graph
 from signatures.errors import naming
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 

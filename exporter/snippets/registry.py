@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from string import Template
 from typing import Any
@@ -13,6 +12,7 @@ from converters.formats import WRITTEN
 from exporter.snippets import agent, csharp, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle, quoted
 from signatures.errors import BundleError, UsageError
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True)

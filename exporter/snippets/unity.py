@@ -8,9 +8,9 @@ BarracudaModelParamLoader's forerunner, TensorFlowSharp's InferenceBrain/ModelPa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from exporter.snippets.contract import Bundle, branch_lines, numbered
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 

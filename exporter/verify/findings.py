@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from converters.runtimes.process import RunFailedError
 from exporter.verify.histogram import to_dict
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,13 +13,13 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from signatures.errors import UsageError
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import Case
 from signatures.spec import PolicySignature, TensorSpec

@@ -13,7 +13,6 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +28,7 @@ from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.saved_model.reader import read_saved_model
 from converters.source import OriginalRun
 from exporter.verify.participants import Feeds, Participant, Run
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun
 from exporter.verify.findings import Finding
+from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
 #: The runtime that takes longest to start, by far.

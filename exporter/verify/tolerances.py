@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 
 from signatures.errors import UsageError
+from signatures.records import dataclass
 from signatures.spec import PolicySignature
 
 #: |a − b| ≤ ATOL + RTOL·|b| for every element.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from converters.graph.builder import Builder
 from converters.graph.nn.shaping import padded
 from converters.graph.ops.convolution import window_padding
 from signatures.errors import UnsupportedOpError
+from signatures.records import dataclass
 
 MAX_GROUPS = 256
 Pair = tuple[int, int]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +17,7 @@ from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import matmul
 from converters.graph.nn.shaping import taken
 from signatures.errors import UnsupportedOpError
+from signatures.records import dataclass
 
 Places = npt.NDArray[np.float32]
 Weights = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ GraphDef, how other versions of TensorFlow spell it, and the *traits* that passe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from converters.graph.nodes import Node
 from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
+from signatures.records import dataclass
 
 Kernel = Callable[..., Any]
 Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from converters.understand.inputs import role_by_name
 from converters.understand.memories import paired_memories
 from signatures.errors import SignatureError
 from signatures.memories import SeparateMemory, SourcePart
+from signatures.records import dataclass
 from signatures.roles import CANONICAL, Role
 
 

@@ -11,7 +11,7 @@ UnsupportedOpError where a predicate is not constant or a loop runs for more tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
 from converters.graph.shapes import Types, infer_types, run_kernel
 from converters.graph.types import INT32
 from signatures.errors import GraphError, UnsupportedOpError
+from signatures.records import dataclass
 
 MAX_TURNS = 64
 

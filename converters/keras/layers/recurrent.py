@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from converters.keras.layers.activations import activation_of
 from converters.keras.layers.step import Step, Translate
 from converters.keras.model import Layer, cells_of, layer_of
 from signatures.errors import DamagedFileError, UnsupportedOpError
+from signatures.records import dataclass
 
 #: (x [B, n], states) → the new states; the first is what the cell gives.
 Turn = Callable[[str, Sequence[str]], list[str]]

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from converters.graph.types import BATCH, Dim, Symbols
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 from signatures.errors import UnsupportedOpError
+from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.onnx.importer.importer import Importer

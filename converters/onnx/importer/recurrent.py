@@ -6,7 +6,6 @@ Equations and gate orders: onnx/docs/Operators.md (LSTM: i, o, f, c; GRU: z, net
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from converters.graph.nn import recurrent as nn
 from converters.graph.types import FLOAT32, Dim
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
+from signatures.records import dataclass
 
 _DEFAULTS = {
     "LSTM": ("sigmoid", "tanh", "tanh"),

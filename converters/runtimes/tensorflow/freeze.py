@@ -6,10 +6,10 @@ For processes that have imported it: the children, and a training script that gi
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from converters.graph.ops.outside import FUNCTIONAL
+from signatures.records import dataclass
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ import os
 import platform
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from converters.runtimes.cache import cache_folder
+from signatures.records import dataclass
 
 API_LIBRARY = "_pywrap_tensorflow_internal.so"
 #: The API library finds the other one beside itself (RUNPATH $ORIGIN).

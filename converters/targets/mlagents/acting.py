@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from converters.graph.types import FLOAT32, INT32, INT64
 from converters.targets.mlagents.dressing import Dressing, row
 from converters.targets.mlagents.feeding import supply_masks
 from converters.understand.action import action_meaning
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 

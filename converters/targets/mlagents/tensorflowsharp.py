@@ -8,8 +8,6 @@ in the graph, as the trainers of 0.3 on did it: the *Graph Placeholders* of the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from converters.graph.nodes import Node, TensorShape
@@ -18,6 +16,7 @@ from converters.policy import Policy
 from converters.targets.mlagents import feeding
 from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities, samples
 from converters.targets.mlagents.dressing import Dressing, row
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import Memory, TensorSpec
 

@@ -8,7 +8,7 @@ LSTM becomes a memory that the runtime manages; where it is cut from an input di
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from converters.targets.unity.model import (
     truncated,
 )
 from converters.targets.unity.onnx_file import Dims, OnnxFile, attributes
+from signatures.records import dataclass
 
 _TO_NCHW = (0, 3, 1, 2)
 _INITIAL_H = 5

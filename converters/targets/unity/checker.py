@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from converters.targets.unity.onnx_file import OnnxFile, read_onnx_file
 from converters.targets.unity.overlooked import overlooked
 from converters.targets.unity.settings import Brain
 from signatures.errors import SourceError
+from signatures.records import dataclass
 
 #: Deterministic Inference of Behavior Parameters: off and on.
 MODES = {"stochastic": False, "deterministic": True}

@@ -8,13 +8,13 @@ that is a ``Construct``. ``converters/targets/unity/readings.py`` says what each
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from signatures.errors import DamagedFileError
+from signatures.records import dataclass
 
 #: The pseudo-operators that an output and an input of the model are listed as.
 OUTPUT, INPUT = "(output)", "(input)"

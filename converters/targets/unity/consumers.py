@@ -7,10 +7,10 @@ Engine 2.2.2 no verdict differs. ML-Agents 4.0.1 depends on Inference Engine 2.4
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 from signatures.errors import UsageError
+from signatures.records import dataclass
 
 
 class Engine(Enum):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from converters.onnx.proto import decoded, load_external
 from converters.targets.unity.onnx_constants import RANDOM_OPS, value_of
 from converters.targets.unity.onnx_shapes import inferred_shapes
 from signatures.errors import DamagedFileError
+from signatures.records import dataclass
 
 #: TensorProto.DataType that Sentis holds as floats; everything else is held as int.
 _FLOATS = frozenset({1, 10, 11, 16})

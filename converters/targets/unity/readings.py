@@ -9,12 +9,12 @@ forms of later ones too, and some of them wrongly.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
 from converters.targets.unity.constructs import INPUT, OUTPUT, Construct, Model, Operand, Source
+from signatures.records import dataclass
 
 #: The importers that were measured, the oldest first, and what of ML-Agents uses them.
 IMPORTERS: Mapping[str, str] = {

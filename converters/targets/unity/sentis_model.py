@@ -8,7 +8,7 @@ counts as 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import ClassVar
 
@@ -32,6 +32,7 @@ from converters.targets.unity.model import (
     truncated,
 )
 from converters.targets.unity.onnx_file import Dims, OnnxFile
+from signatures.records import dataclass
 
 _SINGLE, _INT32 = "Single", "Int32"
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 from converters.fetch import read_bytes
 from signatures.errors import UsageError
+from signatures.records import dataclass
 
 #: Class of a sensor by the number of its axes, where nobody names it.
 _CLASSES = {1: "VectorSensor", 2: "BufferSensor", 3: "CameraSensor"}
