@@ -68,7 +68,7 @@ class Detached:
                     content = self._without(view[start:end], inner)
                 if content is None:
                     continue
-                parts += [view[kept:tag_end], _varint(sum(map(len, content))), *content]
+                parts += [view[kept:tag_end], varint(sum(map(len, content))), *content]
                 kept = end
         except _NoMessageError:
             return None
@@ -95,7 +95,7 @@ class Detached:
                 continue
             content = self._whole(view[start:end], places[first:next_place], offset + start)
             size = sum(len(p) if isinstance(p, bytes) else p.nbytes for p in content)
-            parts += [bytes(view[kept:tag_end]) + _varint(size), *content]
+            parts += [bytes(view[kept:tag_end]) + varint(size), *content]
             kept = end
         return [*parts, bytes(view[kept:])]
 
@@ -146,7 +146,8 @@ def _read_varint(view: memoryview, at: int) -> tuple[int, int]:
     raise _NoMessageError
 
 
-def _varint(value: int) -> bytes:
+def varint(value: int) -> bytes:
+    """As protobuf writes a number."""
     data = bytearray()
     while value > 0x7F:
         data.append(value & 0x7F | 0x80)

@@ -8,11 +8,12 @@ that the list of formats (converters/formats.py) costs nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from signatures.contract import FileEntry
+from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.content import Content
@@ -27,13 +28,14 @@ Dims = tuple[int | None, ...]
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, and the profile's name where
-    the file is made for one consumer (``--for``).
+    """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
+    file is made for one consumer (``--for``), and whether the result is to be proved valid (ONNX: by its checker).
     """
 
     contract: str
     opset: int = 15
     profile: str | None = None
+    checked: bool = True
 
 
 @dataclass(frozen=True, slots=True)

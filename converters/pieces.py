@@ -7,12 +7,12 @@ transposed view) is copied a few megabytes at a time, when it is written.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from signatures.digest import hasher
+from signatures.records import dataclass
 
 #: Bytes that are handed on at once.
 _CHUNK = 4 << 20

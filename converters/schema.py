@@ -1,10 +1,9 @@
-"""The TensorFlow messages this project reads and writes, in a descriptor pool of their own.
+"""The TensorFlow messages this project reads and writes.
 
 Only the fields that are needed, by the numbers of TensorFlow's public .proto files (graph.proto, node_def.proto,
 attr_value.proto, tensor.proto, tensor_shape.proto, versions.proto, saved_model.proto, meta_graph.proto,
 function.proto, op_def.proto, saver.proto, tensor_bundle.proto, tensor_slice.proto, trackable_object_graph.proto,
-event.proto). Fields that are not listed survive as unknown fields. A private pool, so that a real ``tensorflow`` in the
-same process does not clash, and so that no generated code has to match the installed protobuf.
+event.proto). Fields that are not listed survive as unknown fields.
 """
 
 from __future__ import annotations
@@ -12,31 +11,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
 from converters.detached import LARGE_FILE, Detached, Fields
+from converters.messages import message_classes
 from converters.pieces import Pieces
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Nodes of a file, training part and functions included.
 MAX_NODES = 1 << 17
 
-_SCALARS = {
-    "string": 9,
-    "bytes": 12,
-    "int32": 5,
-    "int64": 3,
-    "uint32": 13,
-    "uint64": 4,
-    "float": 2,
-    "double": 1,
-    "bool": 8,
-    "fixed32": 7,
-}
-_MESSAGE_KIND, _OPTIONAL, _REPEATED = 11, 1, 3
-
-#: message → fields, each "number name kind", kind with * for repeated and <K for a map from string to K.
+#: message → fields, as converters/messages.py reads them
 _MESSAGES = {
     "Dim": "1 size int64, 2 name string",
     "TensorShapeProto": "2 dim Dim*, 3 unknown_rank bool",
@@ -87,45 +72,7 @@ _MESSAGES = {
 _ONEOFS = {"AttrValue": "value"}
 
 
-def _add_message(file: Any, name: str, fields: str) -> None:
-    message = file.message_type.add(name=name)
-    if name in _ONEOFS:
-        message.oneof_decl.add(name=_ONEOFS[name])
-    for text in fields.split(", "):
-        number, field_name, kind = text.split()
-        field = message.field.add(name=field_name, number=int(number))
-        field.label = _REPEATED if kind.endswith("*") or kind.startswith("<") else _OPTIONAL
-        if kind.startswith("<"):
-            entry_name = "".join(part.capitalize() for part in field_name.split("_")) + "Entry"
-            entry = message.nested_type.add(name=entry_name)
-            entry.options.map_entry = True
-            entry.field.add(name="key", number=1, type=9, label=_OPTIONAL)
-            value = entry.field.add(name="value", number=2, label=_OPTIONAL)
-            if kind[1:] in _SCALARS:
-                value.type = _SCALARS[kind[1:]]
-            else:
-                value.type, value.type_name = _MESSAGE_KIND, f".export_model.{kind[1:]}"
-            field.type, field.type_name = _MESSAGE_KIND, f".export_model.{name}.{entry_name}"
-        elif kind.rstrip("*") in _SCALARS:
-            field.type = _SCALARS[kind.rstrip("*")]
-        else:
-            field.type, field.type_name = _MESSAGE_KIND, f".export_model.{kind.rstrip('*')}"
-        if name in _ONEOFS:
-            field.oneof_index = 0
-
-
-def _build() -> dict[str, Any]:
-    file = descriptor_pb2.FileDescriptorProto(name="export_model.proto", package="export_model", syntax="proto3")
-    for name, fields in _MESSAGES.items():
-        _add_message(file, name, fields)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return {
-        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"export_model.{name}")) for name in _MESSAGES
-    }
-
-
-_CLASSES = _build()
+_CLASSES = message_classes("export_model", _MESSAGES, _ONEOFS, "proto3")
 GraphDef = _CLASSES["GraphDef"]
 NodeDef = _CLASSES["NodeDef"]
 AttrValue = _CLASSES["AttrValue"]

@@ -1,9 +1,9 @@
 """Policy to ONNX: each node through its lowering in the op table.
 
 Canonical names for inputs and outputs, the batch axis symbolic, the contract in ``metadata_props``, checked by
-``onnx.checker`` with full shape inference before anything is written. Values are called as the tensors of the graph
-that they are; where that cannot be, ``metadata_props`` says so (converters/onnx/tensor_map.py), so that verification
-can point at a tensor inside.
+``onnx.checker`` with full shape inference before anything is written, unless nothing is to be verified. Values are
+called as the tensors of the graph that they are; where that cannot be, ``metadata_props`` says so
+(converters/onnx/tensor_map.py), so that verification can point at a tensor inside.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from converters.graph.ops.table import op_of, unsupported
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
+from converters.onnx import messages
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
 from converters.pieces import Pieces, equal
 from converters.policy import Policy
@@ -60,9 +61,6 @@ class _Builder:
     """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
 
     def __init__(self, graph: Graph, opset: int, outputs: Collection[str], profile: str | None = None) -> None:
-        import onnx
-
-        self.onnx = onnx
         self.opset = opset
         self.constant_first = profile not in SWAPS_OPERANDS
         self._sinks = profile is not None
@@ -105,12 +103,7 @@ class _Builder:
         if sunk:
             return sunk
         names = [self.fresh(f"{self._prefix}/{op}" if self._prefix else op) for _ in range(outputs)]
-        for key, value in attributes.items():
-            if isinstance(value, np.dtype):
-                attributes[key] = self.onnx.helper.np_dtype_to_tensor_dtype(value)
-            elif isinstance(value, np.ndarray):
-                attributes[key] = self.onnx.numpy_helper.from_array(value)
-        self.nodes.append(self.onnx.helper.make_node(op, list(inputs), names, name=names[0], **attributes))
+        self.nodes.append(messages.node(op, inputs, names, names[0], **attributes))
         if op == "Transpose":
             self._transposed[names[0]] = (inputs[0], tuple(attributes["perm"]))
         return names[0] if outputs == 1 else tuple(names)
@@ -146,10 +139,8 @@ class _Builder:
         return name
 
     def _tensor(self, array: np.ndarray, name: str) -> Any:
-        if array.nbytes < LARGE:
-            return self.onnx.numpy_helper.from_array(np.asarray(array, order="C"), name)
-        kind = self.onnx.helper.np_dtype_to_tensor_dtype(array.dtype)
-        return self.onnx.TensorProto(dims=array.shape, data_type=kind, name=name, raw_data=self.detached.mark(array))
+        raw = None if array.nbytes < LARGE else self.detached.mark(array)
+        return messages.tensor(array if raw else np.asarray(array, order="C"), name, raw)
 
     def begin(self, prefix: str) -> None:
         """Let the names of what is made from here on begin with ``prefix``."""
@@ -197,7 +188,7 @@ class _Builder:
             return
         maker = next((n for n in self.nodes if value in n.output), None)
         inputs = list(maker.input) if maker is not None and maker.op_type == "Reshape" else [value]
-        self.nodes.append(self.onnx.helper.make_node("Reshape" if len(inputs) == 2 else "Identity", inputs, [output]))
+        self.nodes.append(messages.node("Reshape" if len(inputs) == 2 else "Identity", inputs, [output]))
 
     def _rename(self, start: int, renamed: Mapping[str, str]) -> None:
         """Call the results of the nodes from ``start`` on otherwise."""
@@ -233,29 +224,17 @@ class _Builder:
         return TensorMap(views, sources)
 
 
-def _value_info(onnx: Any, spec: TensorSpec, batch: str = "batch") -> Any:
+def _value_info(spec: TensorSpec) -> Any:
     dims = [
-        (batch if i == 0 else f"{spec.name}_dim_{i}") if size is None else size for i, size in enumerate(spec.shape)
+        ("batch" if i == 0 else f"{spec.name}_dim_{i}") if size is None else size for i, size in enumerate(spec.shape)
     ]
-    return onnx.helper.make_tensor_value_info(
-        spec.name, onnx.helper.np_dtype_to_tensor_dtype(np.dtype(spec.dtype)), dims
-    )
-
-
-def _constant_info(onnx: Any, name: str, value: np.ndarray) -> Any:
-    kind = onnx.helper.np_dtype_to_tensor_dtype(value.dtype)
-    return onnx.helper.make_tensor_value_info(name, kind, list(value.shape))
+    return messages.value_info(spec.name, np.dtype(spec.dtype), dims)
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The ONNX artefact. Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering,
     GraphError when the checker refuses the result (a fault of this tool).
     """
-    import onnx
-    import onnx.checker
-    import onnx.helper
-    import onnx.numpy_helper
-
     if options.opset not in (IR_VERSIONS if options.profile else ASKED_FOR):
         raise UsageError(
             f"opset {options.opset} is not written",
@@ -274,41 +253,44 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     builder.begin("")
     for name, value in policy.constants.items():
         source = builder.const(value, f"{name}/value")
-        builder.nodes.append(onnx.helper.make_node("Identity", [source], [name]))
+        builder.nodes.append(messages.node("Identity", [source], [name]))
     builder.prune([*(s.name for s in policy.signature.outputs), *policy.constants])
     used = {name for node in builder.nodes for name in node.input}
-    model = onnx.helper.make_model(
-        onnx.helper.make_graph(
-            builder.nodes,
-            policy.name,
-            [_value_info(onnx, s) for s in policy.signature.inputs],
-            [
-                *(_value_info(onnx, s) for s in policy.signature.outputs),
-                *(_constant_info(onnx, name, value) for name, value in policy.constants.items()),
-            ],
-            [i for i in builder.initializers if i.name in used],
-        ),
-        producer_name=PRODUCER,
-        ir_version=IR_VERSIONS[options.opset],
-        opset_imports=[onnx.helper.make_opsetid("", options.opset)],
-    )
     present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
     tensors = builder.tensors(policy.graph, present).dumps()
-    onnx.helper.set_model_props(model, {CONTRACT_KEY: options.contract, **({TENSORS_KEY: tensors} if tensors else {})})
-    _check(onnx, model, builder.detached, policy.name)
+    model = messages.model(
+        policy.name,
+        builder.nodes,
+        [i for i in builder.initializers if i.name in used],
+        [_value_info(s) for s in policy.signature.inputs],
+        [
+            *(_value_info(s) for s in policy.signature.outputs),
+            *(messages.value_info(name, value.dtype, value.shape) for name, value in policy.constants.items()),
+        ],
+        producer=PRODUCER,
+        ir_version=IR_VERSIONS[options.opset],
+        opset=options.opset,
+        props={CONTRACT_KEY: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
+    )
+    if options.checked:
+        _check(model, builder.detached, policy.name)
     return {f"{policy.name}.onnx": builder.detached.whole(model.SerializeToString(deterministic=True))}
 
 
-def _check(onnx: Any, model: Any, detached: Detached, name: str) -> None:
+def _check(model: Any, detached: Detached, name: str) -> None:
     """Raise GraphError where the checker refuses a model; weights that are detached are inputs for it."""
-    plain = onnx.ModelProto()
+    import onnx.checker
+    import onnx.shape_inference
+
+    plain = type(model)()
     plain.CopyFrom(model)
     del plain.graph.initializer[:]
     for tensor in model.graph.initializer:
-        if detached.array(tensor.raw_data) is None:
+        array = detached.array(tensor.raw_data)
+        if array is None:
             plain.graph.initializer.append(tensor)
         else:
-            plain.graph.input.append(onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, tensor.dims))
+            plain.graph.input.append(messages.value_info(tensor.name, array.dtype, tensor.dims))
     try:
         onnx.checker.check_model(plain.SerializeToString(), full_check=True)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:

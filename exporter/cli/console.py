@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import click
 
 from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines
 from signatures.errors import UsageError
+from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from exporter.export.pipeline import ExportResult
@@ -217,15 +217,21 @@ class Console:
 
 def _next(results: Sequence[ExportResult]) -> str:
     """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
-    from exporter.reports.summary import to_verify
-    from exporter.serve.scenes import scene_of
     from exporter.tables import hint
 
-    last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), results[-1])
+    last = results[-1]
+    if len(results) > 1:
+        from exporter.serve.scenes import scene_of
+
+        last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), last)
     if last.report is None:
         return hint(f"export-model verify {last.folder}", "nothing was compared yet")
-    if last.report.passed is None and (install := to_verify(last.report)) is not None:
-        return hint(install, f"then: export-model verify {last.folder}")
+    if last.report.passed is None:
+        from exporter.reports.summary import to_verify
+
+        install = to_verify(last.report)
+        if install is not None:
+            return hint(install, f"then: export-model verify {last.folder}")
     if {"tfjs", "bytes"} <= {*last.sizes}:
         return hint(f"export-model serve {last.folder}", "see it act, in a browser")
     return hint(f"export-model snippets {last.folder}", "code for Python, JavaScript, C#, Unity, TF Serving")

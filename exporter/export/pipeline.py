@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,21 +13,15 @@ from converters.bundle import bundle
 from converters.folders import scratch_folder
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
-from converters.frozen_graph.writer import frozen
 from converters.graph.options import CompileOptions
 from converters.policy import Policy
-from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.saved_model.writer import signatures_of
 from converters.source import ReadOptions, SourceModel
 from exporter.export.labels import Labels, check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import PolicyUnderTest
-from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import check_rules
-from exporter.verify.verification import verify
 from exporter.version import __version__
 from signatures.contract import PARITY, Contract, Origin, parse, safe_name
 from signatures.errors import (
@@ -38,9 +32,14 @@ from signatures.errors import (
     naming,
 )
 from signatures.fields import FieldError, printable
+from signatures.records import dataclass
 
 if TYPE_CHECKING:
+    from converters.runtimes.pool import RuntimePool
+    from converters.runtimes.registry import RuntimeInfo
     from converters.targets.profile import Profile
+    from exporter.verify.participants import PolicyUnderTest
+    from exporter.verify.report import ParityReport
 
 Progress = Callable[[str], None]
 
@@ -142,9 +141,12 @@ class Exporter:
         self._profile = None if taken else wanted
         if not self._formats:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
-        self.runtimes, self._known = (
-            ((), []) if options.verify == "none" else chosen_runtimes(options.verify, self._formats)
-        )
+        self.runtimes: tuple[str, ...] = ()
+        self._known: list[RuntimeInfo] = []
+        if options.verify != "none":
+            from converters.runtimes.pool import chosen_runtimes  # a cold start without verification needs none of it
+
+            self.runtimes, self._known = chosen_runtimes(options.verify, self._formats)
         if self.runtimes:
             check_budget(options.parity.budget, {f.key: 0 for f in self._formats})
         self._labels = read_labels(options.labels)
@@ -184,8 +186,10 @@ class Exporter:
             jobs.append(Job(source, model, dressed, wanted, None if wanted is None else own, note))
         return jobs
 
-    def written(self, jobs: Sequence[Job], pool: RuntimePool, progress: Progress) -> Iterator[ExportResult]:
-        """Write and verify the policies of a source. Raises ExportModelError, before the first is written if it can."""
+    def written(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
+        """Write and verify the policies of a source, in the processes of ``pool`` where any runtime was chosen. Raises
+        ExportModelError, before the first is written if it can.
+        """
         for job in jobs:
             bundle.check_replaceable(self.options.out / job.policy.name)
         made = [(j, *_write(j, self._formats, self.options)) for j in jobs]
@@ -193,7 +197,7 @@ class Exporter:
             yield self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
 
     def _verified(
-        self, job: Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool, progress: Progress
+        self, job: Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool | None, progress: Progress
     ) -> ExportResult:
         """The bundle of a policy, verified and put in its place."""
         options, policy = self.options, job.policy
@@ -203,6 +207,9 @@ class Exporter:
         ):
             report = None
             if self.runtimes:
+                from exporter.verify.verification import verify
+
+                assert pool is not None, "runtimes run in processes"
                 tested = _tested(job, stage, artifacts, folder)
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
@@ -240,7 +247,11 @@ def export(
     exporter, names = Exporter(options), Names()
     exporter.check(paths, progress)
     errors: list[ExportModelError] = []
-    with nullcontext(pool) if pool is not None else RuntimePool() as pool:
+    with contextlib.ExitStack() as opened:
+        if pool is None and exporter.runtimes:
+            from converters.runtimes.pool import RuntimePool
+
+            pool = opened.enter_context(RuntimePool())
         for number, path in enumerate(paths, 1):
             try:
                 told = counted(progress, number, len(paths))
@@ -307,7 +318,7 @@ def _write(job: Job, formats: Sequence[Format], options: ExportOptions) -> tuple
             job.policy, job.source, job.model, options.read, None if job.profile is None else job.profile.name
         )
         if job.profile is None:
-            how = WriteOptions(contract.compact())
+            how = WriteOptions(contract.compact(), checked=options.verify != "none")
             if options.opset is not None:
                 how = replace(how, opset=options.opset)
             return contract, [f.artifact(job.policy, how) for f in formats]
@@ -346,6 +357,10 @@ def contract_of(
 
 
 def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
+    from converters.frozen_graph.writer import frozen
+    from converters.saved_model.writer import signatures_of
+    from exporter.verify.participants import PolicyUnderTest
+
     policy = job.policy
     paths = {a.format.key: stage / a.main for a in artifacts}
     reference = paths.get("bytes")

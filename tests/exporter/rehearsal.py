@@ -16,6 +16,7 @@ from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
+from converters.runtimes import pool as runtimes
 from converters.runtimes.process import RunFailedError
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export import pipeline
@@ -141,5 +142,5 @@ def export(
     monkeypatch: pytest.MonkeyPatch, source: Path, out: Path, pool: ActingPool, **options: Any
 ) -> list[ExportResult]:
     """Export ``source``, the runtimes of ``pool`` verifying."""
-    monkeypatch.setattr(pipeline, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+    monkeypatch.setattr(runtimes, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
     return list(pipeline.export([source], pipeline.ExportOptions(out, **options), pool=pool))  # type: ignore[arg-type]

@@ -144,9 +144,9 @@ def _wrong(kind: str, runtime: str, answer: Tensors) -> Tensors:
 @pytest.fixture
 def disagreeing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Played runtimes, one of which is wrong."""
-    for module in ("pipeline", "again"):
-        monkeypatch.setattr(f"exporter.export.{module}.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
-        monkeypatch.setattr(f"exporter.export.{module}.RuntimePool", lambda: ActingPool(_wrong))
+    for module in ("converters.runtimes.pool", "exporter.export.again"):
+        monkeypatch.setattr(f"{module}.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+        monkeypatch.setattr(f"{module}.RuntimePool", lambda: ActingPool(_wrong))
 
 
 @pytest.mark.usefixtures("disagreeing")

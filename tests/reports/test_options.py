@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.runtimes import pool as runtimes
 from exporter.cli.app import app
 from exporter.cli.console import Console, Progress
-from exporter.export import pipeline
 from fixtures import path as fixture
 from tests.commands import Ran, export_model, is_refused
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
@@ -31,8 +31,8 @@ def exporting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Exporting:
 
     def run(*options: object, good: bool = True, command: tuple[object, ...] | None = None) -> Ran:
         pool = ActingPool() if good else ActingPool(spoil)
-        monkeypatch.setattr(pipeline, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
-        monkeypatch.setattr(pipeline, "RuntimePool", lambda: pool)
+        monkeypatch.setattr(runtimes, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+        monkeypatch.setattr(runtimes, "RuntimePool", lambda: pool)
         return export_model(*(command or (fixture("continuous"), "-o", tmp_path / "out")), *options)
 
     return run
