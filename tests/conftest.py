@@ -5,6 +5,7 @@ Every policy.json and parity.json that a test in this process writes is held aga
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -70,6 +71,14 @@ def pool(processes: RuntimePool) -> RuntimePool:
     if missing:
         pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
     return processes
+
+
+@pytest.fixture
+def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
+    """All real runtimes; every command that this test runs shares their processes."""
+    for module in ("pipeline", "again"):
+        monkeypatch.setattr(f"exporter.export.{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
+    return pool
 
 
 @pytest.fixture(scope="session", autouse=True)

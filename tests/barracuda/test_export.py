@@ -14,10 +14,12 @@ from converters.formats import WRITTEN
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from exporter.reports.summary import failure_lines
+from exporter.verify.options import VerifyOptions
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import BROKEN, genuine_files, params, public_files
 from tests.barracuda.test_layers import expected_of, feeds_of, policy_of
 from tests.conftest import NEEDED
+from tests.corpus.false_alarms import seed_of
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +32,9 @@ SOURCES = [
 @pytest.mark.corpus
 @pytest.mark.parametrize("path", params(SOURCES, lambda p: f"{p.parent.name}-{p.name}"[:90]))
 def test_a_nn_exports_to_four_formats_that_agree(path: Path, shared: Path, tmp_path: Path, pool: RuntimePool) -> None:
-    (result,) = export([path], ExportOptions(tmp_path, verify=NEEDED), pool=pool)
+    (result,) = export(
+        [path], ExportOptions(tmp_path, verify=NEEDED, parity=VerifyOptions(seed=seed_of(path))), pool=pool
+    )
     assert result.report is not None
     assert result.report.passed is True, "\n".join(failure_lines(result.report))
     ran = {c.runtime for c in result.report.comparisons}

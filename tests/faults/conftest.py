@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from converters import schema
-from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.handmade import dense, graph_bytes, node, placeholder
@@ -27,14 +25,6 @@ class Planted:
 
 
 Bundle = Callable[[str], Planted]
-
-
-@pytest.fixture
-def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
-    """All real runtimes; every command that this test runs shares their processes."""
-    for module in ("pipeline", "again"):
-        monkeypatch.setattr(f"exporter.export.{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
-    return pool
 
 
 def two_observations() -> bytes:

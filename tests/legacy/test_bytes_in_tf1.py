@@ -6,6 +6,8 @@ and draws. The reference is numpy.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +51,7 @@ def exported(source: Path, out: Path, **options: Any) -> list[ExportResult]:
     return list(export([source], ExportOptions(out, targets=("bytes",), verify="none", **options)))
 
 
-def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Finding]:
+def compared(result: ExportResult, legacy: Sequence[str], pool: RuntimePool) -> list[Finding]:
     file = result.folder / f"{result.policy.name}.bytes"
     tested = PolicyUnderTest(
         name=result.policy.name,
@@ -59,34 +61,35 @@ def compared(result: ExportResult, legacy: str, pool: RuntimePool) -> list[Findi
         sizes=result.sizes,
         reference=file,
     )
-    report = verify(tested, ("numpy", legacy), (), pool)
-    return [c for c in report.comparisons if c.runtime == legacy]
+    report = verify(tested, ("numpy", *legacy), (), pool)
+    return [c for c in report.comparisons if c.runtime in legacy]
 
 
-def assert_agrees(source: Path, out: Path, legacy: str, pool: RuntimePool) -> None:
+def assert_agrees(source: Path, out: Path, legacy: Sequence[str], pool: RuntimePool) -> None:
     results = exported(source, out)
     assert results
     for result in results:
         found = compared(result, legacy, pool)
-        failed = [f"{c.output}, {c.kind}, {c.worst_input}: {c.max_abs_diff} {c.reason}" for c in found if not c.passed]
-        assert not failed, "\n".join(failed)
-        assert {c.output for c in found} == {s.name for s in result.policy.signature.outputs}
-        memory = result.policy.signature.memory
+        failed = [c for c in found if not c.passed]
+        lines = [f"{c.runtime}, {c.output}, {c.kind}, {c.worst_input}: {c.max_abs_diff} {c.reason}" for c in failed]
+        assert not lines, "\n".join(lines)
+        outputs, memory = {s.name for s in result.policy.signature.outputs}, result.policy.signature.memory
+        assert {(c.runtime, c.output) for c in found} == set(itertools.product(legacy, outputs))
         if memory is not None and memory.output is not None:
-            assert "rollout" in {c.kind for c in found}
+            assert {c.runtime for c in found if c.kind == "rollout"} == set(legacy)
 
 
 @pytest.mark.parametrize("name", FIXTURES)
 def test_fixtures_agree(name: str, tmp_path: Path, legacy: str, pool: RuntimePool) -> None:
-    assert_agrees(path(name), tmp_path, legacy, pool)
+    assert_agrees(path(name), tmp_path, [legacy], pool)
 
 
 @pytest.mark.corpus
 @pytest.mark.parametrize("source", SHARED)
-def test_public_and_genuine_policies_agree(source: Path, tmp_path: Path, legacy: str, pool: RuntimePool) -> None:
+def test_public_and_genuine_policies_agree(source: Path, tmp_path: Path, pool: RuntimePool) -> None:
     if not source.is_file():
         pytest.skip("../shared (public models, genuine graphs) is not beside this checkout")
-    assert_agrees(source, tmp_path, legacy, pool)
+    assert_agrees(source, tmp_path, [ensure(release) for release in RELEASES], pool)
 
 
 @pytest.mark.parametrize("name", FIXTURES)

@@ -1,4 +1,4 @@
-"""What the training scripts of ``train`` exported, once per session and case."""
+"""What the training scripts of ``train`` exported, once per session, by one process."""
 
 from __future__ import annotations
 
@@ -18,14 +18,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """Case → the folder with what was exported (``out``) and what TensorFlow computed (``case.npz``)."""
     if importlib.util.find_spec("tensorflow") is None:
         pytest.skip("TensorFlow is not installed; get it with: pip install tensorflow-cpu")
-    folders: dict[str, Path] = {}
-
-    def folder_of(case: str) -> Path:
-        if case not in folders:
-            folder = tmp_path_factory.mktemp(case)
-            ran = python("-m", "tests.live.train", case, folder)
-            assert ran.status == 0, ran.err[-3000:]
-            folders[case] = folder
-        return folders[case]
-
-    return folder_of
+    folder = tmp_path_factory.mktemp("trained")
+    ran = python("-m", "tests.live.train", folder)
+    assert ran.status == 0, ran.err[-3000:]
+    return lambda case: folder / case

@@ -96,9 +96,9 @@ def test_the_contract_says_what_it_came_from(trained: Trained, case: str) -> Non
 
 @pytest.mark.slow
 def test_another_process_writes_the_same_bytes(trained: Trained, tmp_path: Path) -> None:
-    ran = python("-m", "tests.live.train", "function", tmp_path)
+    ran = python("-m", "tests.live.train", tmp_path, "function")
     assert ran.status == 0, ran.err[-3000:]
-    one, two = (folder / "out/act" for folder in (trained("function"), tmp_path))
+    one, two = (folder / "out/act" for folder in (trained("function"), tmp_path / "function"))
     assert files_in(one) == files_in(two)
     for file in sorted(files_in(one) - {"parity.json"}):
         assert not (one / file).is_file() or (one / file).read_bytes() == (two / file).read_bytes(), file

@@ -1,9 +1,10 @@
-"""Policies that live in a process with TensorFlow, exported from there: ``python -m tests.live.train CASE FOLDER``.
+"""Policies that live in a process with TensorFlow, exported from there: ``python -m tests.live.train FOLDER [CASE …]``.
 
 A program of its own, so that a test process need not load TensorFlow. It plays the training script: it builds the
-policy of ``CASE``, exports it to ``FOLDER/out`` in all formats, verified by TensorFlow, and keeps in
-``FOLDER/case.npz`` what was fed and what the session, function or model itself computed, by canonical names. What must
-hold in this process (the graph is what it was, further exports are the first) is asserted here.
+policy of each ``CASE`` (of all, where none is named), exports it to ``FOLDER/CASE/out`` in all formats, verified by
+TensorFlow, and keeps in ``FOLDER/CASE/case.npz`` what was fed and what the session, function or model itself computed,
+by canonical names. What must hold in this process (the graph is what it was, further exports are the first) is asserted
+here.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ import tensorflow as tf
 
 from exporter import export_model
 from signatures.digest import sha256_hex
+from tests.live.programs import shared_runtimes
 
 RANDOM = np.random.default_rng(11)
+BEGUN = RANDOM.bit_generator.state
 v1 = tf.compat.v1
 Arrays = Mapping[str, Any]
 
@@ -140,6 +143,15 @@ def recurrent() -> tuple[Arrays, Arrays, Any]:
     return inputs, {"action": action, "recurrent_out": after}, tf.reduce_mean(tf.square(action))
 
 
+def loops_of_1(folder: Path) -> None:
+    feeds = {"state": draw(3, 3), "recurrent_in": draw(3, 8), "sequence_length": np.int32(1)}
+    v1.disable_control_flow_v2()
+    try:
+        session_of(folder, recurrent, feeds)
+    finally:
+        v1.enable_control_flow_v2()
+
+
 def looping() -> tuple[Arrays, Arrays, Any]:
     """A loop of TensorFlow 2 (a While that calls functions), and a call of a tf.function."""
     observation = v1.placeholder(tf.float32, [None, 3], name="vector_observation")
@@ -224,9 +236,7 @@ CASES: dict[str, Callable[[Path], None]] = {
         folder, lambda: continuous(resource=True), {"state": draw(3, 6), "epsilon": draw(3, 2)}, name="resources"
     ),
     "discrete": lambda folder: session_of(folder, discrete, {"state": draw(5, 5), "action_masks": masks(5, 5)}),
-    "recurrent": lambda folder: session_of(
-        folder, recurrent, {"state": draw(3, 3), "recurrent_in": draw(3, 8), "sequence_length": np.int32(1)}
-    ),
+    "recurrent-loops_of_1": loops_of_1,
     "loop": lambda folder: session_of(folder, looping, {"state": draw(3, 3)}),
     "hints": lambda folder: session_of(
         folder, unnamed, {"state": draw(3, 4)}, inputs={"x": "vector_observation"}, outputs={"y": "action"}
@@ -237,11 +247,14 @@ CASES: dict[str, Callable[[Path], None]] = {
 }
 
 
-def main(case: str, folder: Path) -> None:
-    if case.endswith("-loops_of_1"):
-        v1.disable_control_flow_v2()
-    CASES[case.partition("-")[0]](folder)
+def main(folder: Path, cases: Sequence[str]) -> None:
+    with shared_runtimes():
+        for case in cases or CASES:
+            RANDOM.bit_generator.state = BEGUN
+            tf.keras.backend.clear_session()
+            (folder / case).mkdir()
+            CASES[case](folder / case)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    main(Path(sys.argv[1]), sys.argv[2:])

@@ -10,9 +10,11 @@ import pytest
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
+from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import Tolerance
 from tests.conftest import NEEDED
 from tests.corpus.conftest import SHARED
+from tests.corpus.false_alarms import seed_of
 from tests.onnx_reader.models import Bench
 
 pytestmark = [pytest.mark.corpus, pytest.mark.slow, pytest.mark.xdist_group("onnx-corpus")]
@@ -42,7 +44,8 @@ def test_nothing_has_fallen_out() -> None:
 def test_exports_to_four_formats_that_agree(source: Path, bench: Bench, tmp_path: Path) -> None:
     for runtime in NEEDED:
         bench.need(runtime)
-    (result,) = export([source], ExportOptions(tmp_path, verify=NEEDED), pool=bench.pool)
+    options = ExportOptions(tmp_path, verify=NEEDED, parity=VerifyOptions(seed=seed_of(source)))
+    (result,) = export([source], options, pool=bench.pool)
     report = result.report
     assert report is not None
     assert report.passed is True, "\n".join(failure_lines(report))

@@ -101,7 +101,8 @@ def test_checkpoint_and_frozen_graph_are_the_same_policy(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINED)
-def test_tensorflow_restores_the_checkpoint_to_what_is_exported(name: str, tmp_path: Path, pool: RuntimePool) -> None:
+@pytest.mark.usefixtures("runtimes")
+def test_tensorflow_restores_the_checkpoint_to_what_is_exported(name: str, tmp_path: Path) -> None:
     steps = REPORT["policies"][name]["steps"]
     for result in export_model(run_folder(name), tmp_path, step=steps, to="onnx", verify=["tensorflow", "onnxruntime"]):
         assert result.passed
