@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,8 @@ import pytest
 
 from exporter.acting.policy import load_policy
 from exporter.serve.site import assemble, assemble_one_file, write_site
+from fixtures.trained import run_folder
+from tests.commands import export_model
 from tests.serve.browsing import CHECKED, Visit, served, visit
 from tests.serve.conftest import Bundle
 
@@ -207,6 +211,75 @@ def test_one_file_plays_from_the_disk(bundle: Bundle, tmp_path: Path) -> None:
     assert seen.results[-2].startswith("Yes. In your browser js")
     assert seen.results[-1] is None
     assert (seen.console, seen.requests) == ([], [page.as_uri()])
+
+
+def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
+    """A ball is dragged, an untrained network loses what the trained one keeps, a dropped bundle acts or is refused."""
+    page = tmp_path / "page.html"
+    page.write_bytes(assemble_one_file(bundle("3DBall")))
+    model = bundle("3DBall") / "tfjs"
+    whole = [
+        [p.name, base64.b64encode(p.read_bytes()).decode()] for p in model.iterdir() if p.suffix in (".json", ".bin")
+    ]
+    x = "document.querySelector('.bars').rows[2].lastChild.textContent"
+    said, titles = (
+        "document.querySelector('#said').textContent",
+        "document.querySelectorAll('.lane .title')[1].textContent",
+    )
+    second = "({...document.querySelector('#status-2').dataset})"
+    seen = visit(
+        f"{page.as_uri()}#speed=8",
+        [
+            ["wait", f"{STATUS}.seconds > 0.5"],
+            ["click", "#pause"],
+            ["drag", "#canvas", [0.385, 0.65], [0.44, 0.65]],
+            ["eval", x],
+            ["drag", "#canvas", [0.385, 0.65], [0.33, 0.65]],
+            ["eval", x],
+            ["select", "#beside", "untrained"],
+            ["click", "#pause"],
+            ["wait", f"document.querySelector('#status-2') && {second}.bad > 12"],
+            ["eval", STATUS],
+            ["eval", "location.hash"],
+            ["drop", [["notes.txt", ""]]],
+            ["wait", f"{said}.includes('no tfjs/model.json')"],
+            ["drop", [["model.json", base64.b64encode(b'{"modelTopology": {"node": []}}').decode()]]],
+            ["wait", f"{said}.includes('no contract of export-model')"],
+            ["drop", whole],
+            ["wait", f"{titles} === '3DBall (dropped here)' && {second}.seconds > 3"],
+            ["eval", "document.querySelector('#apart').textContent"],
+        ],
+    )
+    right, left = (float(seen.results[i].replace("−", "-")) for i in (3, 5))
+    assert right > 0.3 > -0.3 > left
+    assert seen.results[9]["bad"] == "0"
+    assert seen.results[10] == "#speed=8&beside=untrained"
+    assert seen.results[-1] == "Now the answers differ by 0, the states by 0."
+    assert (seen.console, seen.requests) == ([], [page.as_uri()])
+
+
+def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
+    """In each other's place they act the same; how little they differ is shown as it happens."""
+    assert export_model(run_folder("3DBall"), "-o", tmp_path, "--to", "bytes,tfjs,onnx", "--verify", "none").status == 0
+    words = "document.querySelector('#apart')?.textContent ?? ''"
+    played = "document.querySelector('#status-2')?.dataset.seconds > 2"
+    with served(assemble(tmp_path / "3DBall")) as server:
+        seen = visit(
+            f"{server.url}#beside=wasm",
+            [
+                ["wait", f"{played} && document.querySelectorAll('.lane .title')[1].textContent.endsWith('wasm')"],
+                ["eval", words],
+                ["select", "#beside", "onnxruntime-web"],
+                ["wait", "document.querySelectorAll('.lane .title')[1].textContent.endsWith('onnxruntime-web')"],
+                ["wait", played],
+                ["eval", words],
+            ],
+        )
+    for said in (seen.results[1], seen.results[5]):
+        answers, states = (float(n) for n in re.findall(r"by (\S+?)[,.](?:\s|$)", said))
+        assert 0 <= answers < 1e-3, said
+        assert 0 <= states < 1e-3, said
+    assert [said for said in seen.console if said != "warning: No available adapters."] == []
 
 
 def test_the_site_opened_as_a_file_says_what_to_do(bundle: Bundle, tmp_path: Path) -> None:

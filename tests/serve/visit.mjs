@@ -49,6 +49,26 @@ try {
     fill: (selector, value) => page.fill(selector, value),
     focus: (selector) => page.focus(selector),
     press: (key) => page.keyboard.press(key),
+    /** From one place of an element to another, in shares of its size. */
+    async drag(selector, from, to) {
+      const box = await page.locator(selector).boundingBox();
+      const at = ([x, y]) => [box.x + x * box.width, box.y + y * box.height];
+      await page.mouse.move(...at(from));
+      await page.mouse.down();
+      await page.mouse.move(...at(to), { steps: 5 });
+      await page.mouse.up();
+    },
+    /** Files ([name, base64], …) are dropped on the page. */
+    async drop(files) {
+      await page.evaluate((given) => {
+        const dataTransfer = new DataTransfer();
+        for (const [name, data] of given) {
+          const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+          dataTransfer.items.add(new File([bytes], name));
+        }
+        document.dispatchEvent(new DragEvent("drop", { dataTransfer, bubbles: true, cancelable: true }));
+      }, files);
+    },
     shot: async (file, fullPage = true) => void (await page.screenshot({ path: file, fullPage })),
   };
   for (const [verb, ...rest] of steps) seen.results.push((await verbs[verb](...rest)) ?? null);

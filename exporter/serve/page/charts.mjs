@@ -74,3 +74,63 @@ export class Strip {
     canvas.setAttribute("aria-label", `${this.label}: ${count} numbers, ${zero ? "all 0" : `the largest ±${text(most)}`}`);
   }
 }
+
+const [LOWEST, HIGHEST, SECONDS] = [-9, 1, 20];
+
+/** How far two runs are apart over the last seconds: powers of ten, from 1e-9 to 10. */
+export class Divergence {
+  #canvas = h("canvas", { class: "divergence", role: "img", "aria-label": "How far the two are apart" });
+  #words = h("p", { class: "status", id: "apart" });
+  #points = [];
+
+  constructor() {
+    const key = (name, words) => h("span", { class: `key ${name}` }, words);
+    this.element = h("div", { id: "divergence", hidden: true }, h("p", { class: "title" }, "Largest difference of the ", key("cold", "answers"), " and of the ", key("warm", "states")), this.#canvas, this.#words);
+  }
+
+  clear() {
+    this.#points = [];
+    this.#words.textContent = "";
+  }
+
+  add(seconds, answers, states) {
+    this.#points.push({ seconds, values: [answers, states] });
+    while (this.#points.length > 2000 || this.#points[0].seconds < seconds - SECONDS) this.#points.shift();
+  }
+
+  draw() {
+    const last = this.#points.at(-1);
+    const canvas = this.#canvas;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (last === undefined || width === 0) return;
+    const density = Math.min(window.devicePixelRatio || 1, 2);
+    [canvas.width, canvas.height] = [Math.round(width * density), Math.round(height * density)];
+    const context = canvas.getContext("2d");
+    context.scale(density, density);
+    const style = getComputedStyle(canvas);
+    const colour = (name) => style.getPropertyValue(name).trim();
+    const y = (value) => {
+      const power = Math.min(Math.max(Math.log10(value), LOWEST), HIGHEST);
+      return 4 + (1 - (power - LOWEST) / (HIGHEST - LOWEST)) * (height - 8);
+    };
+    context.font = "11px system-ui, sans-serif";
+    context.textBaseline = "middle";
+    for (const power of [-9, -6, -3, 0]) {
+      context.fillStyle = colour("--rule");
+      context.fillRect(44, y(10 ** power), width - 44, 1);
+      context.fillStyle = colour("--soft");
+      context.fillText(power === -9 ? "≤ 1e-9" : power === 0 ? "1" : `1e${power}`, 0, Math.min(y(10 ** power), height - 7));
+    }
+    ["--cold", "--warm"].forEach((name, k) => {
+      context.strokeStyle = colour(name);
+      context.lineWidth = 1.6;
+      context.beginPath();
+      for (const { seconds, values } of this.#points) {
+        context.lineTo(width - ((last.seconds - seconds) / SECONDS) * (width - 44), y(values[k]));
+      }
+      context.stroke();
+    });
+    const [answers, states] = last.values.map((value) => (value < 1e-3 && value > 0 ? value.toExponential(1) : text(value)));
+    this.#words.textContent = `Now the answers differ by ${answers}, the states by ${states}.`;
+  }
+}

@@ -3,6 +3,7 @@
 import { $, h } from "./dom.mjs";
 import { isOneFile, json } from "./files.mjs";
 import { Host } from "./host.mjs";
+import { asked, tell } from "./link.mjs";
 import { Names } from "./names.mjs";
 import { Panel } from "./panel.mjs";
 import { Stage } from "./stage.mjs";
@@ -13,7 +14,7 @@ import { viewOf } from "./views/index.mjs";
 function preferred(contract, backends) {
   const images = contract.inputs.some(({ role }) => role === "visual_observation");
   const names = backends.map(({ name }) => name);
-  return [...new Set([...(images ? ["wasm"] : []), "js", ...names])].filter((name) => names.includes(name));
+  return [...new Set([asked("on"), ...(images ? ["wasm"] : []), "js", ...names])].filter((name) => names.includes(name));
 }
 
 async function started(host, backends) {
@@ -50,14 +51,15 @@ function chooser(site, host, after) {
   select.append(...site.backends.map(({ name }) => h("option", { value: name, selected: name === host.backend }, name)));
   select.disabled = false;
   select.addEventListener("change", async () => {
-    const asked = select.value;
+    const wanted = select.value;
     select.disabled = true;
     try {
-      await host.start(asked);
+      await host.start(wanted);
       problem("");
+      tell("on", wanted);
       after();
     } catch (error) {
-      problem(`${asked} cannot be used: ${error.message}. The policy stays on ${host.backend}.`);
+      problem(`${wanted} cannot be used: ${error.message}. The policy stays on ${host.backend}.`);
     }
     select.value = host.backend;
     select.disabled = false;
@@ -79,10 +81,13 @@ async function main() {
   $("loading").remove();
   const view = site.scene === null ? null : viewOf(site);
   const names = new Names(contract, contract.labels, view?.labels);
-  const stage = view === null ? null : new Stage(view, host, names);
+  const stage = view === null ? null : new Stage(view, host, names, site.backends);
   const panel = new Panel(host, names, { folded: view !== null });
   const verdict = new Verdict(host, site.backends, site.absent);
-  chooser(site, host, () => panel.decide());
+  chooser(site, host, () => {
+    void panel.decide();
+    stage?.retitle();
+  });
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) stage?.play();
   await verdict.run();
 }

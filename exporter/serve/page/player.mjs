@@ -3,9 +3,9 @@
 export class Player {
   #memory = null;
 
-  constructor(host, name, { deterministic = true } = {}) {
-    this.host = host;
-    this.name = name;
+  /** @param {() => object} policy the policy that acts now: it is another when the engine is changed */
+  constructor(policy, { deterministic = true } = {}) {
+    this.policy = policy;
     this.deterministic = deterministic;
   }
 
@@ -16,10 +16,9 @@ export class Player {
 
   /** @param {{state: number[][], masks?: number[][], previous?: number[][]}} observation */
   async act({ state, masks, previous }, isFirst) {
-    const policy = this.host.policy(this.name);
+    const policy = this.policy();
     const roles = new Set(policy.contract.inputs.map(({ role }) => role));
-    const decision = await this.host.decide(
-      this.name,
+    const decision = await policy.decide(
       { [policy.observations[0].name]: state },
       {
         masks: roles.has("masks") ? masks : undefined,

@@ -1,8 +1,14 @@
-/** A scene: the environment is simulated, the policy acts in it, and both are drawn. */
+/** A scene: the environment is simulated, the policy acts in it, and both are drawn; beside it another, from the same seed. */
 
-import { Bars, percent } from "./charts.mjs";
+import { dropped, fitting, untrained } from "./beside.mjs";
+import { Bars, Divergence, percent } from "./charts.mjs";
 import { $, frame, h } from "./dom.mjs";
-import { Player, probabilities } from "./player.mjs";
+import { canRecord, Film } from "./film.mjs";
+import { Hand } from "./hand.mjs";
+import { apart, Lane } from "./lane.mjs";
+import { asked, tell } from "./link.mjs";
+import { probabilities } from "./player.mjs";
+import { Streams } from "./scenes/base.mjs";
 import { palette } from "./views/drawing.mjs";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
@@ -12,62 +18,79 @@ const STEPS_A_FRAME = 12;
 /** How often numbers and the text for screen readers change, in ms. */
 const NUMBERS_EVERY = 100;
 const TEXT_EVERY = 2000;
+/** Until somebody touches the scene, something happens in it by itself: every so many seconds. */
+const GUST_EVERY = 5;
 
 export class Stage {
   #view;
   #host;
-  #env;
-  #players;
-  #observation;
-  #before = null;
-  #after;
-  #tally;
+  #lanes;
   #chosen = 0;
-  #decision = null;
   #paused = true;
-  #seed = 0;
-  #parts = {};
+  #seed = Math.trunc(Math.abs(Number(asked("seed")))) || 0;
+  #parts = { canvases: [] };
   #bars = {};
   #shown = { numbers: 0, text: 0 };
   #colours;
   #busy = Promise.resolve();
   /** The loop that runs; one that was paused and has not noticed yet is another. */
   #loop = 0;
+  #touched = false;
+  #gust = GUST_EVERY;
+  #film = null;
+  #beside = null;
+  #large;
 
-  constructor(view, host, names) {
+  /** @param {{name: string, script: string | null, large?: boolean}[]} backends */
+  constructor(view, host, names, backends) {
     this.#view = view;
     this.#host = host;
-    this.#env = view.create();
-    this.#players = Object.fromEntries(view.players.map((name) => [name, new Player(host, name)]));
-    this.#build(names);
-    this.#watch();
+    this.#large = backends.find(({ large }) => large);
+    this.#lanes = [new Lane(view, this.#policies())];
+    this.#build(names, backends);
+    this.#colours = palette($("scene"));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      this.#colours = palette($("scene"));
+      this.#draw(1);
+    });
     this.#begin();
+    const other = asked("beside");
+    if (backends.some(({ name }) => name === other) || other === "untrained") void this.#compare(other);
   }
 
   /** Simulated seconds since the last reset. */
   get seconds() {
-    return this.#tally.steps * this.#view.stepSeconds;
+    return this.#lanes[0].tally.steps * this.#view.stepSeconds;
   }
 
   play() {
     this.#pause(false);
   }
 
+  #policies() {
+    return Object.fromEntries(this.#view.players.map((name) => [name, () => this.#host.policy(name)]));
+  }
+
   // ---- the elements -------------------------------------------------------------------------------------------------
 
-  #build(names) {
+  #build(names, backends) {
     const view = this.#view;
     const button = (name, words, action) => {
       this.#parts[name] = h("button", { type: "button", id: name, onclick: action }, words);
       return this.#parts[name];
     };
-    const speed = h("select", { id: "speed" }, SPEEDS.map((n) => h("option", { value: n, selected: n === 1 }, `${n} ×`)));
+    const start = SPEEDS.includes(Number(asked("speed"))) ? Number(asked("speed")) : 1;
+    const speed = h("select", { id: "speed", onchange: () => tell("speed", speed.value) });
+    speed.append(...SPEEDS.map((n) => h("option", { value: n, selected: n === start }, `${n} ×`)));
     const exact = h("input", { type: "checkbox", id: "exact", checked: true });
-    exact.addEventListener("change", () => {
-      for (const player of Object.values(this.#players)) player.deterministic = exact.checked;
-    });
-    const canvas = h("canvas", { id: "canvas", role: "img", "aria-label": view.name });
-    Object.assign(this.#parts, { speed, canvas, status: h("p", { id: "status", class: "status" }) });
+    exact.addEventListener("change", () => this.#players().forEach((player) => (player.deterministic = exact.checked)));
+    const beside = h("select", { id: "beside", onchange: () => void this.#compare(beside.value) });
+    const others = [["", "nothing"], ["untrained", "the same, untrained"], ...backends.map(({ name }) => [name, `the same, on ${name}`])];
+    beside.append(...others.map(([value, words]) => h("option", { value }, words)));
+    const lanes = h("div", { class: "lanes" });
+    const divergence = new Divergence();
+    const said = h("p", { id: "said", class: "soft", role: "status" });
+    Object.assign(this.#parts, { speed, exact, beside, lanes, divergence, said });
     $("scene").append(
       h("h2", { id: "scene-title" }, `At work in ${view.name}`),
       h("p", { class: "lead" }, view.story),
@@ -77,33 +100,73 @@ export class Stage {
         h(
           "div",
           { class: "stage" },
-          canvas,
-          this.#parts.status,
+          lanes,
+          divergence.element,
           h(
             "div",
             { class: "controls" },
             button("pause", "Play", () => this.#pause(!this.#paused)),
             button("step", "Step", () => this.#stepOnce()),
-            button("reset", "Reset", () => this.#queued(() => this.#begin())),
+            button("reset", "Reset", () => this.#queued(() => this.#begin(this.#seed + 1))),
             view.poke && button("poke", view.poke, () => this.#queued(() => this.#poke())),
             h("span", { class: "field" }, h("label", { for: "speed" }, "Speed"), speed),
             h("span", { class: "field" }, exact, h("label", { for: "exact" }, "Deterministic")),
+            h("span", { class: "field" }, h("label", { for: "beside" }, "Beside it"), beside),
+            button("copy", "Copy link", () => this.#copy()),
+            canRecord() && button("record", "Record", () => this.#record()),
           ),
+          said,
         ),
         h("div", { class: "numbers" }, this.#chooser(), this.#numbers(names)),
       ),
     );
+    this.#addCanvas();
+    const touch = () => (this.#touched = true);
+    for (const event of ["pointerdown", "keydown", "change"]) $("scene").addEventListener(event, touch);
+    this.#takeDrops();
     $("scene").hidden = false;
+  }
+
+  /** A canvas and a line of text for a lane; the first ones' ids are "canvas" and "status". */
+  #addCanvas() {
+    const number = this.#parts.canvases.length;
+    const id = (name) => (number === 0 ? name : `${name}-${number + 1}`);
+    const canvas = h("canvas", { id: id("canvas"), class: "scene", role: "img", "aria-label": this.#view.name });
+    const status = h("p", { id: id("status"), class: "status" });
+    const title = h("p", { class: "title" });
+    const element = h("div", { class: "lane" }, title, canvas, status);
+    const fit = () => {
+      const width = canvas.clientWidth;
+      const height = Math.round(width / this.#view.ratio(width));
+      const density = Math.min(window.devicePixelRatio || 1, 2);
+      canvas.style.aspectRatio = `${width} / ${height}`;
+      [canvas.width, canvas.height] = [Math.round(width * density), Math.round(height * density)];
+      this.#draw(1);
+    };
+    this.#parts.canvases.push({ canvas, status, title, element });
+    this.#parts.lanes.append(element);
+    new ResizeObserver(() => canvas.clientWidth > 0 && fit()).observe(canvas);
+    const hand = new Hand(canvas, this.#view, {
+      lane: () => this.#lanes[number],
+      change: (what) => void this.#queued(() => this.#changed(what)),
+      poke: () => this.#queued(() => this.#poke()),
+      choose: (i) => this.#choose(i),
+    });
+    this.#parts.canvases[number].hand = hand;
   }
 
   #chooser() {
     if (this.#view.agents === 1) return null;
     const select = h("select", { id: "agent" }, Array.from({ length: this.#view.agents }, (_, i) => h("option", { value: i }, `${i + 1}`)));
-    select.addEventListener("change", () => {
-      this.#chosen = Number(select.value);
-      this.#shown = { numbers: 0, text: 0 };
-    });
+    select.addEventListener("change", () => this.#choose(Number(select.value)));
+    this.#parts.agent = select;
     return h("p", { class: "field" }, h("label", { for: "agent" }, "Agent shown"), select);
+  }
+
+  #choose(i) {
+    this.#chosen = i;
+    if (this.#parts.agent) this.#parts.agent.value = i;
+    this.#shown = { numbers: 0, text: 0 };
   }
 
   #numbers(names) {
@@ -120,46 +183,129 @@ export class Stage {
     return [this.#bars.seen, this.#bars.acts, ...(this.#bars.chances ?? [])].filter(Boolean).map(({ element }) => element);
   }
 
-  #watch() {
-    const canvas = this.#parts.canvas;
-    const fit = () => {
-      const width = canvas.clientWidth;
-      const height = Math.round(width / this.#view.ratio(width));
-      const density = Math.min(window.devicePixelRatio || 1, 2);
-      canvas.style.aspectRatio = `${width} / ${height}`;
-      [canvas.width, canvas.height] = [Math.round(width * density), Math.round(height * density)];
-      this.#draw(1);
-    };
-    const recolour = () => {
-      this.#colours = palette(canvas);
-      if (this.#after) this.#draw(1);
-    };
-    recolour();
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
-    new ResizeObserver(() => this.#after && fit()).observe(canvas);
+  // ---- side by side -------------------------------------------------------------------------------------------------
+
+  /** Puts another policy beside this one: "untrained", a backend's name, "" for none; or a policy that was dropped. */
+  async #compare(what, given = null) {
+    this.#say("");
+    this.#parts.beside.value = given === null ? what : "";
+    try {
+      const policy = given ?? (await this.#other(what));
+      await this.#queued(() => {
+        this.#lanes.length = 1;
+        this.#beside = policy === null ? null : { what, name: given?.name ?? what };
+        if (policy !== null) this.#lanes.push(new Lane(this.#view, { ...this.#policies(), model: () => policy }));
+        if (this.#parts.canvases.length < 2 && policy !== null) this.#addCanvas();
+        this.#players().forEach((player) => (player.deterministic = this.#parts.exact.checked));
+        this.#begin();
+      });
+      tell("beside", what === "" || given !== null ? null : what);
+    } catch (error) {
+      this.#parts.beside.value = this.#beside?.what ?? "";
+      this.#say(`It cannot be put beside: ${error.message}.`);
+    }
+  }
+
+  async #other(what) {
+    if (what === "") return null;
+    return what === "untrained" ? untrained(this.#host.source().artifacts) : this.#host.policyOn(what);
+  }
+
+  #takeDrops() {
+    document.addEventListener("dragover", (event) => event.preventDefault());
+    document.addEventListener("drop", async (event) => {
+      event.preventDefault();
+      try {
+        const policy = await dropped(event.dataTransfer.items, this.#large?.script);
+        fitting(this.#host.policy().contract, policy.contract);
+        await this.#compare("", policy);
+      } catch (error) {
+        this.#say(`What was dropped cannot be shown: ${error.message}.`);
+      }
+    });
+  }
+
+  async #copy() {
+    tell("seed", this.#seed);
+    try {
+      await navigator.clipboard.writeText(location.href);
+      this.#say("The link is copied: it leads to this seed, speed and comparison.");
+    } catch {
+      this.#say(`The link: ${location.href}`);
+    }
+  }
+
+  async #record() {
+    if (this.#film === null) {
+      this.#film = new Film(this.#canvases().map(({ canvas }) => canvas), this.#colours.sheet);
+      this.#parts.record.textContent = "Stop and save";
+      this.#pause(false);
+      return;
+    }
+    const film = this.#film;
+    this.#film = null;
+    this.#parts.record.textContent = "Record";
+    await film.save(`${this.#host.policy().name}.webm`);
+  }
+
+  #say(words) {
+    this.#parts.said.textContent = words;
   }
 
   // ---- the simulation -----------------------------------------------------------------------------------------------
 
-  #begin() {
-    this.#observation = this.#env.reset(this.#seed++);
-    Object.values(this.#players).forEach((player) => player.forget());
-    this.#tally = { good: 0, bad: 0, best: 0, missed: [0, 0], steps: 0 };
-    this.#before = null;
-    this.#after = this.#env.snapshot();
-    this.#decision = null;
+  #players() {
+    return this.#lanes.flatMap(({ players }) => Object.values(players));
+  }
+
+  #canvases() {
+    return this.#parts.canvases.slice(0, this.#lanes.length);
+  }
+
+  #begin(seed = this.#seed) {
+    this.#seed = seed;
+    this.#lanes.forEach((lane) => lane.begin(seed));
+    this.#gust = GUST_EVERY;
+    this.#parts.divergence.clear();
+    this.retitle();
     this.#shown = { numbers: 0, text: 0 };
     this.#tell();
-    if (this.#parts.canvas.width > 0) this.#draw(1);
+    this.#draw(1);
+  }
+
+  /** Says which policy is which. */
+  retitle() {
+    this.#parts.canvases.forEach(({ element, title }, i) => {
+      element.hidden = i >= this.#lanes.length;
+      title.hidden = this.#lanes.length === 1;
+      title.textContent = i === 0 ? `This policy, on ${this.#host.backend}` : this.#titled();
+    });
+    this.#parts.divergence.element.hidden = this.#lanes.length === 1;
+  }
+
+  #titled() {
+    if (this.#beside === null) return "";
+    const { what, name } = this.#beside;
+    return what === "untrained" ? "The same network, untrained" : what === "" ? `${name} (dropped here)` : `The same, on ${name}`;
   }
 
   #poke() {
-    if (this.#view.pokes === "memory") Object.values(this.#players).forEach((player) => player.forget());
-    else {
-      this.#env.poke();
-      this.#observation = this.#env.observe(this.#env.isFirst);
-      this.#after = this.#env.snapshot();
+    const seed = Math.floor(Math.random() * 2 ** 32);
+    for (const lane of this.#lanes) {
+      if (this.#view.pokes === "memory") lane.forget();
+      else {
+        const random = new Streams(seed, 1); // what happens to one happens to the other
+        lane.change((env) => env.poke(() => random.uniform(0)));
+      }
     }
+  }
+
+  #changed(what) {
+    this.#lanes.forEach((lane) => lane.change(what));
+    if (!this.#paused) return;
+    this.#shown = { numbers: 0, text: 0 };
+    this.#tell();
+    this.#draw(1);
   }
 
   /** Steps and what a visitor does come one after the other. */
@@ -169,22 +315,14 @@ export class Stage {
   }
 
   async #step() {
-    const decisions = {};
-    for (const [name, player] of Object.entries(this.#players)) {
-      decisions[name] = await player.act(this.#view.observed(this.#observation, name), this.#env.isFirst);
+    for (const lane of this.#lanes) await lane.step();
+    for (const { hand } of this.#canvases()) hand.hold();
+    if (this.#lanes.length > 1) this.#parts.divergence.add(this.seconds, ...apart(...this.#lanes));
+    this.#gust -= this.#view.stepSeconds;
+    if (this.#gust <= 0 && !this.#touched && this.#view.gusts) {
+      this.#poke();
+      this.#gust = GUST_EVERY;
     }
-    this.#decision = { ...decisions.model, seen: this.#view.observed(this.#observation, "model") };
-    this.#before = this.#after;
-    const { observation, rewards, terminated, truncated, success } = this.#env.step(this.#view.actions(decisions, this.#observation));
-    this.#observation = observation;
-    this.#after = this.#env.snapshot();
-    const tally = this.#tally;
-    tally.steps += 1;
-    terminated.forEach((ended, i) => {
-      if (ended || truncated[i]) tally[success[i] ? "good" : "bad"] += 1;
-      if (Array.isArray(rewards[i])) rewards[i].forEach((reward, side) => (tally.missed[side] += Number(reward < 0)));
-    });
-    if (this.#after.rally) tally.best = Math.max(tally.best, ...this.#after.rally);
   }
 
   async #stepOnce() {
@@ -221,41 +359,52 @@ export class Stage {
       }
     } catch (error) {
       this.#pause(true);
-      this.#parts.status.textContent = `The policy cannot act: ${error.message}`;
+      this.#parts.canvases[0].status.textContent = `The policy cannot act: ${error.message}`;
     }
   }
 
   // ---- what is shown ------------------------------------------------------------------------------------------------
 
   #draw(share) {
-    const { canvas } = this.#parts;
-    const context = canvas.getContext("2d");
-    const density = canvas.width / Math.max(canvas.clientWidth, 1);
-    const size = { width: canvas.width / density, height: canvas.height / density };
-    context.setTransform(density, 0, 0, density, 0, 0);
-    context.clearRect(0, 0, size.width, size.height);
-    this.#view.draw(context, size, this.#before, this.#after, share, this.#colours, this.#view.agents > 1 ? this.#chosen : -1);
+    this.#canvases().forEach(({ canvas }, i) => {
+      if (canvas.width === 0) return;
+      const context = canvas.getContext("2d");
+      const density = canvas.width / Math.max(canvas.clientWidth, 1);
+      const size = { width: canvas.width / density, height: canvas.height / density };
+      context.setTransform(density, 0, 0, density, 0, 0);
+      context.clearRect(0, 0, size.width, size.height);
+      const { before, after } = this.#lanes[i];
+      this.#view.draw(context, size, before, after, share, this.#colours, this.#view.agents > 1 ? this.#chosen : -1);
+    });
+    if (this.#lanes.length > 1) this.#parts.divergence.draw();
+    this.#film?.frame();
   }
 
   #tell() {
     const now = performance.now();
     if (now - this.#shown.numbers > NUMBERS_EVERY || this.#shown.numbers === 0) {
       this.#shown.numbers = now;
-      const time = this.#view.stepSeconds < 0.1 ? `${this.seconds.toFixed(1)} s` : `${this.#tally.steps} steps`;
-      this.#parts.status.textContent = `${this.#view.status(this.#env, this.#tally)} · ${time} played`;
-      Object.assign(this.#parts.status.dataset, { seconds: this.seconds, good: this.#tally.good, bad: this.#tally.bad });
+      const time = this.#view.stepSeconds < 0.1 ? `${this.seconds.toFixed(1)} s` : `${this.#lanes[0].tally.steps} steps`;
+      this.#canvases().forEach(({ status }, i) => {
+        const { env, tally } = this.#lanes[i];
+        status.textContent = `${this.#view.status(env, tally)} · ${time} played`;
+        Object.assign(status.dataset, { seconds: this.seconds, good: tally.good, bad: tally.bad });
+      });
       this.#showNumbers();
     }
     if (now - this.#shown.text > TEXT_EVERY || this.#shown.text === 0) {
       this.#shown.text = now;
-      this.#parts.canvas.setAttribute("aria-label", this.#view.describe(this.#env, this.#tally, this.#chosen));
+      this.#canvases().forEach(({ canvas }, i) => {
+        canvas.setAttribute("aria-label", this.#view.describe(this.#lanes[i].env, this.#lanes[i].tally, this.#chosen));
+      });
     }
   }
 
   #showNumbers() {
-    const decision = this.#decision;
+    const { decision } = this.#lanes[0];
     const i = this.#chosen;
-    this.#bars.seen.show((decision?.seen ?? this.#view.observed(this.#observation, "model")).state[i]);
+    const seen = this.#paused ? this.#lanes[0].seen() : (decision?.seen ?? this.#lanes[0].seen());
+    this.#bars.seen.show(seen.state[i]);
     if (decision === null) return;
     this.#bars.acts?.show(decision.continuous[i]);
     const shares = this.#bars.chances && probabilities(this.#host.policy().contract, decision.outputs, i);

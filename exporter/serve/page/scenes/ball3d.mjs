@@ -13,6 +13,7 @@ const START_TILT = 10 * (Math.PI / 180);
 const START_POSITION = 1.5; // m
 const START_SPEED = 0.5; // m/s
 const PUSH = 1.6; // m/s, of a visitor
+const THROW = 5; // m/s, at most
 const DOWNHILL = [-1, 1];
 
 /** `tilt` is about z and x, `position` and `velocity` along x and z; a pair per agent. */
@@ -53,11 +54,29 @@ export class Ball3D extends Environment {
   }
 
   /** A visitor's push. */
-  poke() {
+  poke(random) {
     for (const velocity of this.velocity) {
-      velocity[0] += PUSH * chance();
-      velocity[1] += PUSH * chance();
+      velocity[0] += PUSH * chance(random);
+      velocity[1] += PUSH * chance(random);
     }
+  }
+
+  /** A visitor holds a ball at a place of its platform. */
+  hold(i, place) {
+    this.position[i] = place.map((p) => clip(p, -HALF_SIDE, HALF_SIDE));
+    this.velocity[i] = [0, 0];
+  }
+
+  /** ... and lets it go with a speed. */
+  release(i, velocity) {
+    this.velocity[i] = velocity.map((v) => clip(v, -THROW, THROW));
+  }
+
+  /** A click pushes the ball away from it. */
+  push(i, place) {
+    const away = this.position[i].map((p, k) => p - place[k]);
+    const length = Math.hypot(...away) || 1;
+    this.velocity[i] = this.velocity[i].map((v, k) => v + (PUSH * away[k]) / length);
   }
 
   snapshot() {

@@ -73,7 +73,7 @@ export class Environment {
 
 export const clip = (value, low, high) => Math.min(Math.max(value, low), high);
 
-/** A number in [-1, 1); for what a visitor does, which is not the environment's own chance. */
-export const chance = () => 2 * Math.random() - 1;
+/** A number in [-1, 1) of a uniform one; for what a visitor does, which is not the environment's own chance. */
+export const chance = (random) => 2 * random() - 1;
 
 export const pairs = (count) => Array.from({ length: count }, () => [0, 0]);

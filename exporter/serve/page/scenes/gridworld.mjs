@@ -52,11 +52,21 @@ export class GridWorld extends Environment {
     return { state, masks: this.agent.map((at) => open(at).map(Number)) };
   }
 
+  /** A visitor puts the goal somewhere, if that is free. */
+  hold(i, cell) {
+    const taken = [this.agent[i], this.pit[i]].some((other) => same(other, cell));
+    if (!taken && FREE.some((free) => same(free, cell))) this.goal[i] = [...cell];
+  }
+
+  push(i, cell) {
+    this.hold(i, cell);
+  }
+
   /** A visitor moves the goals, each to a cell that is free. */
-  poke() {
+  poke(random) {
     this.goal.forEach((old, i) => {
       const left = FREE.filter((cell) => ![old, this.agent[i], this.pit[i]].some((taken) => same(taken, cell)));
-      this.goal[i] = left[Math.floor(Math.random() * left.length)];
+      this.goal[i] = left[Math.floor(random() * left.length)];
     });
   }
 

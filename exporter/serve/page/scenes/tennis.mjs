@@ -73,8 +73,8 @@ export class Tennis extends Environment {
   }
 
   /** A visitor deflects the ball. */
-  poke() {
-    for (const velocity of this.velocity) velocity[1] = clip(velocity[1] + chance(), -MAX_SLANT, MAX_SLANT);
+  poke(random) {
+    for (const velocity of this.velocity) velocity[1] = clip(velocity[1] + chance(random), -MAX_SLANT, MAX_SLANT);
   }
 
   snapshot() {

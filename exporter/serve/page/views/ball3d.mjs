@@ -12,7 +12,9 @@ const CORNERS = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map((corner) => corner.map(
 
 const view = {
   name: "3DBall",
-  story: "Each platform keeps its ball up by tilting. An episode is 20 seconds; a ball that rolls off starts the next.",
+  story:
+    "Each platform keeps its ball up by tilting. An episode is 20 seconds; a ball that rolls off starts the next. " +
+    "Drag a ball and let it go, or click beside it.",
   poke: "Nudge the balls",
   stepSeconds: TIME_STEP,
   agents: AGENTS,
@@ -41,24 +43,54 @@ const view = {
       `is ${Math.hypot(x, z).toFixed(1)} metres from the middle.`
     );
   },
+  gusts: true,
+  at,
   draw,
 };
 
 export const viewOf = () => view;
 
-function draw(context, { width, height }, before, after, share, colours, chosen) {
+/** Where the platforms stand, and what projects a point of the world. */
+function layout({ width, height }) {
   const columns = width < 560 ? 3 : 4;
   const rows = AGENTS / columns;
-  const project = camera(width, height, columns, rows);
-  const order = Array.from({ length: AGENTS }, (_, i) => {
+  const platforms = Array.from({ length: AGENTS }, (_, i) => {
     const [column, row] = [i % columns, Math.floor(i / columns)];
     return { i, x: (column - (columns - 1) / 2) * SPACING.x, z: (row - (rows - 1) / 2) * SPACING.z };
   });
-  for (const place of order) {
+  return { platforms, project: camera(width, height, columns, rows) };
+}
+
+function draw(context, size, before, after, share, colours, chosen) {
+  const { platforms, project } = layout(size);
+  for (const place of platforms) {
     const tilt = between(before, after, "tilt", place.i, share);
     const position = between(before, after, "position", place.i, share);
     platform(context, project, place, tilt, position, colours, place.i === chosen);
   }
+}
+
+/** The platform under a point of the canvas, and the place on it, in m; of `agent`'s platform if it is given. */
+function at(size, after, [x, y], agent) {
+  const { platforms, project } = layout(size);
+  const away = (place) => {
+    const middle = project([place.x, 0, place.z]);
+    return Math.hypot(middle.x - x, middle.y - y) / middle.scale;
+  };
+  const found = agent === undefined ? platforms.reduce((a, b) => (away(b) < away(a) ? b : a)) : platforms[agent];
+  if (agent === undefined && away(found) > 1.3 * HALF_SIDE) return null;
+  const tilt = after.tilt[found.i];
+  const seen = ([u, v]) => project([found.x + u, u * Math.tan(tilt[0]) - v * Math.tan(tilt[1]), found.z + v]);
+  let place = [0, 0];
+  for (let turn = 0; turn < 4; turn++) {
+    const here = seen(place);
+    const [alongU, alongV] = [seen([place[0] + 0.01, place[1]]), seen([place[0], place[1] + 0.01])];
+    const [a, b] = [(alongU.x - here.x) / 0.01, (alongV.x - here.x) / 0.01];
+    const [c, d] = [(alongU.y - here.y) / 0.01, (alongV.y - here.y) / 0.01];
+    const [dx, dy] = [x - here.x, y - here.y];
+    place = [place[0] + (d * dx - b * dy) / (a * d - b * c), place[1] + (a * dy - c * dx) / (a * d - b * c)];
+  }
+  return { agent: found.i, place };
 }
 
 /** A camera that looks at the middle; whatever the grid, all of it is in the picture. */

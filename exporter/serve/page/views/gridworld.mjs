@@ -7,7 +7,7 @@ const AGENTS = 6;
 
 const view = {
   name: "GridWorld",
-  story: "Each walker (blue) goes to the goal (+) and around the pit (×). Moves into walls are masked.",
+  story: "Each walker (blue) goes to the goal (+) and around the pit (×). Moves into walls are masked. Drag the goal, or click where it is to be.",
   poke: "Move the goals",
   stepSeconds: 0.3,
   agents: AGENTS,
@@ -29,10 +29,21 @@ const view = {
       `walker is at ${cell(env.agent[chosen])}, the goal at ${cell(env.goal[chosen])}, the pit at ${cell(env.pit[chosen])}.`
     );
   },
+  at,
   draw,
 };
 
 export const viewOf = () => view;
+
+/** The room and the cell under a point of the canvas. */
+function at({ width, height }, after, [x, y], agent) {
+  const rooms = places(AGENTS, width, height);
+  const room = agent ?? rooms.findIndex((place) => x >= place.x && x < place.x + place.width && y >= place.y && y < place.y + place.width);
+  if (room < 0) return null;
+  const cell = rooms[room].width / SIZE;
+  const inside = (n) => Math.max(0, Math.min(SIZE - 1, Math.floor(n)));
+  return { agent: room, place: [inside((x - rooms[room].x) / cell), SIZE - 1 - inside((y - rooms[room].y) / cell)] };
+}
 
 function draw(context, { width, height }, before, after, share, colours, chosen) {
   places(AGENTS, width, height).forEach((place, i) => room(context, place, i, before, after, share, colours, i === chosen));
