@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 JS := converters/runtimes/javascript/js
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: install browser demo check test lint types docs figures bench fuzz train clean help
+.PHONY: install browser demo check test lint types docs figures pictures bench fuzz train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
@@ -15,6 +15,7 @@ help:
 	@echo "make test      lint, types and all tests (installs Chromium where apt-get can, for those in a browser)"
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes)"
+	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
 	@echo "make fuzz      damaged files of every kind, N=20000 of each (hours); what came of them, counted"
 	@echo "make train     the policies of fixtures/trained anew, in an environment of its own (minutes)"
@@ -68,6 +69,9 @@ docs: install
 
 figures: install
 	$(BIN)/python -m tests.figures
+
+pictures: install browser
+	$(BIN)/python -m tests.pictures
 
 bench: install
 	$(BIN)/python -m tests.bench

@@ -24,6 +24,7 @@ const [modules, executablePath] = process.argv.slice(2);
 const { url, context, steps } = JSON.parse(await text(process.stdin));
 const { chromium } = createRequire(path.join(path.resolve(modules), "package.json"))("playwright-core");
 const browser = await chromium.launch({ executablePath, args: FLAGS, timeout: PATIENCE });
+let reader; // a page of its own, which decodes pictures
 const seen = { results: [], console: [], requests: [] };
 try {
   const page = await (await browser.newContext(context)).newPage();
@@ -68,6 +69,21 @@ try {
         }
         document.dispatchEvent(new DragEvent("drop", { dataTransfer, bubbles: true, cancelable: true }));
       }, files);
+    },
+    /** What an element looks like: its pixels, RGBA. */
+    async pixels(selector) {
+      const png = (await page.locator(selector).screenshot()).toString("base64");
+      reader ??= await (await browser.newContext()).newPage();
+      return reader.evaluate(async (data) => {
+        const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+        const image = await createImageBitmap(new Blob([bytes]));
+        const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
+        context.drawImage(image, 0, 0);
+        const raw = context.getImageData(0, 0, image.width, image.height).data;
+        let text = "";
+        for (let at = 0; at < raw.length; at += 30000) text += String.fromCharCode(...raw.subarray(at, at + 30000));
+        return { width: image.width, height: image.height, data: btoa(text) };
+      }, png);
     },
     shot: async (file, fullPage = true) => void (await page.screenshot({ path: file, fullPage })),
   };

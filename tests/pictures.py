@@ -1,0 +1,120 @@
+"""``python -m tests.pictures``: docs/pictures/page.png, which moves, and report.png, as Chromium shows them.
+
+The moving one is an APNG: one palette for all frames, and in each frame only what changed since the last.
+"""
+
+from __future__ import annotations
+
+import base64
+import struct
+import tempfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from exporter.serve.site import assemble_one_file
+from fixtures.trained import run_folder
+from tests.commands import export_model
+from tests.serve.browsing import visit
+
+PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
+FRAMES, STEPS, MILLISECONDS = 40, 5, 110
+#: Colours, beside the transparent one that says "as before".
+COLOURS = 127
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def main() -> None:
+    """Make both."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        ran = export_model(run_folder("3DBall"), "-o", folder, "--html", folder / "report.html")
+        assert ran.status == 0, ran.err
+        (folder / "page.html").write_bytes(assemble_one_file(folder / "3DBall"))
+        steps = f"for (let n = 0; n < {STEPS}; n++) document.querySelector('#step').click()"
+        once = [
+            ["eval", f"{{ {steps} }}"],
+            ["eval", "new Promise((done) => setTimeout(done, 120))"],
+            ["pixels", ".stage"],
+        ]
+        ready = ["wait", "document.querySelector('#status-2') !== null"]
+        hide = ["eval", "document.querySelectorAll('.stage .controls').forEach((e) => (e.hidden = true))"]
+        seen = visit(
+            f"{(folder / 'page.html').as_uri()}#beside=untrained",
+            [ready, hide, *(step for _ in range(FRAMES) for step in once)],
+            viewport={"width": 1160, "height": 900},
+            reducedMotion="reduce",
+        )
+        frames = [pixels(r) for r in seen.results if isinstance(r, dict)]
+        save("page.png", animated(frames))
+        report = visit((folder / "report.html").as_uri(), [["pixels", "body"]], viewport={"width": 1100, "height": 900})
+        save("report.png", animated([pixels(report.results[0])[:1100]]))
+
+
+def save(name: str, data: bytes) -> None:
+    (PICTURES / name).write_bytes(data)
+    print(f"docs/pictures/{name}: {len(data) / 1000:.0f} kB")
+
+
+def pixels(said: dict[str, Any]) -> Pixels:
+    """[height, width, 3]."""
+    raw = np.frombuffer(base64.b64decode(said["data"]), np.uint8)
+    return raw.reshape(said["height"], said["width"], 4)[..., :3]
+
+
+def animated(frames: Sequence[Pixels]) -> bytes:
+    """A PNG; of several frames an APNG, which repeats for ever."""
+    table, lookup = palette(frames)
+    indices = [lookup[coarse(frame)] for frame in frames]
+    height, width = indices[0].shape
+    parts = [chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0))]
+    if len(frames) > 1:
+        parts.append(chunk(b"acTL", struct.pack(">II", len(frames), 0)))
+    parts += [chunk(b"PLTE", bytes(3) + table.tobytes()), chunk(b"tRNS", b"\0")]
+    sequence = 0
+    for number, frame in enumerate(indices):
+        if len(frames) > 1:
+            timing = struct.pack(">IIIIIHHBB", sequence, width, height, 0, 0, MILLISECONDS, 1000, 0, 1)
+            parts.append(chunk(b"fcTL", timing))
+            sequence += 1
+        shown = frame if number == 0 else np.where(frame == indices[number - 1], 0, frame)
+        data = zlib.compress(b"".join(b"\0" + row.tobytes() for row in shown.astype(np.uint8)), 9)
+        if number == 0:
+            parts.append(chunk(b"IDAT", data))
+        else:
+            parts.append(chunk(b"fdAT", struct.pack(">I", sequence) + data))
+            sequence += 1
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts) + chunk(b"IEND", b"")
+
+
+def coarse(frame: Pixels) -> npt.NDArray[np.int32]:
+    """Colours of five bits a channel, as one number."""
+    red, green, blue = (frame[..., k].astype(np.int32) >> 3 for k in range(3))
+    return red << 10 | green << 5 | blue
+
+
+def palette(frames: Sequence[Pixels]) -> tuple[Pixels, npt.NDArray[np.uint8]]:
+    """(the most frequent colours as they are on average, coarse colour → its index, from 1)."""
+    keys = np.concatenate([coarse(f).reshape(-1) for f in frames[:: max(len(frames) // 8, 1)]])
+    values = np.concatenate([f.reshape(-1, 3) for f in frames[:: max(len(frames) // 8, 1)]]).astype(np.float64)
+    counts = np.bincount(keys, minlength=1 << 15)
+    sums = np.stack([np.bincount(keys, values[:, k], 1 << 15) for k in range(3)], axis=-1)
+    chosen = np.argsort(-counts, kind="stable")[:COLOURS]
+    table = np.round(sums[chosen] / np.maximum(counts[chosen, None], 1))
+    grid = np.arange(1 << 15)
+    colours = np.stack([grid >> 10, grid >> 5 & 31, grid & 31], axis=-1) * 8.0 + 4
+    nearest = [np.abs(part[:, None] - table).sum(-1).argmin(-1) for part in np.array_split(colours, 64)]
+    return table.astype(np.uint8), (np.concatenate(nearest) + 1).astype(np.uint8)
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+if __name__ == "__main__":
+    main()
