@@ -25,6 +25,8 @@ Fields: TypeAlias = Mapping[int, "Fields | None"]
 LARGE = 1 << 12
 #: Files of fewer bytes are parsed as they are.
 LARGE_FILE = 1 << 20
+#: Protobuf's own limit.
+MAX_MESSAGE = (2 << 30) - 1
 _SECRET = os.urandom(16)
 _MARK = re.compile(re.escape(_SECRET) + b".{8}", re.DOTALL)
 _MARK_BYTES = len(_SECRET) + 8
@@ -36,11 +38,15 @@ class Detached:
 
     def __init__(self) -> None:
         self._arrays: list[np.ndarray] = []
+        self._numbers: dict[tuple[object, ...], int] = {}
 
     def mark(self, array: np.ndarray) -> bytes:
-        """What stands for the bytes of an array in a message."""
-        self._arrays.append(array)
-        return _SECRET + (len(self._arrays) - 1).to_bytes(8, "little")
+        """What stands for the bytes of an array in a message; the same memory has the same."""
+        place = (array.__array_interface__["data"][0], array.shape, array.strides, array.dtype.str)
+        number = self._numbers.setdefault(place, len(self._arrays))
+        if number == len(self._arrays):
+            self._arrays.append(array)
+        return _SECRET + number.to_bytes(8, "little")
 
     def array(self, content: bytes) -> np.ndarray | None:
         """What a field's content is the mark of; None where it is no mark."""
@@ -100,6 +106,11 @@ class Detached:
         return [*parts, bytes(view[kept:])]
 
 
+def is_readable(message: Pieces) -> bool:
+    """Whether protobuf could read a message in one."""
+    return message.size <= MAX_MESSAGE
+
+
 # ------------------------------------------------------------------ protobuf's wire format
 
 
@@ -147,7 +158,7 @@ def _read_varint(view: memoryview, at: int) -> tuple[int, int]:
 
 
 def varint(value: int) -> bytes:
-    """As protobuf writes a number."""
+    """A number as protobuf and TensorFlow's tables write it."""
     data = bytearray()
     while value > 0x7F:
         data.append(value & 0x7F | 0x80)

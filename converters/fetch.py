@@ -11,8 +11,10 @@ from pathlib import Path
 from signatures.digest import sha256_hex, sha256_of_file
 from signatures.errors import DamagedFileError, SourceError
 
-#: Protobuf's own limit; no policy comes near it.
+#: Protobuf's own limit; files of other formats that are one have the same.
 MAX_BYTES = (2 << 30) - 1
+#: Weights that lie beside a model, all together; no policy comes near it.
+MAX_WEIGHTS = 16 << 30
 #: As a path keeps an address: with one slash of the two.
 _ADDRESS = re.compile("(https?|ftps?|s3|gs|hf|ssh|git)://?")
 
@@ -47,9 +49,9 @@ class Fetched:
         return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())
 
 
-def read_bytes(path: Path, *, empty: bool = False) -> bytes:
+def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> bytes:
     """The file's bytes. Raises SourceError where it is missing, a folder or unreadable, DamagedFileError where it is
-    empty, unless it may be.
+    empty, unless it may be; ``most`` bytes are read.
     """
     try:
         status = path.stat()
@@ -59,9 +61,9 @@ def read_bytes(path: Path, *, empty: bool = False) -> bytes:
             )
         if not stat.S_ISREG(status.st_mode):
             raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
-        if status.st_size > MAX_BYTES:
+        if status.st_size > most:
             raise SourceError(
-                f"has {status.st_size} bytes, and no model of 2 GiB or more is read",
+                f"has {status.st_size} bytes, and no file of {(most + 1) >> 30} GiB or more is read",
                 where=str(path),
                 fix="give the frozen graph of the policy; it has some hundred kilobytes",
             )

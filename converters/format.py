@@ -126,7 +126,8 @@ class Format:
     - ``read`` gives the models of a file or folder; ``members`` instead says which sources inside are to be read.
       ``takes`` are the options that mean something to it: ``step``, ``sensors``.
     - ``write`` gives the files of an artefact by their path in the bundle; ``main`` is the one that a loader is given,
-      with ``{name}`` for the policy's name. A ``default`` is written unless ``--to`` says otherwise.
+      with ``{name}`` for the policy's name, ``beside`` a file that it may need next to it. A ``default`` is written
+      unless ``--to`` says otherwise.
     - ``vetted`` copies an artefact that anyone may have made to an empty folder, as far as a runtime may be given it:
       what the wanted nodes (of a graph that any node can be asked of) or signatures need, no op that does more than
       compute, no file from elsewhere.
@@ -147,6 +148,7 @@ class Format:
     takes: frozenset[str] = frozenset()
     write: Callable[[Policy, WriteOptions], Mapping[str, Pieces]] | None = None
     main: str = ""
+    beside: str = ""
     default: bool = False
     ports: Callable[[Path], Ports] | None = None
     vetted: Callable[[Path, Sequence[str], Path], Path] | None = None
@@ -173,7 +175,7 @@ class Format:
     def owns(self, path: str, name: str) -> bool:
         """Whether a file of the bundle of the policy ``name`` is of this format's artefact."""
         main = self.main_of(name)
-        return path == main or (bool(self.marker) and path.startswith(f"{main}/"))
+        return path in (main, self.beside.format(name=name)) or (bool(self.marker) and path.startswith(f"{main}/"))
 
     def artifact(self, policy: Policy, options: WriteOptions) -> Artifact:
         """The policy in this format, which has a writer. Raises GraphError and its like where it cannot be."""

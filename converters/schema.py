@@ -48,7 +48,7 @@ _MESSAGES = {
     "TensorInfo": "1 name string, 2 dtype int32, 3 tensor_shape TensorShapeProto",
     "SignatureDef": "1 inputs <TensorInfo, 2 outputs <TensorInfo, 3 method_name string",
     "MetaInfoDef": "1 meta_graph_version string, 4 tags string*, 5 tensorflow_version string",
-    "SaverDef": "3 restore_op_name string",
+    "SaverDef": "1 filename_tensor_name string, 2 save_tensor_name string, 3 restore_op_name string, 7 version int32",
     "MetaGraphDef": (
         "1 meta_info_def MetaInfoDef, 2 graph_def GraphDef, 3 saver_def SaverDef, 5 signature_def <SignatureDef"
     ),

@@ -126,6 +126,10 @@ class UnsupportedOpError(GraphError):
         return {**super().to_dict(), "issues": [{"node": n, "op": o} for n, o in self.issues]}
 
 
+class TooLargeError(ExportModelError):
+    """A format cannot hold a policy of that size. A format that nobody asked for is left out, with a note."""
+
+
 class SignatureError(ExportModelError):
     """Inputs and outputs cannot be given their roles; the text lists the candidates and the flags that decide."""
 

@@ -24,34 +24,38 @@ def _table() -> np.ndarray:
 
 
 _TABLE = _table()
+#: Two bytes at once.
+_PAIRS = _TABLE[(_TABLE[np.arange(1 << 16) & 0xFF] ^ (np.arange(1 << 16) >> 8)) & 0xFF] ^ (
+    _TABLE[np.arange(1 << 16) & 0xFF] >> np.uint32(8)
+)
 _NUMBERS: list[int] = _TABLE.tolist()
 
 
-def _scalar(state: int, data: bytes) -> int:
+def _scalar(state: int, data: bytes | memoryview) -> int:
     for byte in data:
         state = _NUMBERS[(state ^ byte) & 0xFF] ^ (state >> 8)
     return state
 
 
 def _advance(states: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Every state moved over its lane; ``columns`` are the lanes' bytes, one row per position."""
+    """Every state moved over its lane; ``columns`` are the lanes' pairs of bytes, one row per position."""
     for column in columns:
-        states = _TABLE[(states ^ column) & np.uint32(0xFF)] ^ (states >> np.uint32(8))
+        states = _PAIRS[(states ^ column) & np.uint32(0xFFFF)] ^ (states >> np.uint32(16))
     return states
 
 
-def crc32c(data: bytes) -> int:
-    """The checksum of ``data``, not masked."""
+def crc32c(data: bytes | memoryview, before: int = 0) -> int:
+    """The checksum of ``data``, not masked; ``before`` is that of what lies before it."""
     if len(data) < _SHORT:
-        return _scalar(_ONES, data) ^ _ONES
-    length = max(int(len(data) ** 0.5) // 2, 256)
+        return _scalar(before ^ _ONES, data) ^ _ONES
+    length = max(int(len(data) ** 0.5) // 4, 128) * 2
     count = len(data) // length
-    lanes = np.frombuffer(data, np.uint8, count * length).reshape(count, length)
+    lanes = np.frombuffer(data, "<u2", count * length // 2).reshape(count, length // 2)
     states = np.zeros(count, np.uint32)
-    states[0] = _ONES
+    states[0] = before ^ _ONES
     ends: list[int] = _advance(states, np.ascontiguousarray(lanes.T)).tolist()
     bits = np.uint32(1) << np.arange(32, dtype=np.uint32)
-    images: list[int] = _advance(bits, np.zeros((length, 1), np.uint8)).tolist()
+    images: list[int] = _advance(bits, np.zeros((length // 2, 1), np.uint16)).tolist()
     state = ends[0]
     for end in ends[1:]:
         moved = 0

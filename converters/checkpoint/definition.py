@@ -12,20 +12,24 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.detached import Detached
 from converters.frozen_graph.tensors import from_array
 from converters.graph.nodes import NameScope, node_of
 from converters.graph.ops.table import hands_on
 
 
-def with_values(graph_def: Any, values: Mapping[str, np.ndarray]) -> Any:
-    """A GraphDef in which the variables named in ``values`` are constants, and what reads them reads these."""
+def with_values(graph_def: Any, values: Mapping[str, np.ndarray], detached: Detached) -> Any:
+    """A GraphDef in which the variables named in ``values`` are constants, and what reads them reads these.
+
+    Large values go to ``detached``.
+    """
     frozen = schema.GraphDef()
     frozen.versions.CopyFrom(graph_def.versions)
     scope = NameScope(n.name for n in graph_def.node)
     dtypes = _handles(graph_def, values)
     for node in graph_def.node:
         if node.name in values:
-            frozen.node.append(_constant(node.name, values[node.name]))
+            frozen.node.append(_constant(node.name, values[node.name], detached))
             continue
         copy = frozen.node.add()
         copy.CopyFrom(node)
@@ -41,7 +45,7 @@ def with_values(graph_def: Any, values: Mapping[str, np.ndarray]) -> Any:
             copy.attr["T"].type = dtype
         elif node.op == "ResourceGather":
             axis = scope.fresh(f"{node.name}/axis")
-            frozen.node.append(_constant(axis, np.array(0, np.int32)))
+            frozen.node.append(_constant(axis, np.array(0, np.int32), detached))
             indices = node.attr["Tindices"].type
             _become(copy, "GatherV2", Tparams=dtype, Tindices=indices, Taxis=schema.dtype_number(np.dtype(np.int32)))
             copy.input.insert(2, axis)
@@ -66,10 +70,10 @@ def _handles(graph_def: Any, values: Mapping[str, np.ndarray]) -> dict[str, int]
     return found
 
 
-def _constant(name: str, value: np.ndarray) -> Any:
+def _constant(name: str, value: np.ndarray, detached: Detached) -> Any:
     node = schema.NodeDef(name=name, op="Const")
     node.attr["dtype"].type = schema.dtype_number(value.dtype)
-    node.attr["value"].tensor.CopyFrom(from_array(value))
+    node.attr["value"].tensor.CopyFrom(from_array(value, detached))
     return node
 
 

@@ -13,6 +13,7 @@ from converters.checkpoint.policy_nodes import policy_nodes
 from converters.checkpoint.table import MAGIC
 from converters.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
 from converters.checkpoint.training_graph import read_training_graph
+from converters.detached import Detached
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.errors import ExportModelError, SourceError, UsageError
@@ -71,12 +72,15 @@ def read_checkpoint(
         if error.where is None:
             raise error.at(path.name) from error.__cause__
         raise
+    detached = Detached()
     return SourceModel(
         policy,
         (path, *checkpoint.files),
         SourceFacts(notes=(*found, *notes)),
         name,
-        OriginalRun("tensorflow", path, definition=with_values(training.definition, frozen.values)),
+        OriginalRun(
+            "tensorflow", path, definition=with_values(training.definition, frozen.values, detached), detached=detached
+        ),
     )
 
 

@@ -42,6 +42,7 @@ class Checkpoint:
     def __init__(self, prefix: Path) -> None:
         """Read the index of ``prefix``. Raises SourceError, DamagedFileError, NotAPolicyError for a V1 checkpoint."""
         self.prefix = prefix
+        self._read: dict[str, np.ndarray] = {}
         self.index = prefix.with_name(prefix.name + ".index")
         try:
             self._entries = dict(read_table(self.index.read_bytes()))
@@ -100,7 +101,9 @@ class Checkpoint:
         Raises DamagedFileError that names the tensor and the file; KeyError where there is no such tensor.
         """
         entry = self._entry(name.encode(), name)
-        array = self._joined(name, entry) if entry.slices else self._tensor(name, entry)
+        if name not in self._read:
+            self._read[name] = self._joined(name, entry) if entry.slices else self._tensor(name, entry)
+        array = self._read[name]
         if extents is None:
             return array
         return array[self._window(name, array.shape, extents)].copy()

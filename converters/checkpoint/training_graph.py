@@ -17,6 +17,7 @@ import numpy as np
 
 from converters import schema
 from converters.checkpoint.tensor_bundle import Extents
+from converters.detached import Detached
 from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.tensors import to_array
 from converters.graph.nodes import Graph, node_of, split_ref
@@ -57,13 +58,13 @@ def read_training_graph(path: Path) -> TrainingGraph:
     return training_graph(graph_def)
 
 
-def training_graph(graph_def: Any) -> TrainingGraph:
-    """The same of a GraphDef message."""
+def training_graph(graph_def: Any, detached: Detached | None = None) -> TrainingGraph:
+    """The same of a GraphDef message, of which some may be ``detached``."""
     saved = saved_places(graph_def)
     rest = SimpleNamespace(
         node=_without_initial_values(graph_def), library=graph_def.library, versions=graph_def.versions
     )
-    return TrainingGraph(from_graph_def(rest), saved, graph_def)
+    return TrainingGraph(from_graph_def(rest, detached), saved, graph_def)
 
 
 def _inputs(proto: Any) -> list[str]:

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from converters import schema
 from converters.bundle.embed import with_contract
-from converters.detached import Detached
+from converters.detached import Detached, is_readable
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.pieces import Pieces
 from converters.policy import Policy
+from signatures.errors import TooLargeError
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
-    """The ``.bytes`` artefact."""
-    return {f"{policy.name}.bytes": frozen(policy, options.contract)}
+    """The ``.bytes`` artefact. Raises TooLargeError where no TensorFlow could read it."""
+    made = frozen(policy, options.contract)
+    if not is_readable(made):
+        raise TooLargeError(
+            f"a .bytes of {made.size} bytes cannot be read",
+            where=policy.name,
+            why="it is one protobuf message, which may have no more than 2 GiB",
+            fix="write the other formats: --to saved_model,tfjs,onnx",
+        )
+    return {f"{policy.name}.bytes": made}
 
 
 def frozen(policy: Policy, contract: str = "{}") -> Pieces:

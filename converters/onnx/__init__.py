@@ -53,6 +53,7 @@ FORMATS = (
         read=_read,
         write=_write,
         main="{name}.onnx",
+        beside="{name}.onnx.data",
         default=True,
         ports=_ports,
         vetted=_vetted,

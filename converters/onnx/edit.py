@@ -62,8 +62,8 @@ def _rename_reads(nodes: Iterable[Any], old: str, new: str) -> None:
                 _rename_reads(attribute.g.node, old, new)
 
 
-def cut(model: Any, fetch: Sequence[str]) -> bytes:
-    """The part of a model that makes the values in ``fetch``, with these as its outputs, serialised."""
+def cut(model: Any, fetch: Sequence[str]) -> Any:
+    """The part of a model that makes the values in ``fetch``, with these as its outputs."""
     import onnx
     import onnx.helper
 
@@ -91,8 +91,7 @@ def cut(model: Any, fetch: Sequence[str]) -> bytes:
     outputs = [types.get(o.name, o) for o in outputs]
     fresh = onnx.helper.make_graph(nodes, graph.name or "graph", inputs, outputs, constants)
     part.graph.CopyFrom(fresh)
-    data: bytes = part.SerializeToString()
-    return data
+    return part
 
 
 def _reads(node: Any) -> list[str]:

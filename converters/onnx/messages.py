@@ -22,7 +22,10 @@ _CLASSES = message_classes(
         "Tensor": "1 elem_type int32, 2 shape TensorShapeProto",
         "TypeProto": "1 tensor_type Tensor",
         "ValueInfoProto": "1 name string, 2 type TypeProto",
-        "TensorProto": "1 dims int64*, 2 data_type int32, 8 name string, 9 raw_data bytes",
+        "TensorProto": (
+            "1 dims int64*, 2 data_type int32, 8 name string, 9 raw_data bytes, "
+            "13 external_data StringStringEntryProto*, 14 data_location int32"
+        ),
         "AttributeProto": (
             "1 name string, 2 f float, 3 i int64, 4 s bytes, 5 t TensorProto, 7 floats float*, 8 ints int64*, "
             "9 strings bytes*, 20 type int32"

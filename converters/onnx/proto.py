@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from converters.detached import LARGE, LARGE_FILE, Detached, Fields
-from converters.fetch import MAX_BYTES, read_bytes
+from converters.fetch import MAX_WEIGHTS, read_bytes
 from converters.graph.types import FLOAT32
 from converters.schema import check_nodes
 from signatures.errors import DamagedFileError, UnsupportedOpError
@@ -215,8 +215,8 @@ def load_external(graph: Any, folder: Path, detached: Detached | None = None) ->
     for tensor in tensors(graph):
         if tensor.data_location == _EXTERNAL:
             total += _bring(tensor, folder, files, detached)
-            if total > MAX_BYTES:
-                raise _damaged(tensor.name, "the model's weights together are larger than 2 GiB")
+            if total > MAX_WEIGHTS:
+                raise _damaged(tensor.name, f"the model's weights together are larger than {MAX_WEIGHTS >> 30} GiB")
             if total > _MAX_TIMES * sum(map(len, files.values())):
                 raise _damaged(tensor.name, "the same bytes of a file are named again and again as weights")
     return sorted(files)
@@ -226,7 +226,7 @@ def _bring(tensor: Any, folder: Path, files: dict[Path, bytes], detached: Detach
     entries = {e.key: e.value for e in tensor.external_data}
     path = _inside(folder, entries.get("location", ""), tensor.name)
     if path not in files:
-        files[path] = read_bytes(path)
+        files[path] = read_bytes(path, most=MAX_WEIGHTS)
     data = files[path]
     try:
         offset = int(entries.get("offset") or 0)

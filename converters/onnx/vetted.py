@@ -1,8 +1,8 @@
 """An ONNX model that anyone may have made, as far as a runtime may be given it.
 
 onnxruntime reads the files that a model names as its weights, in some releases from any folder, and loads what
-custom ops need. The copy is one file: weights that lie beside the model are brought into it, others are refused, and so
-is every op that is not of ONNX or of the runtime itself.
+custom ops need. The copy is one file: weights that lie beside the model are brought into it (from 2 GiB on, into one of
+our own name beside it), others are refused, and so is every op that is not of ONNX or of the runtime itself.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 from converters.detached import Detached
 from converters.fetch import read_bytes
+from converters.onnx.files import files_of
 from converters.onnx.proto import decoded, load_external
 from signatures.errors import UnsupportedOpError
 
@@ -29,7 +30,8 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     """
     copy = folder / path.name
     detached = Detached()
-    detached.whole(contained(path, detached).SerializeToString()).write(copy)
+    for name, data in files_of(contained(path, detached), detached, path.name).items():
+        data.write(folder / name)
     return copy
 
 

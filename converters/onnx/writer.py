@@ -21,6 +21,7 @@ from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
 from converters.onnx import messages
+from converters.onnx.files import files_of
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
 from converters.pieces import Pieces, equal
 from converters.policy import Policy
@@ -274,7 +275,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     )
     if options.checked:
         _check(model, builder.detached, policy.name)
-    return {f"{policy.name}.onnx": builder.detached.whole(model.SerializeToString(deterministic=True))}
+    return files_of(model, builder.detached, f"{policy.name}.onnx")
 
 
 def _check(model: Any, detached: Detached, name: str) -> None:

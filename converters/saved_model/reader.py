@@ -7,9 +7,11 @@ the signatures call functions of the graph's library (converters/saved_model/inl
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import field
 from typing import Any
 
 from converters import schema
+from converters.detached import Detached
 from converters.graph.nodes import TensorShape, node_of
 from converters.graph.ops.outside import CALLING
 from converters.saved_model.signature import ModelSignature, Tensor
@@ -33,14 +35,18 @@ class Saved:
     calls: bool
     #: the node that restores the variables, empty where there is none
     restore: str = ""
+    #: what of the graph lies beside it
+    detached: Detached = field(default_factory=Detached)
 
 
-def read_saved_model(data: bytes, key: str | None = None) -> Saved:
+def read_saved_model(data: bytes, key: str | None = None, detached: Detached | None = None) -> Saved:
     """The MetaGraph that is tagged for serving (else the first), and its signature ``key``.
 
-    Without a key it is ``serving_default``, else the first. Raises DamagedFileError, NotAPolicyError.
+    Without a key it is ``serving_default``, else the first. Large contents go to ``detached``, by default one of
+    its own. Raises DamagedFileError, NotAPolicyError.
     """
-    message = schema.parse(schema.SavedModel, data, "SavedModel")
+    detached = detached or Detached()
+    message = schema.parse(schema.SavedModel, data, "SavedModel", detached)
     if not message.meta_graphs:
         raise NotAPolicyError("the SavedModel has no graph", fix="save the model again")
     meta = next((m for m in message.meta_graphs if "serve" in m.meta_info_def.tags), message.meta_graphs[0])
@@ -53,7 +59,7 @@ def read_saved_model(data: bytes, key: str | None = None) -> Saved:
         signature = ModelSignature(_tensors(definition.inputs), _tensors(definition.outputs), key)
     calls = _calls_functions(meta.graph_def, signature)
     restore = meta.saver_def.restore_op_name
-    return Saved(meta.graph_def, tuple(meta.meta_info_def.tags), signature, keys, calls, restore)
+    return Saved(meta.graph_def, tuple(meta.meta_info_def.tags), signature, keys, calls, restore, detached)
 
 
 def _tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:

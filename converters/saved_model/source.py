@@ -39,7 +39,7 @@ def read(given: Fetched) -> list[SourceModel]:
     if Content(given.bytes_of(file)).is_graph:  # some give a frozen graph this name
         return frozen_graph.read(given.inside(file))
     saved = read_saved_model(given.bytes_of(file))
-    frozen = frozen_model(saved, folder)
+    frozen = frozen_model(saved, values_beside(folder))
     graph, contract = recalled(frozen.graph)
     facts = facts_of(graph, contract)
     if contract is None:
@@ -50,7 +50,7 @@ def read(given: Fetched) -> list[SourceModel]:
             memories=memories_of(frozen.signature, roles),
             notes=_notes(saved),
         )
-    original = OriginalRun("tensorflow", folder, definition=frozen.definition)
+    original = OriginalRun("tensorflow", folder, definition=frozen.definition, detached=saved.detached)
     return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
 
 
@@ -67,16 +67,23 @@ class FrozenModel:
     files: tuple[Path, ...]
 
 
-def frozen_model(saved: Saved, folder: Path) -> FrozenModel:
-    """What a signature computes, flat and frozen. Raises NotAPolicyError, DamagedFileError, GraphError."""
+def values_beside(folder: Path) -> Checkpoint | None:
+    """The values of a SavedModel's variables. Raises SourceError, DamagedFileError."""
     prefix = folder / "variables" / "variables"
-    checkpoint = Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
-    training, signature = _inlined(saved) if saved.calls else (training_graph(saved.graph_def), saved.signature)
+    return Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
+
+
+def frozen_model(saved: Saved, checkpoint: Checkpoint | None) -> FrozenModel:
+    """What a signature computes, flat and frozen. Raises NotAPolicyError, DamagedFileError, GraphError."""
+    detached = saved.detached
+    training, signature = (
+        _inlined(saved) if saved.calls else (training_graph(saved.graph_def, detached), saved.signature)
+    )
     if checkpoint is not None and saved.calls:
         named = {name: Place(key) for name, key in checkpoint.by_variable().items()}
         training = replace(training, saved={**named, **training.saved})
     frozen = freeze(training, checkpoint, signature.roots or None, _WITHOUT_VARIABLES)
-    definition = fed_by_signature(with_values(training.definition, frozen.values), signature)
+    definition = fed_by_signature(with_values(training.definition, frozen.values, detached), signature)
     return FrozenModel(frozen.graph, definition, signature, () if checkpoint is None else checkpoint.files)
 
 
@@ -103,7 +110,7 @@ def _inlined(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
     if saved.restore:
         restoring = flat(saved.graph_def, [saved.restore], restoring=True)
         restored = saved_places(restoring.definition)
-    training = replace(training_graph(flattened.definition), saved=restored)
+    training = replace(training_graph(flattened.definition, saved.detached), saved=restored)
     return training, ModelSignature(inputs, outputs, signature.key)
 
 

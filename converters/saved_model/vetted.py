@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from converters import schema
+from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.frozen_graph.subgraph import subgraph
 from converters.saved_model.reader import read_saved_model
 from converters.saved_model.signature import Tensor
-from converters.saved_model.source import FILE, frozen_model
+from converters.saved_model.source import FILE, frozen_model, values_beside
+from converters.saved_model.variables import files_of
 from converters.saved_model.writer import METHOD
 
 
@@ -26,13 +28,15 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     Raises UnsupportedOpError where an op does more than compute, NotAPolicyError, DamagedFileError, GraphError.
     """
     data = read_bytes(path / FILE)
-    known = read_saved_model(data).keys
+    detached = Detached()
+    known = read_saved_model(data, None, detached).keys
     message = schema.SavedModel(saved_model_schema_version=1)
     meta = message.meta_graphs.add()
     meta.meta_info_def.tags.append("serve")
     placed: dict[str, Any] = {}
+    values = values_beside(path)
     for key in (k for k in wanted if k in known):
-        model = frozen_model(read_saved_model(data, key), path)
+        model = frozen_model(read_saved_model(data, key, detached), values)
         signature = model.signature
         tensors = [t.name for t in (*signature.inputs.values(), *signature.outputs.values())]
         part = subgraph(model.definition, tensors)
@@ -50,7 +54,9 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
                 _fill(side[name], replace(tensor, name=f"{prefix}{tensor.name}"))
     copy = folder / (path.resolve().name or "model")
     copy.mkdir()
-    (copy / FILE).write_bytes(schema.serialise(message))
+    for relative, content in files_of(message, detached, str(folder)).items():
+        (copy / relative).parent.mkdir(exist_ok=True)
+        content.write(copy / relative)
     return copy
 
 

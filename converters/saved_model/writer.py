@@ -1,7 +1,7 @@
 """Policy to a SavedModel (saved_model.proto, meta_graph.proto), without TensorFlow.
 
-There is no ``variables`` folder: the graph has no variables, and neither loader of TensorFlow nor TensorFlow Serving
-asks for one then.
+Below 2 GiB there is no ``variables`` folder: the graph has no variables, and neither loader of TensorFlow nor
+TensorFlow Serving asks for one then.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
 from converters.pieces import Pieces
 from converters.policy import Policy
+from converters.saved_model.variables import files_of
+from signatures.digest import sha256_hex
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
-PATH = "saved_model/saved_model.pb"
+FOLDER = "saved_model"
 SERVING, DETERMINISTIC = "serving_default", "deterministic"
 METHOD = "tensorflow/serving/predict"
 
@@ -67,4 +69,5 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         definition.method_name = METHOD
         _fill(definition.inputs, inputs)
         _fill(definition.outputs, outputs)
-    return {PATH: schema.pieces(message, detached)}
+    files = files_of(message, detached, sha256_hex(options.contract.encode()))
+    return {f"{FOLDER}/{path}": data for path, data in files.items()}

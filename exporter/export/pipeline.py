@@ -28,6 +28,7 @@ from signatures.errors import (
     ExportModelError,
     RefusedError,
     SignatureError,
+    TooLargeError,
     UsageError,
     naming,
 )
@@ -74,6 +75,8 @@ class ExportResult:
     report: ParityReport | None
     #: why it has another name than its source's, where it has
     renamed: str | None = None
+    #: the formats that nobody asked for and that cannot hold it, and why
+    left_out: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         verdict = "not verified" if self.report is None else self.report.verdict
@@ -92,7 +95,7 @@ class ExportResult:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know of the policy."""
-        return (*self.policy.signature.notes, *([] if self.renamed is None else [self.renamed]))
+        return (*self.policy.signature.notes, *([] if self.renamed is None else [self.renamed]), *self.left_out)
 
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -193,8 +196,9 @@ class Exporter:
         for job in jobs:
             bundle.check_replaceable(self.options.out / job.policy.name)
         made = [(j, *_write(j, self._formats, self.options)) for j in jobs]
-        for number, (job, contract, artifacts) in enumerate(made, 1):
-            yield self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
+        for number, (job, contract, artifacts, notes) in enumerate(made, 1):
+            result = self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
+            yield replace(result, left_out=notes)
 
     def _verified(
         self, job: Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool | None, progress: Progress
@@ -312,7 +316,10 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     return [written(target) for target in targets]
 
 
-def _write(job: Job, formats: Sequence[Format], options: ExportOptions) -> tuple[Contract, list[Artifact]]:
+def _write(
+    job: Job, formats: Sequence[Format], options: ExportOptions
+) -> tuple[Contract, list[Artifact], tuple[str, ...]]:
+    """The contract, the artefacts, and why some of the usual formats are not among these."""
     with naming(job.source.path):
         contract = contract_of(
             job.policy, job.source, job.model, options.read, None if job.profile is None else job.profile.name
@@ -321,13 +328,21 @@ def _write(job: Job, formats: Sequence[Format], options: ExportOptions) -> tuple
             how = WriteOptions(contract.compact(), checked=options.verify != "none")
             if options.opset is not None:
                 how = replace(how, opset=options.opset)
-            return contract, [f.artifact(job.policy, how) for f in formats]
+            artifacts, notes = list[Artifact](), list[str]()
+            for form in formats:
+                try:
+                    artifacts.append(form.artifact(job.policy, how))
+                except TooLargeError as error:
+                    if options.targets is not None:
+                        raise
+                    notes.append(f"{form.key} was left out: {error.what}: {error.why}")
+            return contract, artifacts, tuple(notes)
         how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
         artifacts = [f.artifact(job.policy, how) for f in formats]
         for artifact in artifacts:
             if job.profile.check is not None:
                 job.profile.check(job.profile, artifact.files, job.policy.name)
-        return contract, artifacts
+        return contract, artifacts, ()
 
 
 def contract_of(

@@ -18,14 +18,18 @@ from pathlib import Path
 import numpy as np
 
 from converters import schema
+from converters.detached import Detached
 from converters.folders import scratch_folder
-from converters.frozen_graph.reader import read_graph
+from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Graph, normal_ref, ref, split_ref
+from converters.onnx.files import files_of
+from converters.onnx.proto import array_of, decoded, load_external
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View, loads
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.saved_model.reader import read_saved_model
+from converters.saved_model.source import FILE, frozen_model, values_beside
 from converters.source import OriginalRun
 from exporter.verify.participants import Feeds, Participant, Run
 from signatures.records import dataclass
@@ -108,11 +112,13 @@ def _tfjs_nodes(folder: Path) -> frozenset[str]:
 
 @contextmanager
 def _saved_model(folder: Path, key: str, pool: RuntimePool) -> Iterator[InnerTensors]:
-    message = schema.parse(schema.SavedModel, (folder / "saved_model.pb").read_bytes(), "SavedModel")
-    meta = message.meta_graphs[0]
-    fed = {name: normal_ref(info.name) for name, info in meta.signature_def[key].inputs.items()}
-    outputs = [info.name for info in meta.signature_def[key].outputs.values()]
-    inside = OriginalRun("tensorflow", folder, definition=subgraph(meta.graph_def, outputs, fed.values()))
+    saved = read_saved_model((folder / FILE).read_bytes(), key)
+    fed = {name: normal_ref(tensor.name) for name, tensor in saved.signature.inputs.items()}
+    outputs = [tensor.name for tensor in saved.signature.outputs.values()]
+    values = values_beside(folder)
+    definition = saved.graph_def if values is None else frozen_model(saved, values).definition
+    part = subgraph(definition, outputs, fed.values())
+    inside = OriginalRun("tensorflow", folder, definition=part, detached=saved.detached)
     with inside.loadable() as (path, options):
         model = pool.process("tensorflow").load(path, **options)
 
@@ -120,14 +126,16 @@ def _saved_model(folder: Path, key: str, pool: RuntimePool) -> Iterator[InnerTen
         return model.run({fed[n]: a for n, a in feeds.items() if n in fed}, fetch)
 
     with _unloading(model):
-        yield InnerTensors(_own_name(frozenset(n.name for n in meta.graph_def.node)), run)
+        yield InnerTensors(_own_name(frozenset(n.name for n in definition.node)), run)
 
 
 @contextmanager
 def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[InnerTensors]:
     import onnx
 
-    model = onnx.ModelProto.FromString(path.read_bytes())
+    detached = Detached()
+    model = decoded(path.read_bytes(), detached)
+    load_external(model.graph, path.parent, detached)
     graph = model.graph
     notes = {p.key: p.value for p in model.metadata_props}
     names: TensorMap = loads(notes.get(TENSORS_KEY, ""))
@@ -140,7 +148,7 @@ def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[InnerTensors]
         return found if found is not None and found.name in made | constants | fed else None
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
-        values = {t.name: onnx.numpy_helper.to_array(t) for t in graph.initializer if t.name in fetch}
+        values = {t.name: array_of(t, detached) for t in graph.initializer if t.name in fetch}
         values.update({name: feeds[name] for name in fetch if name in fed})
         wanted = [name for name in fetch if name in made]
         if wanted:
@@ -148,7 +156,8 @@ def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[InnerTensors]
             open_model.CopyFrom(model)
             known = {o.name for o in graph.output}
             open_model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in wanted if n not in known)
-            file.write_bytes(open_model.SerializeToString())
+            for name, data in files_of(open_model, detached, file.name).items():
+                data.write(file.with_name(name))
             opened = pool.process(runtime).load(str(file), kind="graph")
             with _unloading(opened):
                 values.update(opened.run({n: a for n, a in feeds.items() if n in fed}, wanted))
@@ -178,8 +187,9 @@ def onnx_sources(path: Path) -> Mapping[str, str]:
 
 def saved_graph(folder: Path) -> Graph:
     """The graph of a SavedModel of ours. Raises SourceError and its like where the file is damaged."""
-    definition = read_saved_model((folder / "saved_model.pb").read_bytes()).graph_def
-    return read_graph(definition.SerializeToString())
+    saved = read_saved_model((folder / FILE).read_bytes())
+    values = values_beside(folder)
+    return from_graph_def(saved.graph_def, saved.detached) if values is None else frozen_model(saved, values).graph
 
 
 def outputs_read(nodes: Sequence[str], reads: Sequence[str]) -> dict[str, list[str]]:

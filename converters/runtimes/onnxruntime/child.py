@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import secrets
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,9 @@ def main() -> None:
             values = self.session.run(list(fetch), feeds)
             return dict(zip(fetch, values, strict=True))
 
+    from converters.detached import Detached
+    from converters.onnx.files import files_of
+
     class Source:
         """A foreign model: a session for each set of values that is asked for."""
 
@@ -59,15 +63,20 @@ def main() -> None:
             from converters.onnx.vetted import contained
 
             self.cut = edit.cut
-            model = contained(Path(path))
-            widen(model)
+            self.detached = Detached()
+            model = contained(Path(path), self.detached)
+            widen(model, self.detached)
             self.model = edit.lifted(model, draws)
             self.sessions: dict[tuple[str, ...], Any] = {}
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
             key = tuple(dict.fromkeys(fetch))
             if key not in self.sessions:
-                self.sessions[key] = session(self.cut(self.model, key))
+                files = files_of(self.cut(self.model, key), self.detached, "source.onnx")
+                with tempfile.TemporaryDirectory() as folder:
+                    for name, data in files.items():
+                        data.write(Path(folder, name))
+                    self.sessions[key] = session(str(Path(folder, "source.onnx")))
             chosen = self.sessions[key]
             wanted = {i.name: i for i in chosen.get_inputs()}
             given = {n: fitting(a, wanted[n].shape, wanted[n].type) for n, a in feeds.items() if n in wanted}
