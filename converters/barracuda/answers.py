@@ -28,9 +28,6 @@ from signatures.spec import PolicySignature, TensorSpec
 Array = np.ndarray
 Arrays = Mapping[str, Array]
 
-#: A drawn class has no place in a ``.nn``: ML-Agents draws it from the log-probabilities.
-_UNANSWERED = (Role.SAMPLED, Role.OTHER)
-
 
 def contract_of(model: NnModel) -> PolicySignature:
     """The contract that the writer left in the file. Raises DamagedFileError where there is none."""
@@ -45,8 +42,13 @@ def contract_of(model: NnModel) -> PolicySignature:
 
 
 def answered(signature: PolicySignature) -> list[str]:
-    """The outputs of a policy that its ``.nn`` answers."""
-    return [s.name for s in signature.outputs if s.role not in _UNANSWERED]
+    """The outputs of a policy that its ``.nn`` answers.
+
+    A drawn class has no place in one of API version 2: ML-Agents draws it from the log-probabilities.
+    """
+    scored = any(s.role is Role.LOG_PROBS for s in signature.outputs)
+    unanswered = {Role.OTHER, Role.SAMPLED} if scored else {Role.OTHER}
+    return [s.name for s in signature.outputs if s.role not in unanswered]
 
 
 class NnPolicy:
@@ -58,6 +60,8 @@ class NnPolicy:
         self.graph: Graph = normalise(to_graph(model).graph)
         self._places = {n.name: n for n in self.graph.nodes if n.op == "Placeholder"}
         self._samplers = [n.name for n in samplers(self.graph)]
+        #: whether the contract has the names of the file
+        self._dressed = any(s.name in self._places for s in self.signature.observations if s.name.startswith("obs_"))
 
     def run(self, feeds: Arrays, fetch: Sequence[str], jitter: Jitter | None = None) -> dict[str, Array]:
         """Outputs by their names in the contract."""
@@ -81,14 +85,15 @@ class NnPolicy:
     def _placed(self, feeds: Arrays) -> dict[str, Array]:
         signature = self.signature
         rows = signature.rows(feeds)
+        if self._dressed:
+            laid = {s.name: self._laid(s, feeds[s.name]) for s in signature.inputs if s.name in self._places}
+            return {n: a.astype(self._places[n].attrs["dtype"]) for n, a in laid.items()}
         found: dict[str, Array] = {}
         vectors = [feeds[s.name].reshape(rows, -1) for s in signature.inputs if s.role is Role.VECTOR]
         if vectors:
             found["vector_observation"] = np.concatenate(vectors, axis=1)
         for number, spec in enumerate(s for s in signature.inputs if s.role is Role.VISUAL):
-            turned = signature.preprocess.get(spec.name, {}).get("layout") == "NCHW"
-            image = feeds[spec.name]
-            found[f"visual_observation_{number}"] = image.transpose(0, 2, 3, 1) if turned else image
+            found[f"visual_observation_{number}"] = self._laid(spec, feeds[spec.name])
         for role, name in INPUT_NAMES.items():
             for number, spec in enumerate(s for s in signature.inputs if s.role is role):
                 given = name if number == 0 else self._samplers[number - 1]
@@ -101,6 +106,12 @@ class NnPolicy:
             found[masks] = np.ones((rows, self._width(masks)), np.float32)
         kept = {n: a.astype(self._places[n].attrs["dtype"]) for n, a in found.items() if n in self._places}
         return kept | {n: a.astype(np.float32) for n, a in found.items() if n in self._samplers}
+
+    def _laid(self, spec: TensorSpec, array: Array) -> Array:
+        """An input as the file has it: images with their colours last."""
+        if spec.role is Role.VISUAL and self.signature.preprocess.get(spec.name, {}).get("layout") == "NCHW":
+            return array.transpose(0, 2, 3, 1)
+        return array
 
     def _width(self, name: str) -> int:
         return int(self._places[name].attrs["shape"].dims[-1])
@@ -137,7 +148,7 @@ class NnPolicy:
 
     def _answer(self, spec: TensorSpec, value: Array) -> Array:
         rows = len(value)
-        if spec.role is Role.DETERMINISTIC and spec.dtype.startswith("int"):
+        if spec.role is Role.DETERMINISTIC and spec.dtype.startswith("int") and not self._dressed:
             value = _best(value.reshape(rows, -1), self.signature.branches)
         elif spec.role is Role.PROBS:
             value = np.exp(value)

@@ -18,13 +18,16 @@ from converters.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value
 from converters.barracuda.layers import check_bypassed, translate
 from converters.barracuda.vocabulary import LayerType
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape
-from converters.graph.types import FLOAT32, INT32
+from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
 from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, OUTPUT_NAMES, Role
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"
 _INTEGER_INPUTS = ("prev_action",)
+#: The ``version_number`` from which on classes are drawn in the model and memories are inputs and outputs.
+_DRAWS = 3
+_CLASSES = ("discrete_actions", "deterministic_discrete_actions")
 _INTEGER_ROLES = (Role.ACTION, Role.DETERMINISTIC)
 
 
@@ -60,6 +63,7 @@ class _Reader:
         #: what could not be translated, and is read by nothing that is needed so far
         self.failed: dict[str, ExportModelError] = {}
         self.needed = _upstream(model, self.layers)
+        self.draws = (model.number("version_number") or 0) >= _DRAWS
 
     def read(self) -> Reading:
         memories = {m.input for m in self.model.memories}
@@ -115,12 +119,16 @@ class _Reader:
         self.builder.sized(h, w, c)
         shape = (None, h, w, c)
         name = self.nodes[given.name]
-        if self.model.version >= EIGHT_AXES and h == 1 < w and re.fullmatch(r"obs_\d+", given.name):
+        sensor = (self.draws or self.model.version >= EIGHT_AXES) and re.fullmatch(r"obs_\d+", given.name)
+        if sensor and h == 1 < w:
             return self._entities(given, w, c)
         integer = given.name in _INTEGER_INPUTS
-        dims = (None, c) if (h, w) == (1, 1) else shape
+        state = self.draws and given.name == MEMORY_IN
+        dims = (None, 1, w) if state else (None, c) if (h, w) == (1, 1) else shape
         attrs = {"dtype": INT32 if integer else FLOAT32, "shape": TensorShape(dims)}
         self.builder.append(Node(name, "Placeholder", attrs=attrs, origin=given.name))
+        if state:
+            return self.builder.shaped(name, shape)
         if not integer:
             return Value(name, shape)
         return Value(self.builder.add("Cast", [name], name="float", DstT=FLOAT32), shape, integer=name)
@@ -212,6 +220,11 @@ class _Reader:
         args += [b.dataset(d.name, self.model.array(d)) for d in layer.datasets]
         begun = b.start(layer, name)
         result = translate(b, layer, args, self.model.version)
+        if self.draws and layer.name in _CLASSES and result.integer is None:
+            result = replace(result, integer=b.add("Cast", [b.as_matrix(result)], name="classes", DstT=INT64))
+        if self.draws and layer.name == MEMORY_OUT:
+            rows = b.add("Reshape", [result.reference, b.ints([-1, 1, result.size], "rows")])
+            return replace(result, reference=b.finish(rows, begun, name, layer.name))
         if result.integer is not None and OUTPUT_NAMES.get(layer.name) in _INTEGER_ROLES:
             # An action that was drawn: Unity makes floats of the classes, a policy gives integers.
             return replace(result, integer=b.finish(result.integer, begun, name, layer.name))

@@ -20,13 +20,14 @@ chance is not where it is made here: it is the largest score of each branch, or 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from converters.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
-from converters.barracuda.lower_arrays import joined, reshaped, written
-from converters.barracuda.lower_base import FREE, Axes, Dims, Draft, NnBuilder, Piece, Value
+from converters.barracuda.assemble import assembled
+from converters.barracuda.format import NnInput, NnMemory, NnModel
+from converters.barracuda.lower_arrays import as_row, joined, reshaped
+from converters.barracuda.lower_base import FREE, Axes, Dims, NnBuilder, Piece, Value
+from converters.barracuda.lower_dressed import dressed_model
 from converters.barracuda.lower_linear import FORBIDDEN, best_score, noise
 from converters.barracuda.lower_table import lower_graph
 from converters.barracuda.vocabulary import Activation, C, LayerType, N
@@ -40,8 +41,6 @@ from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
-#: Every Barracuda from 1.0 to 3.0 reads it, and none of the later ones is read by all.
-VERSION = 16
 #: What ML-Agents calls the layout of names and constants that is written here.
 API_VERSION = 2
 
@@ -57,8 +56,11 @@ _PARTS = ("c", "h")
 
 
 def policy_model(policy: Policy) -> NnModel:
-    """The policy as a model of version 16. Raises UnsupportedOpError, SignatureError."""
-    return _Lowering(policy).model()
+    """The policy as a model of version 16. Raises UnsupportedOpError, SignatureError.
+
+    One in the names of a consumer (``Policy.constants``) keeps them.
+    """
+    return dressed_model(policy) if policy.constants else _Lowering(policy).model()
 
 
 def base_name(spec: TensorSpec) -> str:
@@ -103,9 +105,9 @@ class _Lowering:
             if spec in self.heads:
                 self._action(spec, [values[r] for r in scores] if reference is None else [values[reference]])
             elif reference is not None:
-                self._output(_EXTRA.get(spec.role, base_name(spec)), self._row(values[reference]))
+                self._output(_EXTRA.get(spec.role, base_name(spec)), as_row(self.b, values[reference]))
         if memory is not None and memory.output is not None:
-            self._memories_out(self._row(values[self.policy.fetches[memory.output]]))
+            self._memories_out(as_row(self.b, values[self.policy.fetches[memory.output]]))
         return self._assembled()
 
     # ------------------------------------------------------------------ inputs
@@ -228,7 +230,7 @@ class _Lowering:
         start = 0
         for part in self.parts:
             piece = self.b.cut(state, start, start + part.size, (BATCH, part.size))
-            self._name(part.given, self.b.stored(piece))
+            self.b.named(part.given, self.b.stored(piece))
             start += part.size
 
     # ------------------------------------------------------------------ outputs
@@ -258,19 +260,10 @@ class _Lowering:
                 return _scores_behind(self.graph, self.policy.fetches[spec.name], self.b)
         return []
 
-    def _row(self, value: Value) -> Value:
-        """A tensor as [B, size]."""
-        if value.array is not None:
-            shape: tuple[Dim, ...] = (BATCH, value.size)
-            return written(self.b, Value(shape, array=value.array.reshape(1, -1)), (N, C))
-        value = self.b.settled(value)
-        flat = reshaped(self.b, value, (BATCH, value.size)) if value.shape != (BATCH, value.size) else value
-        return self.b.settled(flat)
-
     def _action(self, spec: TensorSpec, values: Sequence[Value]) -> None:
         b = self.b
         b.node = Node(base_name(spec), "Identity")
-        rows = [self._row(v) for v in values]
+        rows = [as_row(b, v) for v in values]
         if not self._discrete(spec):
             self._output(base_name(spec), rows[0])
             return
@@ -288,13 +281,8 @@ class _Lowering:
         self._output(base_name(spec), row)
 
     def _output(self, name: str, row: Value) -> None:
-        self._name(name, self.b.stored(row))
+        self.b.named(name, self.b.stored(row))
         self.outputs.append(name)
-
-    def _name(self, name: str, tensor: str) -> None:
-        """A linear activation called ``name``, as the trainers' converter ends an output."""
-        b = self.b
-        b.drafts.append(Draft(name, LayerType.ACTIVATION, (tensor,)))
 
     # ------------------------------------------------------------------ the file
 
@@ -318,34 +306,9 @@ class _Lowering:
         return self.b.dims_of(draft.inputs[0])[C]
 
     def _assembled(self) -> NnModel:
-        for name, number in self._constants().items():
-            self.b.constant(np.full((1, 1, 1, 1), number, np.float32), name)
-        ends = {*self.outputs, *(p.given for p in self.parts)}
-        drafts = _needed(self.b.drafts, ends | set(_CONSTANTS))
-        drafts = _renamed(drafts, ends)
-        drafts.sort(key=lambda d: d.type != LayerType.LOAD)  # constants first; sorting keeps the order otherwise
-        layers, weights, offset = [], [], 0
-        for draft in drafts:
-            datasets = []
-            for name, array in draft.data:
-                datasets.append(Dataset(name, tuple(array.shape), offset, 4, array.size))
-                weights.append(array.reshape(-1))
-                offset += array.size
-            layers.append(
-                Layer(
-                    draft.name, int(draft.type), int(draft.activation), draft.pad, draft.stride, draft.pool, draft.axis,
-                    draft.alpha, draft.beta, draft.inputs, tuple(datasets),
-                )
-            )  # fmt: skip
-        used = {name for layer in layers for name in layer.inputs}
-        return NnModel(
-            VERSION,
-            tuple(i for i in self.inputs if i.name in used),
-            tuple(self.outputs),
-            tuple(NnMemory((1, 1, 1, p.size), p.taken, p.given) for p in self.parts),
-            tuple(layers),
-            np.concatenate(weights) if weights else np.zeros(0, np.float32),
-        )
+        constants = {n: np.array([number], np.float32) for n, number in self._constants().items()}
+        memories = [NnMemory((1, 1, 1, p.size), p.taken, p.given) for p in self.parts]
+        return assembled(self.b, self.inputs, self.outputs, constants, memories)
 
 
 _CONSTANTS = (
@@ -356,44 +319,6 @@ _CONSTANTS = (
     "continuous_action_output_shape",
     "discrete_action_output_shape",
 )
-
-
-def _needed(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
-    """The layers that something in ``roots`` depends on, in their order."""
-    needed = set(roots)
-    kept = []
-    for draft in reversed(drafts):
-        if draft.name in needed:
-            needed.update(draft.inputs)
-            kept.append(draft)
-    return kept[::-1]
-
-
-def _renamed(drafts: Sequence[Draft], ends: set[str]) -> list[Draft]:
-    """Linear activations at the end give their name to the layer before them, where nothing else reads that."""
-    readers: dict[str, int] = {}
-    for draft in drafts:
-        for name in draft.inputs:
-            readers[name] = readers.get(name, 0) + 1
-    made = {d.name: d for d in drafts}
-    names: dict[str, str] = {}
-    for draft in drafts:
-        if draft.name not in ends or draft.type != LayerType.ACTIVATION or draft.activation != Activation.NONE:
-            continue
-        before = made.get(draft.inputs[0])
-        if (
-            before is not None
-            and before.type != LayerType.LOAD
-            and before.name not in ends
-            and before.name not in names
-        ):
-            names[before.name] = draft.name
-    swallowed = set(names.values())
-    return [
-        replace(d, name=names.get(d.name, d.name), inputs=tuple(names.get(i, i) for i in d.inputs))
-        for d in drafts
-        if d.name not in swallowed
-    ]
 
 
 _PASSED = ("Reshape", "Cast", "Identity", "ExpandDims", "Squeeze")

@@ -55,6 +55,16 @@ def reshaped(b: NnBuilder, value: Value, shape: tuple[Dim, ...]) -> Value:
     return b.made(b.layer(LayerType.RESHAPE, [name], wanted.dims, pool=wanted.dims), shape, axes)
 
 
+def as_row(b: NnBuilder, value: Value) -> Value:
+    """A tensor as [B, size]."""
+    if value.array is not None:
+        shape: tuple[Dim, ...] = (BATCH, value.size)
+        return written(b, Value(shape, array=value.array.reshape(1, -1)), (N, C))
+    value = b.settled(value)
+    flat = reshaped(b, value, (BATCH, value.size)) if value.shape != (BATCH, value.size) else value
+    return b.settled(flat)
+
+
 def _usual(b: NnBuilder, shape: tuple[Dim, ...]) -> Axes:
     axes = usual_axes(shape)
     if axes is None:

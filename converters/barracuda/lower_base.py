@@ -139,10 +139,14 @@ def usual_axes(shape: Sequence[Dim]) -> Axes | None:
 
 
 class NnBuilder:
-    """Collects layers. ``names`` are taken by inputs, outputs and memories before the first layer is made."""
+    """Collects layers. ``names`` are taken by inputs, outputs and memories before the first layer is made.
 
-    def __init__(self, types: Types, names: Sequence[str]) -> None:
-        self.types = types
+    ``draws``: classes are drawn by the model, as ML-Agents expects from release 17 (Barracuda 1.4) on; 1.1 draws
+    once for all agents.
+    """
+
+    def __init__(self, types: Types, names: Sequence[str], *, draws: bool = False) -> None:
+        self.types, self.draws = types, draws
         self.drafts: list[Draft] = []
         self.node = Node("", "NoOp")
         self._names = NameScope(names)
@@ -301,6 +305,10 @@ class NnBuilder:
         if key not in self._spread:
             self._spread[key] = self.dense(x, np.ones((1, width)), np.zeros(width), "spread")
         return self._spread[key]
+
+    def named(self, name: str, tensor: str) -> None:
+        """A linear activation called ``name``, as the trainers' converter ends an output."""
+        self.drafts.append(Draft(name, LayerType.ACTIVATION, (tensor,)))
 
     # ------------------------------------------------------------------ values
 

@@ -222,7 +222,36 @@ def best_score(b: NnBuilder, x: str, width: int, label: str) -> str:
     return b.two(LayerType.MAX, b.scaled(below, 1e30, f"{label}/steep"), b.number(FORBIDDEN), label)
 
 
+def arg_max(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """The first class of a row that scores highest.
+
+    Of layers that every Barracuda has (ArgMax is one from 1.4 on): the place of the one that is as large as the
+    largest, and before which there is no other.
+    """
+    value = b.settled(args[0])
+    axis = int(b.known(1, "the axis").reshape(())) % len(value.shape)
+    width, row = value.size, [i for i, d in enumerate(value.shape) if d not in (1, BATCH)]
+    if BATCH not in value.shape or (width > 1 and row != [axis]):
+        raise b.refused(f"the best of {list(value.shape)} along axis {axis}", "it takes one row of scores per agent")
+    x = b.rows(value)
+    if width == 1:
+        return b.result(b.constant_rows(np.zeros(1, np.float32), "only"))
+    top = b.layer(LayerType.REDUCE_MAX, [x], (b.dims_of(x)[N], 1, 1, 1), label="largest")
+    best = b.two(LayerType.EQUAL, x, b.spread(top, width), "is_largest")
+    before = b.dense(best, np.triu(np.ones((width, width)), 1), np.zeros(width), "before")
+    first = b.activation(Activation.RELU, b.two(LayerType.SUB, best, before, "after_none"), label="first")
+    return b.result(b.dense(first, np.arange(width).reshape(-1, 1), np.zeros(1)))
+
+
 # ------------------------------------------------------------------ chance
+
+
+def drawn_class(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A class of each row, drawn by its log-probabilities."""
+    count = int(b.known(1, "the number of draws").reshape(()))
+    x = b.rows(b.settled(args[0]))
+    name = b.layer(LayerType.MULTINOMIAL, [x], (b.dims_of(x)[N], 1, 1, count), pool=(count,))
+    return b.made(name, b.shape_of(b.node.name), (N, None if count == 1 else C))
 
 
 def random(b: NnBuilder, args: Sequence[Value]) -> Value:

@@ -70,13 +70,14 @@ _OPS: MappingProxyType[str, tuple[Lower, slice]] = MappingProxyType(
         **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
         **dict.fromkeys(linear.REDUCTIONS, (linear.reduce, _FIRST)),
         **dict.fromkeys(("Softmax", "LogSoftmax"), (linear.softmax, _ALL)),
+        "ArgMax": (linear.arg_max, _FIRST),
+        "Multinomial": (linear.drawn_class, _FIRST),
         **dict.fromkeys(("RandomStandardNormal", "RandomUniform"), (linear.random, slice(0, 0))),
     }
 )
 
 _WHY = MappingProxyType(
     {
-        "ArgMax": "Barracuda before 1.4 has no ArgMax (ML-Agents chooses the action from the scores itself)",
         "ArgMin": "Barracuda before 1.4 has no ArgMin",
         "Multinomial": "a drawn class is read on inside of the policy, and ML-Agents draws it from the scores itself",
     }
@@ -125,7 +126,7 @@ def _needed(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict[str, 
         if name in given:
             continue
         node = graph[name]
-        if node.op not in _OPS:
+        if node.op not in _OPS or (node.op == "Multinomial" and not b.draws):
             b.node = node
             raise _unknown(b, node)
         stack.extend(normal_ref(r) for r in node.inputs[_OPS[node.op][1]])

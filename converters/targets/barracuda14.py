@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from converters.targets.importable import importable
-from converters.targets.mlagents.version2 import without_memory
 from converters.targets.mlagents.version3 import dress
 from converters.targets.profile import Profile
 
@@ -11,7 +10,6 @@ PROFILE = Profile(
     name="barracuda-1.4",
     purpose="ML-Agents 2.0 to 2.2 (releases 17 to 19) in Unity 2019 to 2021 (Barracuda 1.4 to 2.3)",
     formats=("onnx", "nn"),
-    undressed={"nn": lambda policy: without_memory(policy, "barracuda-1.4")},
     dress=lambda policy: dress(policy, "barracuda-1.4"),
     opset=12,
     importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),

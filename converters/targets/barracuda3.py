@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from converters.targets.importable import importable
-from converters.targets.mlagents.version2 import without_memory
 from converters.targets.mlagents.version3 import dress
 from converters.targets.profile import Profile
 
@@ -12,7 +11,6 @@ PROFILE = Profile(
     aliases=("barracuda",),
     purpose="ML-Agents 2.3 (release 20) in Unity 2020 to 2022 (Barracuda 3.0)",
     formats=("onnx", "nn"),
-    undressed={"nn": lambda policy: without_memory(policy, "barracuda-3")},
     dress=lambda policy: dress(policy, "barracuda-3"),
     opset=12,
     importers=("Barracuda 3.0.0",),

@@ -13,7 +13,7 @@ from signatures.errors import ProfileError
 
 def _other_format(profile: Profile) -> str:
     """What to try first: a format of the same consumer whose layers are others."""
-    return "".join(f"write a .{key} for the same one (--to {key}), or " for key in profile.undressed)
+    return "".join(f"write a .{key} for the same one (--to {key}), or " for key in profile.formats if key != "onnx")
 
 
 def importable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
 from typing import NoReturn
 
 from converters.pieces import Pieces
@@ -20,8 +19,7 @@ class Profile:
     layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
     ``converters/targets/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
     releases of ``converters/targets/unity/consumers.py`` that must accept it. ``opset`` is the ONNX opset.
-    ``undressed`` are formats whose writer gives the consumer's names by itself (``.nn``), each with what raises
-    ProfileError where the consumer does not take the policy in it.
+    ``own_names`` are formats whose writer gives a policy the consumer's names by itself (``.nn`` of API version 2).
     """
 
     name: str
@@ -29,7 +27,7 @@ class Profile:
     purpose: str
     formats: tuple[str, ...]
     dress: Callable[[Policy], Policy]
-    undressed: Mapping[str, Callable[[Policy], None]] = field(default_factory=dict)
+    own_names: frozenset[str] = frozenset()
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()

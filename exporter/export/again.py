@@ -67,7 +67,8 @@ def verify_folder(
     artefacts = {f.key: found.path(f) for f in formats}
     made_for = contract.tool.get("profile")
     # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
-    again = None if read is None or made_for is None else _made_again(read, contract, consumer(made_for))
+    dressed = made_for is not None and consumer(made_for).own_names.isdisjoint(artefacts)
+    again = _made_again(read, contract, consumer(made_for)) if read is not None and made_for and dressed else None
     original = None if read is None or again is not None else _original_of(read, contract)
     # Without the source, it is the consumer alone that is asked.
     asked = again is None and made_for is not None and not {"bytes", "nn"} & artefacts.keys()

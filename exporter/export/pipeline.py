@@ -137,13 +137,11 @@ class Exporter:
         self.options = options
         wanted = None if options.profile is None else consumer(options.profile)
         self._formats = _formats(options, wanted)
-        taken = (
-            {} if wanted is None else {k: w for k, w in wanted.undressed.items() if k in {f.key for f in self._formats}}
-        )
-        self._undressed = taken
-        self._profile = None if taken else wanted
         if not self._formats:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
+        self._profile = wanted
+        #: None where the writers of its formats give a policy the consumer's names
+        self._dress = None if wanted is None or self._formats[0].key in wanted.own_names else wanted.dress
         self.runtimes: tuple[str, ...] = ()
         self._known: list[RuntimeInfo] = []
         if options.verify != "none":
@@ -171,7 +169,7 @@ class Exporter:
 
     def compiled(self, path: Path | str | Source, names: Naming, progress: Progress) -> list[Job]:
         """The policies of a source, under the names that they will have. Raises ExportModelError."""
-        options, wanted = self.options, self._profile
+        options, dress = self.options, self._dress
         progress(f"reading {path.path if isinstance(path, Source) else path}")
         source = path if isinstance(path, Source) else read_source(path, options.read)
         found = list(source.compiled(options.compile))
@@ -183,10 +181,8 @@ class Exporter:
         called = names.claim(source.path, [safe_name(policy.name) for _, policy in found])
         for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
-            for key in self._undressed:
-                self._undressed[key](own)
-            dressed = labelled(own if wanted is None else wanted.dress(own), self._labels)
-            jobs.append(Job(source, model, dressed, wanted, None if wanted is None else own, note))
+            dressed = labelled(own if dress is None else dress(own), self._labels)
+            jobs.append(Job(source, model, dressed, self._profile, None if dress is None else own, note))
         return jobs
 
     def written(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
@@ -295,7 +291,7 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
                 why=f"{wanted.purpose}: it loads {', '.join(wanted.formats)}",
                 fix="leave --to out",
             )
-    if 0 < sum(t in wanted.undressed for t in targets) < len(targets):
+    if 0 < sum(t in wanted.own_names for t in targets) < len(targets):
         raise UsageError(
             f"--to {','.join(targets)} does not go with --for {wanted.name} at once",
             why="a bundle has one set of names, and these formats have different ones",
@@ -391,7 +387,7 @@ def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path)
         paths,
         {a.format.key: a.size for a in artifacts},
         reference,
-        job.model.original if job.profile is None else None,
+        job.model.original if job.own is None else None,
         policy.source,
         keys,
         None if job.profile is None else job.profile.name,
@@ -401,7 +397,8 @@ def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path)
 
 def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
     """A policy written to a folder that is thrown away."""
-    artifacts = [f.artifact(job.policy, WriteOptions("{}")) for f in formats]
+    contract = contract_of(job.policy, job.source, job.model, ReadOptions())
+    artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats]
     for artifact in artifacts:
         artifact.write(folder)
     return _tested(job, folder, artifacts, folder)

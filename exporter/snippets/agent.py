@@ -75,7 +75,8 @@ def _model(bundle: Bundle) -> str:
         from converters.targets.profiles import profile
 
         wanted = profile(bundle.made_for)
-        return f"{bundle.name}.{wanted.formats[0]}, made for {wanted.purpose} (--for {wanted.name})"
+        form = next(f for f in wanted.formats if f"{bundle.name}.{f}" in bundle.files)
+        return f"{bundle.name}.{form}, made for {wanted.purpose} (--for {wanted.name})"
     if f"{bundle.name}.nn" in bundle.files:
         return f"{bundle.name}.nn (ML-Agents 0.7 to release 16)"
     return f"{bundle.name}.onnx of a bundle made with --for unity6 (export-model --for help: for older ones)"

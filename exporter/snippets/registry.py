@@ -104,7 +104,7 @@ def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
     if wanted is None:
         return name
     if bundle.made_for != wanted.name and not any(
-        WRITTEN[f].first_file_of(bundle.name) in bundle.files for f in wanted.undressed
+        WRITTEN[f].first_file_of(bundle.name) in bundle.files for f in wanted.own_names
     ):
         made = "its names are this tool's own" if bundle.made_for is None else f"it was made for {bundle.made_for}"
         raise BundleError(

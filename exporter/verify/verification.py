@@ -59,7 +59,7 @@ def verify(
             reference = answering.name
             findings += _findings(trial, answering, runtimes, progress, participants)
         notes = trial.notes()
-    findings += consumers(tested.profile, tested.files)
+    findings += consumers(tested.profile, tested.files, memory=tested.signature.memory is not None)
     return _report(trial, reference, runtimes, known, in_order(findings, tested), notes)
 
 

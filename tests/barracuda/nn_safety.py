@@ -35,8 +35,9 @@ def assert_safe(model: NnModel) -> None:
         assert shape[0] == -1, name
     names = [layer.name for layer in model.layers]
     assert len(set(names)) == len(names)
+    safe = SAFE | ({LayerType.MULTINOMIAL} if model.number("version_number") == 3 else set())
     for layer in model.layers:
-        assert layer.type in SAFE, layer
+        assert layer.type in safe, layer
         assert layer.activation in SAFE_ACTIVATIONS, layer
         assert layer.activation == Activation.NONE or layer.type == LayerType.ACTIVATION, layer
         assert all(len(d.shape) == 4 for d in layer.datasets)
@@ -80,6 +81,9 @@ def _result(kind: int, layer: object, shapes: list[tuple[int, ...]]) -> tuple[in
         if layer.activation in (Activation.SOFTMAX, Activation.LOG_SOFTMAX):
             assert x[1] == x[2] == 1, layer
         return x
+    if kind == LayerType.MULTINOMIAL:
+        assert x[1] == x[2] == 1, layer
+        return x[0], 1, 1, *layer.pool
     if kind in (LayerType.REDUCE_MAX, LayerType.REDUCE_MIN, LayerType.REDUCE_PROD):
         assert x[3] > 1, f"{layer.name}: 1.1 leaves the model at a reduction over one number"
         assert layer.axis == -1

@@ -13,6 +13,8 @@ import numpy as np
 import onnx
 import onnxruntime
 
+from converters.barracuda.format import NnModel, parse
+from converters.barracuda.vocabulary import LayerType
 from converters.format import WriteOptions
 from converters.formats import written
 from converters.graph.options import CompileOptions
@@ -27,6 +29,8 @@ from converters.targets.unity.settings import Brain, sensors_of
 from exporter.export.sources import read_source
 from signatures.roles import Role
 from signatures.spec import TensorSpec
+from tests.barracuda.nn_safety import assert_safe
+from tests.barracuda.reference import evaluate
 
 Feeds = dict[str, np.ndarray]
 #: (feeds, fetches) → what was fetched, by name
@@ -60,21 +64,25 @@ class Pair:
     profile: Profile
     dressed: Policy
     plain: Plain
-    #: the ModelProto, an empty one where the profile's format is .bytes
+    #: the ModelProto, an empty one where the format is not ONNX
     made: onnx.ModelProto
     data: bytes
+    form: str
 
     @classmethod
-    def of(cls, policy: Policy, profile: Profile, plain: Plain | None = None) -> Pair:
-        """Raises ProfileError where the profile cannot hold the policy."""
+    def of(cls, policy: Policy, profile: Profile, plain: Plain | None = None, form: str | None = None) -> Pair:
+        """In the profile's usual format, or in ``form``.
+
+        Raises ProfileError where the profile cannot hold the policy, UnsupportedOpError where that format cannot.
+        """
         dressed = profile.dress(policy)
-        form = profile.formats[0]
+        form = form or profile.formats[0]
         artifact = written(form).artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
         if profile.check is not None:
             profile.check(profile, artifact.files, policy.name)
         data = artifact.files[artifact.main].joined()
         made = onnx.ModelProto.FromString(data if form == "onnx" else b"")
-        return cls(policy, profile, dressed, plain or Plain(policy), made, data)
+        return cls(policy, profile, dressed, plain or Plain(policy), made, data, form)
 
     def brain(self) -> Brain:
         """Behavior Parameters of an agent that the dressed policy is for."""
@@ -88,7 +96,7 @@ class Pair:
 
     def verdicts(self, folder: Path) -> dict[str, UnityVerdict]:
         """What our checker says for each release of the profile."""
-        path = folder / "policy.onnx"
+        path = folder / f"policy.{self.form}"
         path.write_bytes(self.data)
         return {name: check_file(path, consumer(name), self.brain()) for name in self.profile.checkers}
 
@@ -109,13 +117,15 @@ class Pair:
         if masks is not None and self.policy.signature.has_input("action_masks"):
             own["action_masks"] = masks.astype(self.policy.signature.input("action_masks").dtype)
         theirs = {s.name: self._mapped(s, own, masks) for s in self.dressed.signature.inputs}
-        if self.profile.formats[0] == "bytes":
+        if self.form == "bytes":
             expected = run_graph(self.policy.graph, own, [s.name for s in self.policy.signature.outputs])
             noise = [own[s.name] for s in self.policy.signature.noise]
             return self._frozen_difference(expected, theirs, noise, runner, atol)
         expected = self.plain.run(own)
         draws, scores = self._draws, self._scores
         noise = {s.name: own[s.name] for s in self.policy.signature.noise}
+        if self.form == "nn":
+            return self._nn_difference(expected, theirs, list(noise.values()), atol)
         if len(draws) == 1 and len(noise) == 1:
             theirs[draws[0]] = next(iter(noise.values()))
         actual = self._run_made(theirs)
@@ -138,6 +148,44 @@ class Pair:
         inner = (n for n in dict.fromkeys(self._scores) if n not in known)
         model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in inner)
         return runner_of(model)
+
+    def _nn_difference(self, expected: Feeds, theirs: Feeds, noise: list[np.ndarray], atol: float) -> str | None:
+        model = parse(self.data)
+        assert_safe(model)
+        values = self.nn_values(model, theirs, noise)
+        given = {s.name: values[s.name].astype(s.dtype) for s in self.dressed.signature.outputs}
+        for spec in self.dressed.signature.outputs:
+            want = (1, spec.shape[-1], 1) if spec.role is Role.MEMORY_OUT else (1, 1, spec.shape[-1])
+            if given[spec.name].shape[1:] != want:
+                return f"{spec.name} is {given[spec.name].shape} in the file"
+            given[spec.name] = given[spec.name].reshape([-1, *(d or 1 for d in spec.shape[1:])])
+        given |= {name: values[name].reshape(value.shape) for name, value in self.dressed.constants.items()}
+        scores = [layer.inputs[0] for layer in model.layers if layer.type == LayerType.MULTINOMIAL]
+        given |= {name: values[name].reshape(len(values[name]), -1) for name in scores}
+        draws = sum(layer.type == LayerType.RANDOM_NORMAL for layer in model.layers)
+        return self._compared(expected, given, scores, drawn=draws != len(noise) or draws > 1, atol=atol)
+
+    def nn_values(self, model: NnModel, theirs: Feeds, noise: list[np.ndarray]) -> dict[str, np.ndarray]:
+        """Every tensor of the .nn by the format's layer rules, fed as Unity feeds it; classes are not drawn."""
+        feeds: dict[str, np.ndarray] = {}
+        rows = self.dressed.signature.rows(theirs)
+        for spec in self.dressed.signature.inputs:
+            value = theirs[spec.name]
+            if spec.role is Role.VISUAL:
+                feeds[spec.name] = value.transpose(0, 2, 3, 1)
+            elif spec.role is Role.MEMORY_IN:
+                feeds[spec.name] = value.reshape(rows, 1, -1, 1)
+            elif spec.role is Role.ENTITIES:
+                feeds[spec.name] = value.transpose(0, 2, 1)[:, None]
+            else:
+                feeds[spec.name] = value.reshape(rows, 1, 1, -1)
+        drawn = iter(noise)
+        for layer in model.layers:
+            if layer.type == LayerType.MULTINOMIAL:
+                feeds[layer.name] = np.zeros((rows, 1, 1, 1))
+            elif layer.type == LayerType.RANDOM_NORMAL:
+                feeds[layer.name] = next(drawn).reshape(rows, 1, 1, -1)
+        return evaluate(model, feeds)
 
     def _frozen_difference(
         self, expected: Feeds, theirs: Feeds, noise: list[np.ndarray], runner: Runner | None, atol: float

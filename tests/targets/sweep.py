@@ -72,18 +72,20 @@ def tried(policy: Policy, wanted: Profile, form: str, pool: RuntimePool | None, 
     """(held, refused or wrong; why)."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            if form in wanted.undressed:
-                wanted.undressed[form](policy)
+            if form in wanted.own_names:
                 model = written_nn(policy)
                 if pool is not None:
                     assert_answers(policy, model, BATCHES)
                 return "held", ""
-            pair = Pair.of(policy, wanted)
+            pair = Pair.of(policy, wanted, form=form)
         except ExportModelError as error:
             return "refused", reason(error)
         except AssertionError as error:
             return "wrong", str(error)[:200]
-        other = None if pool is None else _acts_otherwise(pair, pool, Path(folder), atol)
+        try:
+            other = None if pool is None else _acts_otherwise(pair, pool, Path(folder), atol)
+        except AssertionError as error:
+            return "wrong", str(error)[:200]
         if other is not None:
             return "wrong", other
         for release, verdict in pair.verdicts(Path(folder)).items():
@@ -95,7 +97,7 @@ def tried(policy: Policy, wanted: Profile, form: str, pool: RuntimePool | None, 
 
 def _acts_otherwise(pair: Pair, pool: RuntimePool, folder: Path, atol: float) -> str | None:
     model = None
-    if pair.profile.formats[0] == "bytes":
+    if pair.form == "bytes":
         file = folder / "policy.bytes"
         file.write_bytes(pair.data)
         model = pool.process(_runtime(pair.profile.name)).load(str(file))

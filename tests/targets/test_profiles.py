@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import numpy as np
 import onnx
 import pytest
 
+from converters.barracuda.format import parse
+from converters.barracuda.writer import CONTRACT_KEY
+from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES, profile
@@ -47,29 +51,6 @@ CANNOT_IN = {
     ("Balint-H+marathon-envs__Hopper-v0.onnx", "barracuda-1.0"): "Reshape",
     # a flattened image joined with a vector
     ("visual.bytes", "barracuda-1.0"): "Concat",
-    # Barracuda 1.1 has no Shape, which a sum of exponentials that may be infinite, and rows of constants, are made with
-    **dict.fromkeys(
-        (
-            (f"{name}.onnx", "barracuda-1.0")
-            for name in (
-                "clean_ppo_cont_sampled__legacy",
-                "sb3_maskable_bool__dynamo_dyn",
-                "sb3_maskable_bool__legacy_fixed",
-                "sb3_maskable_dist__legacy_fixed",
-                "sb3_maskable_where__dynamo_dyn",
-                "sb3_ppo_discobs__dynamo_dyn",
-                "sb3_ppo_discobs__legacy_fixed",
-                "sb3_ppo_mlp_disc__dynamo_fixed",
-                "sb3_ppo_mlp_multi__legacy_fixed",
-                "sb3_ppo_stoch_box__legacy_fixed",
-                "sb3_ppo_stoch_disc__legacy_fixed",
-                "sb3_trpo_mlp_disc__dynamo_dyn",
-                "sb3_discrete",
-                "sb3_stochastic",
-            )
-        ),
-        "Shape",
-    ),
 }
 
 
@@ -237,10 +218,56 @@ def test_a_memory_goes_to_old_barracuda_as_nn(tmp_path: Path) -> None:
     assert [p.suffix for p in result.folder.iterdir() if p.suffix != ".json"] == [".nn"]
 
 
-@pytest.mark.parametrize("wanted", ["barracuda-1.4", "barracuda-3"])
-def test_a_newer_barracuda_takes_nn_but_for_its_memory(wanted: str, tmp_path: Path) -> None:
-    """Release 17 to 20 read version 2 too, and throw where it has a memory."""
-    with pytest.raises(ProfileError, match="keeps as API version 2 did"):
-        export_model(ROOT / "fixtures" / "recurrent.bytes", tmp_path, for_=wanted, to="nn", verify="none")
-    (result,) = export_model(ROOT / "fixtures" / "discrete.bytes", tmp_path, for_=wanted, to="nn", verify="none")
-    assert list(result.sizes) == ["nn"]
+@pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
+def test_a_fixture_as_nn_of_version_3_acts_the_same_and_is_accepted(path: Path, tmp_path: Path) -> None:
+    """By the layer rules of the format, fed as release 20 feeds it: memories as inputs and outputs, classes drawn."""
+    for policy in compiled(path):
+        if path.name in WITHOUT_MEMORY_OUT:
+            with pytest.raises(ProfileError, match="not given back"):
+                Pair.of(policy, profile("barracuda-3"), form="nn")
+            continue
+        pair = Pair.of(policy, profile("barracuda-3"), form="nn")
+        for seed, rows in enumerate(BATCHES):
+            assert pair.difference(rows, seed) is None, (policy.name, rows)
+        (verdict,) = pair.verdicts(tmp_path).values()
+        assert all(verdict.accepted.values()), verdict.to_dict()
+
+
+@pytest.mark.parametrize(("wanted", "version"), [("barracuda-1.0", 2), ("barracuda-1.4", 3), ("barracuda-3", 3)])
+def test_a_nn_is_of_the_version_that_its_consumer_runs_and_says_whom_it_is_for(
+    wanted: str, version: int, tmp_path: Path
+) -> None:
+    source = ROOT / "fixtures" / "recurrent.bytes"
+    (result,) = export_model(source, tmp_path, for_=wanted, to="nn", verify="numpy")
+    assert result.contract["tool"]["profile"] == wanted
+    file = result.folder / "recurrent.nn"
+    model = parse(file.read_bytes())
+    assert model.number("version_number") == version
+    assert json.loads(model.metadata(CONTRACT_KEY) or "")["tool"]["profile"] == wanted
+    assert bool(model.memories) == (version == 2)
+    if version == 3:
+        assert {i.name: i.shape for i in model.inputs}["recurrent_in"] == (-1, 1, 32, 1)
+        assert {"discrete_actions", "deterministic_discrete_actions", "recurrent_out"} <= {*model.outputs}
+    for options in ((), ("--source", source)):
+        again = commands.export_model("verify", result.folder, *options)
+        assert again.status == 0, again.out + again.err
+    said = commands.export_model("snippets", result.folder, "--for", wanted)
+    assert f"recurrent.nn, made for ML-Agents {'1.0' if version == 2 else '2.'}" in said.out
+
+
+def test_a_nn_of_version_3_is_a_source_like_any_other(tmp_path: Path) -> None:
+    """Its classes are whole numbers, its memory [agents, 1, size]; what comes of it acts as the first did."""
+    first = ROOT / "fixtures" / "torch_checkpoint" / "ppo_1_1_hybrid_lstm.onnx"
+    (made,) = export_model(first, tmp_path, for_="barracuda-3", to="nn", verify="none")
+    (own,), (again,) = compiled(first), compiled(next(made.folder.glob("*.nn")))
+    assert (again.signature.branches, again.signature.action_space) == (own.signature.branches, "hybrid")
+    rng = np.random.default_rng(0)
+    feeds = {s.name: rng.random([3 if d is None else d for d in s.shape]).astype(s.dtype) for s in own.signature.inputs}
+    feeds["action_masks"] = np.ones_like(feeds["action_masks"])
+    wanted = ["deterministic_continuous_actions", "deterministic_discrete_actions", "recurrent_out"]
+    expected = run_graph(own.graph, feeds, wanted)
+    taken = {s.name for s in again.signature.inputs}
+    found = run_graph(again.graph, {n: a for n, a in feeds.items() if n in taken}, wanted)
+    for name in wanted:
+        assert found[name].dtype == expected[name].dtype
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-5, err_msg=name)

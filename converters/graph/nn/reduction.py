@@ -41,10 +41,9 @@ def log_sum(b: Builder, x: str, axes: Sequence[int], keep: bool) -> str:
 
 
 def log_sum_exp(b: Builder, x: str, axes: Sequence[int], keep: bool) -> str:
-    """Ln Σeˣ, the largest element taken out first (zero where all are −∞, as onnxruntime does)."""
-    top = b.reduce("Max", x, axes, keep=True)
-    finite = b.add("Less", [b.add("Abs", [top]), b.number(top, np.inf)])
-    top = b.add("Select", [finite, top, b.add("ZerosLike", [top])])
+    """Ln Σeˣ, the largest element taken out first: a finite number, since ∞ − ∞ is none."""
+    top, largest = b.reduce("Max", x, axes, keep=True), np.finfo(b.dtype(x)).max
+    top = b.add("Maximum", [b.add("Minimum", [top, b.number(top, largest)]), b.number(top, -largest)])
     total = b.reduce("Sum", b.add("Exp", [b.add("Sub", [x, top])]), axes, keep=True)
     value = b.add("Add", [b.add("Log", [total]), top])
     return value if keep else b.squeeze(value, axes)

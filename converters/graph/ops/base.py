@@ -34,6 +34,8 @@ class OnnxBuilder(Protocol):
     opset: int
     #: False: the importer that is written for swaps the operands of Sub and Div where the first is a constant
     constant_first: bool
+    #: whether there are Where, Shape and Expand
+    chooses: bool
 
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""

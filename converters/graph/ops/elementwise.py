@@ -28,7 +28,7 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.ops.older import clip, leaky_relu, select_v2
-from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
+from converters.graph.types import BOOL, FLOAT32, INT32, INT64, Symbols, TensorType
 
 T = type_attr()
 
@@ -220,7 +220,24 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
     shape, wide = builder.type_of(node.inputs[0]).shape, builder.type_of(node.inputs[1]).rank
     if shape is not None and len(shape) == 1 and wide is not None and wide > 1:
         condition = unsqueezed(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
-    return builder.emit("Where", [condition, a, b])
+    choices = [builder.type_of(r) for r in node.inputs[1:]]
+    infinite = any(k.constant is not None and not np.isfinite(k.constant).all() for k in choices)
+    if builder.chooses or infinite or choices[0].dtype != FLOAT32:
+        return builder.emit("Where", [condition, a, b])
+    holds = builder.emit("Cast", [condition], to=FLOAT32)
+    negative = builder.emit("Mul", [holds, builder.const(np.array(-1, np.float32), "minus")])
+    other = builder.emit("Add", [negative, builder.const(np.array(1, np.float32), "one")])
+    first, second = (_bounded(builder, v, k) for v, k in zip((a, b), choices, strict=True))
+    return builder.emit("Add", [builder.emit("Mul", [first, holds]), builder.emit("Mul", [second, other])])
+
+
+def _bounded(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
+    """A float that is finite, so that its product with 0 is 0."""
+    if kind.constant is not None:
+        return value
+    largest = np.finfo(np.float32).max
+    low, high = (builder.const(np.array(s * largest, np.float32), w) for s, w in ((-1, "lowest"), (1, "highest")))
+    return str(builder.emit("Clip", [value, low, high]))
 
 
 def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
@@ -242,9 +259,12 @@ def _lower_add_n(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
-    dtype = builder.type_of(node.inputs[0]).dtype
+    kind = builder.type_of(node.inputs[0])
+    zero = builder.const(np.zeros((), kind.dtype), "zero")
+    if not builder.chooses and kind.dtype == FLOAT32:
+        return builder.emit("Mul", [_bounded(builder, builder.value(node.inputs[0]), kind), zero])
     shape = builder.emit("Shape", [builder.value(node.inputs[0])])
-    return builder.emit("Expand", [builder.const(np.zeros((), dtype), "zero"), shape])
+    return builder.emit("Expand", [zero, shape])
 
 
 def _lower_ones_like(node: Node, builder: OnnxBuilder) -> Any:

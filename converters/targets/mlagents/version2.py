@@ -14,7 +14,6 @@ from converters.policy import Policy
 from converters.targets.mlagents import feeding
 from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities
 from converters.targets.mlagents.dressing import Dressing
-from converters.targets.profile import refused
 from signatures.roles import Role
 
 _VERSION = 2
@@ -39,18 +38,6 @@ def dress(policy: Policy, profile: str) -> Policy:
     dressing.constants["memory_size"] = np.array([0], np.float32)
     _give_actions(dressing, heads(dressing), masks)
     return dressing.finished(None, images)
-
-
-def without_memory(policy: Policy, profile: str) -> None:
-    """Raise ProfileError where a ``.nn``, which is of version 2, has a memory and the consumer is of version 3."""
-    if policy.signature.memory is not None:
-        refused(
-            policy,
-            profile,
-            "it has a memory, which a .nn keeps as API version 2 did",
-            why="release 17 and later throw at a model of version 2 with a memory",
-            fix="leave --to out: the ONNX has the memory of version 3",
-        )
 
 
 def _take_observations(dressing: Dressing) -> dict[str, object]:
