@@ -222,8 +222,8 @@ def best_score(b: NnBuilder, x: str, width: int, label: str) -> str:
     return b.two(LayerType.MAX, b.scaled(below, 1e30, f"{label}/steep"), b.number(FORBIDDEN), label)
 
 
-def arg_max(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """The first class of a row that scores highest.
+def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """ArgMax and ArgMin: the first class of a row that scores highest, or lowest.
 
     Of layers that every Barracuda has (ArgMax is one from 1.4 on): the place of the one that is as large as the
     largest, and before which there is no other.
@@ -236,8 +236,9 @@ def arg_max(b: NnBuilder, args: Sequence[Value]) -> Value:
     x = b.rows(value)
     if width == 1:
         return b.result(b.constant_rows(np.zeros(1, np.float32), "only"))
-    top = b.layer(LayerType.REDUCE_MAX, [x], (b.dims_of(x)[N], 1, 1, 1), label="largest")
-    best = b.two(LayerType.EQUAL, x, b.spread(top, width), "is_largest")
+    kind = LayerType.REDUCE_MAX if b.node.op == "ArgMax" else LayerType.REDUCE_MIN
+    top = b.layer(kind, [x], (b.dims_of(x)[N], 1, 1, 1), label="top")
+    best = b.two(LayerType.EQUAL, x, b.spread(top, width), "is_best")
     before = b.dense(best, np.triu(np.ones((width, width)), 1), np.zeros(width), "before")
     first = b.activation(Activation.RELU, b.two(LayerType.SUB, best, before, "after_none"), label="first")
     return b.result(b.dense(first, np.arange(width).reshape(-1, 1), np.zeros(1)))

@@ -70,7 +70,7 @@ _OPS: MappingProxyType[str, tuple[Lower, slice]] = MappingProxyType(
         **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
         **dict.fromkeys(linear.REDUCTIONS, (linear.reduce, _FIRST)),
         **dict.fromkeys(("Softmax", "LogSoftmax"), (linear.softmax, _ALL)),
-        "ArgMax": (linear.arg_max, _FIRST),
+        **dict.fromkeys(("ArgMax", "ArgMin"), (linear.arg_best, _FIRST)),
         "Multinomial": (linear.drawn_class, _FIRST),
         **dict.fromkeys(("RandomStandardNormal", "RandomUniform"), (linear.random, slice(0, 0))),
     }
@@ -78,7 +78,6 @@ _OPS: MappingProxyType[str, tuple[Lower, slice]] = MappingProxyType(
 
 _WHY = MappingProxyType(
     {
-        "ArgMin": "Barracuda before 1.4 has no ArgMin",
         "Multinomial": "a drawn class is read on inside of the policy, and ML-Agents draws it from the scores itself",
     }
 )

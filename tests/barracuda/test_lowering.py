@@ -67,7 +67,7 @@ def as_policy(sample: Sample) -> Policy | None:
 #: Op → the titles of its samples that version 16 cannot hold, or that not every Barracuda computes.
 REFUSALS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("Sin", "Cos", "Tan"), ("matrix", "rank 4")),
-    **dict.fromkeys(("ArgMax", "ArgMin"), ("last axis", "negative axis, int32", "ties", "int32 scores")),
+    **dict.fromkeys(("ArgMax", "ArgMin"), ("negative axis, int32",)),
     **dict.fromkeys(("Prod", "Min"), ("vector of an axis", "scalar axis, kept")),
     **dict.fromkeys(("Softmax", "LogSoftmax"), ("rank 3",)),
     "BatchMatMul": ("rank 3", "adj_x", "adj_y, rank 4"),

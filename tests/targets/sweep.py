@@ -68,8 +68,15 @@ def reason(error: ExportModelError) -> str:
     return re.sub(r"the policy takes a memory and gives none, .*", "its memory is taken but not given back", text)
 
 
-def tried(policy: Policy, wanted: Profile, form: str, pool: RuntimePool | None, atol: float = 1e-5) -> tuple[str, str]:
-    """(held, refused or wrong; why)."""
+def tried(
+    policy: Policy,
+    wanted: Profile,
+    form: str,
+    pool: RuntimePool | None,
+    acted: dict[bytes, str | None],
+    atol: float = 1e-5,
+) -> tuple[str, str]:
+    """(held, refused or wrong; why). ``acted`` has what the policy's files for other profiles do otherwise."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             if form in wanted.own_names:
@@ -83,7 +90,9 @@ def tried(policy: Policy, wanted: Profile, form: str, pool: RuntimePool | None, 
         except AssertionError as error:
             return "wrong", str(error)[:200]
         try:
-            other = None if pool is None else _acts_otherwise(pair, pool, Path(folder), atol)
+            if pool is not None and pair.data not in acted:
+                acted[pair.data] = _acts_otherwise(pair, pool, Path(folder), atol)
+            other = acted.get(pair.data)
         except AssertionError as error:
             return "wrong", str(error)[:200]
         if other is not None:
@@ -126,9 +135,10 @@ def swept(files: Sequence[Path], pool: RuntimePool | None = None, names: Collect
         atol, _ = ATOL.get(path.name, (1e-5, ""))
         for policy in found:
             policies += 1
+            acted: dict[bytes, str | None] = {}
             for profile in wanted:
                 for form in profile.formats:
-                    outcome, why = tried(policy, profile, form, pool, atol)
+                    outcome, why = tried(policy, profile, form, pool, acted, atol)
                     cell = cells[profile.name, form]
                     cell.held += outcome == "held"
                     if outcome == "refused":
