@@ -76,8 +76,8 @@ def pool(processes: RuntimePool) -> RuntimePool:
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
     """All real runtimes; every command that this test runs shares their processes."""
-    for module in ("pipeline", "again"):
-        monkeypatch.setattr(f"exporter.export.{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
+    for module in ("exporter.export.again", "converters.runtimes.pool"):
+        monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool
 
 

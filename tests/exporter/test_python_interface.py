@@ -144,7 +144,7 @@ def _wrong(kind: str, runtime: str, answer: Tensors) -> Tensors:
 @pytest.fixture
 def disagreeing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Played runtimes, one of which is wrong."""
-    for module in ("converters.runtimes.pool", "exporter.export.again"):
+    for module in ("exporter.export.again", "converters.runtimes.pool"):
         monkeypatch.setattr(f"{module}.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: ActingPool(_wrong))
 

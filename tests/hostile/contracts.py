@@ -166,7 +166,7 @@ class Trial:
             file = write(folder, changed(content, how), graph, beyond)
             before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
             with pytest.MonkeyPatch.context() as patch:
-                for module in ("exporter.export.pipeline", "exporter.compare.comparison"):
+                for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
                     patch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(self.pool))
                 patch.setattr(site, "_vendor", lambda: ({}, [], []))
                 for command in _commands(folder, file, self.home, out):

@@ -73,8 +73,8 @@ def clean(text: str) -> None:
 def test_no_command_says_or_writes_what_acts(
     what: str, given: Path, tmp_path: Path, processes: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("export.pipeline", "export.again", "compare.comparison"):
-        monkeypatch.setattr(f"exporter.{module}.RuntimePool", lambda: contextlib.nullcontext(processes))
+    for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
+        monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(processes))
     places = {"FILE": "policy.bytes", "ONNX": "policy.onnx", "FOREIGN": "foreign.bytes"}
     arguments = [str(given / places[a]) if a in places else a.replace("OUT", str(tmp_path)) for a in COMMANDS[what]]
     ran: Ran = export_model(*arguments)

@@ -32,7 +32,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
-    for module in ("exporter.export.pipeline", "exporter.compare.comparison"):
+    for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool
 
