@@ -68,6 +68,7 @@ def compare_command(
         )
     console.verified(report, ", ".join(map(str, candidates)))
     console.json({"reports": [report.to_dict()]})
-    console.write_reports(lambda: [Entry(report, steps=options.steps)])
+    command = ("compare", str(reference), *map(str, candidates), *(word for m in mapped for word in ("--map", m)))
+    console.write_reports(lambda: [Entry(report, steps=options.steps, command=command)])
     if report.passed is False:
         sys.exit(1)

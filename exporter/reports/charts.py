@@ -21,18 +21,20 @@ _COLOURS = 6
 
 
 def histograms(output: str, comparisons: Sequence[Finding]) -> Markup:
-    """One strip per comparison of ``output``: how many elements differ by how much, the bound marked."""
+    """One strip per comparison of ``output``: how many elements differ by how much, the bound in the middle."""
     names = [f"{c.format} · {c.runtime}" for c in comparisons]
     left = 2.0
     right = left + BINS * _BAR + _ZERO_GAP
+    first, last = _decades(comparisons)
+    wide = (right - left - _BAR - _ZERO_GAP) / (last - first)
     bottom = 8 + _STRIP * len(comparisons)
 
     def edge(exponent: float) -> float:
         """Where the decade from 10^exponent begins; equal elements stand apart, to its left."""
-        return left + (1 + exponent - FIRST) * _BAR + _ZERO_GAP
+        return left + _BAR + _ZERO_GAP + (exponent - first) * wide
 
     parts: list[Markup] = []
-    for decade in range(FIRST, LAST + 1, 3):
+    for decade in range(math.ceil(first), math.floor(last) + 1, 1 + int(last - first) // 8):
         x = edge(decade)
         parts.append(el("line", class_="grid", x1=x, x2=x, y1=6.0, y2=bottom))
         parts.append(el("text", _power(decade), class_="tick", x=x, y=bottom + 14, text_anchor="middle"))
@@ -52,15 +54,27 @@ def histograms(output: str, comparisons: Sequence[Finding]) -> Markup:
                     class_="bar" if c.passed else "bar bad",
                     x=(edge(FIRST + place - 1) if place else left) + 1,
                     y=base - height,
-                    width=_BAR - 2,
+                    width=(wide if place else _BAR) - 2,
                     height=height,
                 )
                 parts.append(bar)
         if c.tolerance.atol > 0:
-            x = edge(min(max(math.log10(c.tolerance.atol), FIRST), LAST + 1))
+            x = edge(min(max(math.log10(c.tolerance.atol), first), last))
             parts.append(el("line", class_="bound", x1=x, x2=x, y1=base - 20, y2=base))
     described = f"{output}: histogram of absolute differences for {len(comparisons)} comparisons, in decades"
     return _svg(parts, right + 12, bottom + 22, described)
+
+
+def _decades(comparisons: Sequence[Finding]) -> tuple[float, float]:
+    """The axis from which to which power of ten: all that differs is on it, and the bound is its middle."""
+    bounds = [math.log10(c.tolerance.atol) for c in comparisons if c.tolerance.atol > 0]
+    filled = [FIRST + place - 1 for c in comparisons for place, count in enumerate(c.histogram) if place and count]
+    low, high = min(filled, default=FIRST), max(filled, default=LAST) + 1
+    if not bounds:
+        return low, max(high, low + 2)
+    middle = min(max(bounds[0], FIRST), LAST + 1)
+    half = max(middle - low, high - middle, 3.0)
+    return middle - half, middle + half
 
 
 def drift(output: str, comparisons: Sequence[Finding], pairs: Sequence[tuple[str, str]]) -> Markup:

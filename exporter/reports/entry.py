@@ -28,6 +28,8 @@ class Entry:
     contract: Contract | None = None
     #: Steps of a rollout, to draw its inputs again.
     steps: int = 4
+    #: The words of the command that makes the same comparison; empty: ``verify`` of the bundle.
+    command: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

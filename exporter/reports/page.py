@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.markup import Markup, el
+from exporter.reports.matrix import Row, matrix
 from exporter.reports.summary import verdict
+from exporter.verify.findings import Finding
 from exporter.version import __version__
 
 _CHIPS = {
@@ -16,6 +19,14 @@ _CHIPS = {
     "self-consistent": ("passed", "Self-consistent"),
     "failed": ("failed", "Failed"),
     "not verified": ("unverified", "Not verified"),
+}
+#: How much of the absolute tolerance a difference takes, as a colour of the overview.
+_HEAT = {
+    "equal": "equal",
+    "low": "a tenth of what is allowed, or less",
+    "near": "within what is allowed",
+    "rounding": "within the relative tolerance, or what rounding explains",
+    "over": "disagrees",
 }
 #: In the order of the page; each gives nothing where it has nothing to say.
 _SECTIONS: tuple[Callable[[Entry], Markup | None], ...] = (
@@ -51,17 +62,53 @@ def page(entries: Sequence[Entry]) -> str:
         "body",
         el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered)),
         el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)]),
+        sections.words(),
         el("footer", f"Written by export-model {__version__}. parity.json in the bundle holds the same as data."),
     )
     return f"<!DOCTYPE html>\n{el('html', head, body, lang='en')}\n"
 
 
-def _overview(entries: Iterable[Entry]) -> Markup:
-    rows = [
-        (el("a", e.name, href=f"#policy-{n}"), _chip(e), f"{len(e.report.failures)} of {len(e.report.comparisons)}")
-        for n, e in enumerate(entries, 1)
+def _overview(entries: Sequence[Entry]) -> Markup:
+    """Policies by format and runtime: how much of what is allowed the worst difference takes, as a colour."""
+    found = [{(row.format, row.runtime): row for row in matrix(e.report).rows} for e in entries]
+    pairs = list(dict.fromkeys(pair for rows in found for pair in rows))
+    table = [
+        (
+            el("a", e.name, href=f"#policy-{n}"),
+            _chip(e),
+            f"{len(e.report.failures)} of {len(e.report.comparisons)}",
+            *(_heat(rows.get(pair)) for pair in pairs),
+        )
+        for n, (e, rows) in enumerate(zip(entries, found, strict=True), 1)
     ]
-    return sections.table("Policies in this report", ("policy", "verdict", "disagreements"), rows)
+    head = ("policy", "verdict", "disagreements", *(f"{kind} · {runtime}" for kind, runtime in pairs))
+    return el(
+        "div",
+        sections.table("Policies in this report: the worst |Δ| of each format in each runtime", head, table),
+        el("p", [el("span", words, class_=f"heat {kind}") for kind, words in _HEAT.items()], class_="legend"),
+        class_="overview",
+    )
+
+
+def _heat(row: Row | None) -> Markup:
+    """The worst of a format in a runtime; the colour says how much of the tolerance it takes."""
+    if row is None:
+        return el("td", "–", class_="number soft")
+    if not row.passed:
+        return el("td", el("span", "✗"), class_="heat over")
+    worst = max((cell.worst for cell in row.cells.values() if cell.worst.measured), key=_share, default=None)
+    if worst is None:
+        return el("td", "✓", class_="heat equal")
+    share = _share(worst)
+    kind = "equal" if share == 0 else "low" if share <= 0.1 else "near" if share <= 1 else "rounding"
+    return el("td", worst.cell(), class_=f"heat {kind}")
+
+
+def _share(found: Finding) -> float:
+    """Of the absolute tolerance, how much a difference takes."""
+    if found.max_abs_diff == 0:
+        return 0.0
+    return found.max_abs_diff / found.tolerance.atol if found.tolerance.atol else math.inf
 
 
 def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
@@ -71,6 +118,7 @@ def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
         el("div", el("h2", entry.name, id=f"title-{number}"), _chip(entry), class_="title"),
         el("p", f"{says[:1].upper()}{says[1:]}.", class_="lead"),
         sections.facts(entry),
+        sections.again(entry),
         [section(entry) for section in _SECTIONS],
         class_="policy only" if alone else "policy",
         id=f"policy-{number}",

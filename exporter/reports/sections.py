@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -72,6 +73,37 @@ def facts(entry: Entry) -> Markup:
     return el("dl", [el("div", el("dt", k), el("dd", v)) for k, v in found], class_="facts")
 
 
+def again(entry: Entry) -> Markup | None:
+    """The command that makes the same comparison once more."""
+    report = entry.report
+    if entry.contract is None and not entry.command:
+        return None
+    command = entry.command or ("verify", f"./{entry.name}")
+    ran = [name for name, state in report.runtimes.items() if state["status"] == "ran" and name != "numpy"]
+    chosen = ["--runtimes", ",".join(ran)] if ran else ["--allow-unverified"]
+    numbers = ["--seed", str(report.seed), "--samples", str(report.samples), "--steps", str(entry.steps)]
+    line = shlex.join(["export-model", *command, *chosen, *numbers])
+    return el("p", "The same again: ", el("code", line), class_="soft again")
+
+
+_WORDS = (
+    ("reference", "what all are compared with: the source in its own runtime where one reads it, else numpy's kernels"),
+    ("|Δ|", "the absolute difference between a number and the reference's"),
+    ("tolerance", "|Δ| may be up to atol + rtol·|reference|; one that is not the default stands here with its reason"),
+    ("rounding", "how far float32's own rounding moves a result at an input, measured: no runtime is closer by right"),
+    ("rollout", "the memory is fed back, step after step, in each runtime by itself"),
+    ("draws", "actions drawn by chance are compared as distributions, with a stated rate of false alarms"),
+    ("self-consistent", "no other runtime reads the source, so the formats were compared with this tool's own reading"),
+    ("not verified", "no runtime but this tool's own kernels was there to ask"),
+)
+
+
+def words() -> Markup:
+    """What the words of a report mean."""
+    listed = [el("div", el("dt", word), el("dd", meaning)) for word, meaning in _WORDS]
+    return el("details", el("summary", "What the words mean"), el("dl", listed, class_="words"))
+
+
 def failures(entry: Entry) -> Markup | None:
     """Every comparison that failed, by format and runtime: by how much, the first tensor that differs, what passes."""
     failed = entry.report.failures
@@ -134,7 +166,7 @@ def spread(entry: Entry) -> Markup | None:
         figures.append(_figure(output, picture, _equal_text(equal, len(group))))
     text = (
         "How many elements differ by how much, over all inputs; each bar is a decade of |Δ|, its height the square "
-        "root of the count. The dashed line is the absolute tolerance."
+        "root of the count. The dashed line is the absolute tolerance; the bar on the left is what is equal."
     )
     return section("How the differences are spread", el("p", text, class_="soft"), el("div", figures, class_="figures"))
 

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from exporter.reports import charts
 from exporter.reports.entry import Entry, of_bundle, of_result
 from exporter.reports.page import page
 from exporter.reports.sections import shortened
@@ -126,6 +127,34 @@ def test_it_can_be_read_without_eyes(recurrent: tuple[Entry, Path]) -> None:
 def test_failed_policies_come_first() -> None:
     text = Page(page([entry(PASSING), entry(UNVERIFIED), entry(replace(FAILING, policy="broken"))])).text
     assert text.index("broken") < text.index("Not verified") < text.index("Passed")
+
+
+def test_many_policies_begin_with_a_coloured_table_of_formats_and_runtimes() -> None:
+    far = tuple(replace(c, max_abs_diff=2e-5) if c.output == "value_estimate" else c for c in PASSING.comparisons)
+    policies = [PASSING, replace(PASSING, policy="far", comparisons=far), replace(FAILING, policy="broken")]
+    source = page([entry(report) for report in policies])
+    colours = [a["class"] for t, a in Page(source).elements if t == "td" and "heat" in str(a.get("class"))]
+    assert set(colours) == {"heat low", "heat over"}
+    source = page([entry(PASSING), entry(replace(PASSING, comparisons=(replace(far[0], max_abs_diff=2e-5),)))])
+    assert 'class="heat rounding"' in source
+    assert "reference · numpy" in Page(source).text
+
+
+def test_the_tolerance_is_the_middle_of_its_axis() -> None:
+    source = charts.histograms("action", [c for c in PASSING.comparisons if any(c.histogram)][:1])
+    (bound,) = re.findall(r'class="bound" x1="([\d.]+)"', source)
+    bars = [float(x) for x in re.findall(r'class="bar"[^>]* x="([\d.]+)"', source)]
+    (line,) = re.findall(r'class="axis" x1="[\d.]+" x2="([\d.]+)"', source)
+    begin = 2 + 17 + 18
+    assert float(bound) == pytest.approx((begin + float(line)) / 2)
+    assert all(x <= float(line) for x in bars)
+
+
+def test_a_report_says_the_command_that_makes_it(recurrent: tuple[Entry, Path]) -> None:
+    made, _ = recurrent
+    assert "The same again: export-model verify ./recurrent --runtimes " in Page(page([made])).text
+    other = replace(entry(PASSING), command=("compare", "a b.onnx", "c.onnx"))
+    assert "export-model compare 'a b.onnx' c.onnx --runtimes onnxruntime --seed 3" in Page(page([other])).text
 
 
 def test_no_light_or_dark_text_is_too_faint() -> None:
