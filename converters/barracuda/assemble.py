@@ -42,10 +42,9 @@ def assembled(
                 draft.alpha, draft.beta, draft.inputs, tuple(datasets),
             )
         )  # fmt: skip
-    used = {name for layer in layers for name in layer.inputs}
     return NnModel(
         VERSION,
-        tuple(i for i in inputs if i.name in used),
+        tuple(inputs),  # those too that no layer reads (of a policy with a single action): Unity looks for them
         tuple(outputs),
         tuple(memories),
         tuple(layers),

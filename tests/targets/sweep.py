@@ -17,11 +17,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from converters.barracuda.encode import encode
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.source import ReadOptions
 from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES
+from converters.targets.unity.checker import check_file
+from converters.targets.unity.consumers import consumer
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 from tests.barracuda.test_writer import assert_answers
@@ -64,6 +67,7 @@ def reason(error: ExportModelError) -> str:
     text = re.sub(r"has \d+ branches", "has several branches", text)
     text = re.sub(r"its observation \w+ is", "one of its observations is", text)
     text = re.sub(r"its memory \(.*\)", "its memory", text)
+    text = re.sub(r"Reshape cannot be written to a .nn: .*\['\?.*", "it has rows for each of several entities", text)
     text = re.sub(r"Placeholder cannot be written to a .nn: .*", "one of its observations is a list of entities", text)
     return re.sub(r"the policy takes a memory and gives none, .*", "its memory is taken but not given back", text)
 
@@ -80,10 +84,7 @@ def tried(
     with tempfile.TemporaryDirectory() as folder:
         try:
             if form in wanted.own_names:
-                model = written_nn(policy)
-                if pool is not None:
-                    assert_answers(policy, model, BATCHES)
-                return "held", ""
+                return _tried_own(policy, wanted, pool, Path(folder))
             pair = Pair.of(policy, wanted, form=form)
         except ExportModelError as error:
             return "refused", reason(error)
@@ -102,6 +103,17 @@ def tried(
             if not all(verdict.accepted[mode] for mode in modes):
                 return "wrong", f"{release} does not accept it"
     return "held", ""
+
+
+def _tried_own(policy: Policy, wanted: Profile, pool: RuntimePool | None, folder: Path) -> tuple[str, str]:
+    """A .nn of API version 2. Release 20 reads it too, but for one with a memory."""
+    model = written_nn(policy)
+    if pool is not None:
+        assert_answers(policy, model, BATCHES)
+    path = folder / "policy.nn"
+    path.write_bytes(encode(model))
+    accepted = [check_file(path, consumer(r)).accepted["stochastic"] for r in wanted.checkers if not model.memories]
+    return ("held", "") if all(accepted) else ("wrong", "R20 does not accept it")
 
 
 def _acts_otherwise(pair: Pair, pool: RuntimePool, folder: Path, atol: float) -> str | None:

@@ -17,6 +17,7 @@ from converters.policy import Policy
 from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES, profile
 from exporter import export_model
+from exporter.verify.checks.consumer import consumers
 from signatures.errors import ProfileError, UsageError
 from signatures.roles import Role
 from tests import commands, known
@@ -153,6 +154,20 @@ def test_a_branch_of_one_action_is_held_beside_others(wanted: Profile, tmp_path:
     pair = Pair.of(policy, wanted)
     assert pair.dressed.signature.branches == (4, 1)
     assert pair.difference(3, 0) is None
+
+
+@pytest.mark.parametrize(("wanted", "form"), [(p, f) for p in PROFILES for f in p.formats], ids=str)
+def test_a_policy_of_a_single_action_keeps_its_inputs(wanted: Profile, form: str, tmp_path: Path) -> None:
+    """Its action hangs on nothing; Unity looks for the observation and the masks all the same."""
+    path = tmp_path / "single.bytes"
+    head = dense("logits", "vector_observation", 3, 1)
+    drawn = node("action", "Multinomial", "logits", "one", output_dtype=np.int64, seed=1, seed2=2)
+    path.write_bytes(graph_bytes([placeholder("vector_observation"), constant("one", 1), *head, drawn]))
+    (made,) = export_model(path, tmp_path / "out", for_=wanted.name, to=form, verify="none")
+    if form != "bytes":
+        files = {form: next(made.folder.glob(f"*.{form}"))}
+        findings = list(consumers(wanted.name, files))
+        assert findings and all(f.passed for f in findings), [f.reason for f in findings]
 
 
 def test_what_unity_reads_is_float32_and_constants_are_outputs(tmp_path: Path) -> None:
