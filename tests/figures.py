@@ -3,7 +3,8 @@
 It writes docs/figures.json and docs/figures.md. Every frozen graph of ../shared/genuine and ../shared/corpus is
 exported to four formats and verified in all runtimes that are installed; in browsers too with ``--browsers``. The page
 says nothing that depends on the machine's place or speed.
-``python -m tests.figures --profiles`` counts what each profile of ``--for`` holds and refuses (tests/targets/sweep.py),
+``python -m tests.figures --profiles`` counts what each profile of ``--for`` holds and refuses, and runs what is held
+(tests/targets/sweep.py, 35 minutes of a processor),
 ``python -m tests.figures --page`` writes the page anew from the figures that are there.
 """
 
@@ -251,9 +252,10 @@ def _profiles(counted: Mapping[str, Any]) -> list[str]:
         f"Counted on {counted['date']} by `python -m tests.figures --profiles`: {counted['files']} files and folders "
         f"(public models, genuine trainings, other trainers), of which {unread} are not read as a policy; the others "
         f"hold {counted['policies']}. *Held* is written, has no construct or layer that an importer of that profile "
-        "misreads by the recorded verdicts, and is accepted by our checkers of its releases. That what is held acts as "
-        "the policy does is run by the tests: ONNX in onnxruntime, `.bytes` in TensorFlow 1.4 and 1.7, `.nn` by the "
-        "layer rules of the format.",
+        "misreads by the recorded verdicts, is accepted by our checkers of its releases, and acts as the policy does: "
+        "actions, memories and what is drawn from are compared under the names, layouts and dtypes of that consumer, "
+        "with 1, 3 and 16 agents: ONNX in onnxruntime, `.bytes` in TensorFlow 1.4 and 1.7, `.nn` by the layer rules "
+        "of the format.",
         "",
         *_table(
             ["`--for`", "format", "held", "refused", "why"],
@@ -296,7 +298,8 @@ def main() -> int:
     if options.profiles:
         from tests.targets import sweep
 
-        counted = {"date": _today(), **sweep.swept(sweep.sources())}
+        with RuntimePool() as pool:
+            counted = {"date": _today(), **sweep.swept(sweep.sources(), pool)}
         FIGURES.write_text(json.dumps({**before, "unity": counted}, indent=1) + "\n", encoding="utf-8")
     elif not options.page:
         files = [(origin, f) for origin, f in sources() if options.only in str(f)]

@@ -165,6 +165,14 @@ class Pair:
         draws = sum(layer.type == LayerType.RANDOM_NORMAL for layer in model.layers)
         return self._compared(expected, given, scores, drawn=draws != len(noise) or draws > 1, atol=atol)
 
+    def values(self, model: NnModel, own: Feeds) -> dict[str, np.ndarray]:
+        """Every tensor of the .nn, for what the policy itself is fed."""
+        masks = own.get(
+            "action_masks", np.ones((self.policy.signature.rows(own), sum(self.dressed.signature.branches)))
+        )
+        theirs = {s.name: self._mapped(s, own, masks) for s in self.dressed.signature.inputs}
+        return self.nn_values(model, theirs, [own[s.name] for s in self.policy.signature.noise])
+
     def nn_values(self, model: NnModel, theirs: Feeds, noise: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Every tensor of the .nn by the format's layer rules, fed as Unity feeds it; classes are not drawn."""
         feeds: dict[str, np.ndarray] = {}

@@ -1,8 +1,8 @@
 """Every policy at hand under every profile: what is held, what is refused and why.
 
 ``python -m tests.figures --profiles`` writes the counts into docs/figures. Held is what is written, has no construct or
-layer that an importer of the profile misreads, and is accepted by our checkers of its releases; that it acts the same
-is run by the tests of each format (tests/targets, tests/legacy, tests/barracuda), and here where a pool is given.
+layer that an importer of the profile misreads, is accepted by our checkers of its releases and, where a pool is given,
+acts the same with 1, 3 and 16 agents.
 """
 
 from __future__ import annotations
