@@ -17,11 +17,13 @@ from converters.detached import LARGE, Detached
 from converters.format import WriteOptions
 from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.table import op_of, unsupported
+from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
 from converters.onnx import messages
 from converters.onnx.files import files_of
+from converters.onnx.shorten import shortened
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
 from converters.pieces import Pieces, equal
 from converters.policy import Policy
@@ -156,6 +158,12 @@ class _Builder:
                 kept.append(node)
         self.nodes = kept[::-1]
 
+    def shorten(self, wanted: Collection[str]) -> None:
+        """One node for two, where ONNX has one."""
+        constants = {name: array for alike in self._constants.values() for array, name in alike}
+        ranks = {self._values.get(r, r): len(t.shape) for r, t in self.types.items() if t.shape is not None}
+        self.nodes = shortened(self.nodes, constants, ranks, wanted)
+
     def lower(self, node: Node) -> None:
         """Append what a node of the graph becomes, its result under the node's own name."""
         self.begin(node.name)
@@ -243,6 +251,8 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
     graph = fuse(policy.graph, policy.fetches.values(), activations=False)
+    if options.profile is None:
+        graph = parts_for_slices(graph, policy.fetches.values())
     builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], options.profile)
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)
@@ -255,7 +265,10 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     for name, value in policy.constants.items():
         source = builder.const(value, f"{name}/value")
         builder.nodes.append(messages.node("Identity", [source], [name]))
-    builder.prune([*(s.name for s in policy.signature.outputs), *policy.constants])
+    wanted = [*(s.name for s in policy.signature.outputs), *policy.constants]
+    builder.prune(wanted)
+    if options.profile is None:
+        builder.shorten(wanted)
     used = {name for node in builder.nodes for name in node.input}
     present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
     tensors = builder.tensors(policy.graph, present).dumps()

@@ -27,6 +27,7 @@ from converters.frozen_graph.encode import encode
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import op_of
+from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
@@ -162,7 +163,8 @@ def _shards(weights: Pieces) -> Mapping[str, Pieces]:
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
-    graph = fuse(for_tfjs(policy.graph), policy.fetches.values(), activations=True)
+    roots = policy.fetches.values()
+    graph = fuse(parts_for_slices(for_tfjs(policy.graph), roots), roots, activations=True)
     entries, values = _weights(graph)
     shards = _shards(Pieces(*values))
     contract = json.loads(options.contract)

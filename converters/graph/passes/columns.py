@@ -1,0 +1,59 @@
+"""A slice of a concatenation that is one of its parts is that part.
+
+The discrete policies of ML-Agents 0.5 and later put their branches' scores together and take them apart again.
+``.bytes`` and SavedModel keep that; runtimes in which the start of an op is most of its cost do without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, node_of
+from converters.graph.ops.slicing import strided_steps
+from converters.graph.shapes import Types, infer_types
+
+_WHOLE = (("slice", None, None, 1), ("slice", 0, None, 1))
+
+
+def parts_for_slices(graph: Graph, roots: Iterable[str]) -> Graph:
+    """The graph with those slices left out; outputs stay."""
+    types, outputs, editor = infer_types(graph), {node_of(r) for r in roots}, Editor(graph)
+    for node in graph.nodes:
+        part = None if node.op != "StridedSlice" or node.name in outputs else _part(graph, types, node)
+        if part is None:
+            editor.keep(node)
+        else:
+            editor.redirect(node.name, editor.resolve(part))
+    return editor.graph()
+
+
+def _part(graph: Graph, types: Types, node: Node) -> str | None:
+    """What a slice takes, where it is a part that goes into a concatenation."""
+    joined = graph.producer(node.inputs[0])
+    bounds = [graph.constant(r) for r in node.inputs[1:]]
+    shape = types[node.inputs[0]].shape
+    if joined.op != "ConcatV2" or shape is None:
+        return None
+    axis = graph.constant(joined.inputs[-1])
+    begin, end, strides = (b.tolist() if b is not None else None for b in bounds)
+    if axis is None or begin is None or end is None or strides is None:
+        return None
+    at = int(axis) % len(shape)
+    steps = strided_steps(node, len(shape), begin, end, strides)
+    if len(steps) != len(shape) or any(step not in _WHOLE for i, step in enumerate(steps) if i != at):
+        return None
+    if steps[at][0] != "slice" or steps[at][3] != 1:
+        return None
+    _, first, last, _ = steps[at]
+    start = 0
+    for part in joined.inputs[:-1]:
+        dims = types[part].shape
+        size = None if dims is None else dims[at]
+        if not isinstance(size, int):
+            return None
+        whole = shape[at]
+        if (first or 0, whole if last is None else last) == (start, start + size):
+            return part
+        start += size
+    return None
