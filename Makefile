@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JS := converters/runtimes/javascript/js
 PYTEST := $(BIN)/python -m pytest
+# Where the machine forbids it, each of hundreds of processes would compile all modules anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: install browser demo check test lint types docs figures pictures bench fuzz train clean help
 

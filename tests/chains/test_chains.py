@@ -18,7 +18,7 @@ from converters.runtimes.pool import RuntimePool
 from tests.chains.hops import FORMS, Hop, assert_runs_alike, told, walk
 from tests.chains.starts import GENUINE, OWN, Start
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.no_cover]
 
 bounded = settings(
     max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]

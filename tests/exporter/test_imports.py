@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-
-import pytest
 
 from tests.commands import ROOT, python
 
@@ -54,31 +53,38 @@ def test_the_modules_are_found() -> None:
     assert {"signatures/roles.py", "converters/formats.py", "exporter/cli/main.py"} <= names
 
 
-@pytest.mark.parametrize("module", MODULES, ids=name_of)
-def test_imports_go_one_way(module: Path) -> None:
-    package = module.relative_to(ROOT).parts[0]
-    own = set(imported(ast.parse(module.read_text(encoding="utf-8")))) & set(ALLOWED)
-    assert own <= ALLOWED[package]
+@functools.cache
+def tree_of(module: Path) -> ast.Module:
+    return ast.parse(module.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m.is_relative_to(ROOT / "signatures")], ids=name_of)
-def test_signatures_know_numpy_and_the_standard_library_only(module: Path) -> None:
-    assert set(imported(ast.parse(module.read_text(encoding="utf-8")))) <= {
-        *sys.stdlib_module_names,
-        "numpy",
-        "signatures",
-    }
+def importing(modules: Iterable[Path], wrong: Callable[[Path], set[str]]) -> dict[str, set[str]]:
+    """The modules that import what they may not, and what that is."""
+    return {name_of(m): found for m in modules if (found := wrong(m))}
 
 
-@pytest.mark.parametrize("module", MODULES, ids=name_of)
-def test_no_runtime_is_imported_with_a_module(module: Path) -> None:
-    assert not set(at_module_level(ast.parse(module.read_text(encoding="utf-8")))) & HEAVY
+def test_imports_go_one_way() -> None:
+    def wrong(module: Path) -> set[str]:
+        own = set(imported(tree_of(module))) & set(ALLOWED)
+        return own - ALLOWED[module.relative_to(ROOT).parts[0]]
+
+    assert importing(MODULES, wrong) == {}
 
 
-@pytest.mark.parametrize("module", MODULES, ids=name_of)
-def test_only_the_children_and_what_acts_import_a_runtime(module: Path) -> None:
-    if not any(module.is_relative_to(ROOT / room) for room in ("converters/runtimes", "exporter/acting")):
-        assert not set(imported(ast.parse(module.read_text(encoding="utf-8")))) & RUNTIMES
+def test_signatures_know_numpy_and_the_standard_library_only() -> None:
+    known = {*sys.stdlib_module_names, "numpy", "signatures"}
+    modules = [m for m in MODULES if m.is_relative_to(ROOT / "signatures")]
+    assert importing(modules, lambda m: set(imported(tree_of(m))) - known) == {}
+
+
+def test_no_runtime_is_imported_with_a_module() -> None:
+    assert importing(MODULES, lambda m: set(at_module_level(tree_of(m))) & HEAVY) == {}
+
+
+def test_only_the_children_and_what_acts_import_a_runtime() -> None:
+    theirs = [ROOT / room for room in ("converters/runtimes", "exporter/acting")]
+    modules = [m for m in MODULES if not any(m.is_relative_to(room) for room in theirs)]
+    assert importing(modules, lambda m: set(imported(tree_of(m))) & RUNTIMES) == {}
 
 
 def own_imports(path: Path, names: set[str]) -> set[str]:

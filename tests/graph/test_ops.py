@@ -185,46 +185,44 @@ def contradictions(sample: Sample, graph: Graph) -> list[str]:
 
 @each_op
 def test_inferred_types_hold(op: str) -> None:
+    """With the shapes of the sample, all lengths, only the ranks, and nothing known."""
     for sample in BY_OP[op]:
         assert contradictions(sample, sample.graph) == []
+        all_lengths_known(sample)
+        only_the_ranks_known(sample)
+        nothing_known(sample)
 
 
-@each_op
-def test_inferred_types_hold_with_all_lengths_known(op: str) -> None:
-    for sample in BY_OP[op]:
-        graph = sample.with_shapes(lambda _, array: TensorShape(array.shape))
+def all_lengths_known(sample: Sample) -> None:
+    graph = sample.with_shapes(lambda _, array: TensorShape(array.shape))
+    assert contradictions(sample, graph) == []
+    if sample.op == "Range" and any(n.op == "Placeholder" for n in graph.nodes):
+        return  # its length is a fed value
+    types = infer_types(graph)
+    for name in sample.fetches:
+        shape = types[name].shape
+        assert shape is not None, sample.title
+        assert all(isinstance(d, int) for d in shape), sample.title
+
+
+def only_the_ranks_known(sample: Sample) -> None:
+    graph = sample.with_shapes(
+        lambda shape, array: TensorShape((*(shape.dims or ())[:1], *[None] * array.ndim)[: array.ndim])
+    )
+    if sample.op == "Squeeze" and not sample.graph["op"].attrs["squeeze_dims"]:
+        with pytest.raises(ExportModelError, match="'op'"):
+            infer_types(graph)
+    else:
         assert contradictions(sample, graph) == []
-        if op == "Range" and any(n.op == "Placeholder" for n in graph.nodes):
-            continue  # its length is a fed value
-        types = infer_types(graph)
-        for name in sample.fetches:
-            shape = types[name].shape
-            assert shape is not None, sample.title
-            assert all(isinstance(d, int) for d in shape), sample.title
 
 
-@each_op
-def test_inferred_types_hold_with_only_the_ranks_known(op: str) -> None:
-    for sample in BY_OP[op]:
-        graph = sample.with_shapes(
-            lambda shape, array: TensorShape((*(shape.dims or ())[:1], *[None] * array.ndim)[: array.ndim])
-        )
-        if op == "Squeeze" and not sample.graph["op"].attrs["squeeze_dims"]:
-            with pytest.raises(ExportModelError, match="'op'"):
-                infer_types(graph)
-        else:
-            assert contradictions(sample, graph) == []
-
-
-@each_op
-def test_inferred_types_hold_with_nothing_known(op: str) -> None:
-    for sample in BY_OP[op]:
-        graph = sample.with_shapes(lambda _shape, _array: TensorShape(None))
-        if op in WINDOWS:
-            with pytest.raises(ExportModelError, match="'op'"):
-                infer_types(graph)
-        else:
-            assert contradictions(sample, graph) == []
+def nothing_known(sample: Sample) -> None:
+    graph = sample.with_shapes(lambda _shape, _array: TensorShape(None))
+    if sample.op in WINDOWS:
+        with pytest.raises(ExportModelError, match="'op'"):
+            infer_types(graph)
+    else:
+        assert contradictions(sample, graph) == []
 
 
 # ------------------------------------------------------------------ slices

@@ -33,7 +33,8 @@ from signatures.roles import Role
 from tests.commands import files_in
 from tests.handmade import continuous_policy, graph_bytes, sampled_policy
 
-pytestmark = pytest.mark.slow
+#: Traced for coverage, thousands of examples take three times as long and run what every other test runs.
+pytestmark = [pytest.mark.slow, pytest.mark.no_cover]
 
 #: Seconds of this process that one graph may take.
 SECONDS = 2.0
