@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import re
 import stat
 from collections.abc import Iterable
@@ -16,7 +17,9 @@ MAX_BYTES = (2 << 30) - 1
 #: Weights that lie beside a model, all together; no policy comes near it.
 MAX_WEIGHTS = 16 << 30
 #: As a path keeps an address: with one slash of the two.
-_ADDRESS = re.compile("(https?|ftps?|s3|gs|hf|ssh|git)://?")
+_ADDRESS = re.compile("(https?|ftps?|s3|gs|gcs|hf|memory|ssh|git)://?")
+#: Addresses of these are fetched where fsspec is installed (exporter/remote).
+FETCHED = ("http", "https", "s3", "gs", "gcs", "hf", "memory")
 
 
 class Fetched:
@@ -86,16 +89,31 @@ def unreadable(path: Path, error: OSError) -> SourceError:
 
 def _missing(path: Path) -> SourceError:
     """There is no such file; an address is none."""
-    scheme = _ADDRESS.match(path.as_posix())
-    if scheme is None:
+    address = address_of(path)
+    if address is None:
         return SourceError("no such file", where=str(path), fix=_neighbours(path))
-    address = f"{scheme[1]}://{path.as_posix()[scheme.end() :]}"
+    fix = "download it (the raw file, not the page that shows it), and give the file"
+    known = address.partition("://")[0] in FETCHED
     return SourceError(
         "is an address, not a file",
         where=address,
-        why="nothing is fetched from the network",
-        fix="download it (the raw file, not the page that shows it), and give the file",
+        why=f"only {', '.join(FETCHED)} are fetched" if fetches() else "nothing is fetched from the network",
+        fix=f"{fix}; or pip install 'export-model[remote]'" if known and not fetches() else fix,
     )
+
+
+def address_of(path: Path) -> str | None:
+    """The address that a path is, which keeps one slash of its two; None where it is none."""
+    scheme = _ADDRESS.match(path.as_posix())
+    return None if scheme is None else f"{scheme[1]}://{path.as_posix()[scheme.end() :]}"
+
+
+def fetches() -> bool:
+    """Whether what fetches addresses is installed."""
+    try:
+        return importlib.util.find_spec("fsspec") is not None
+    except ValueError:  # something put it into sys.modules without a spec
+        return False
 
 
 def _neighbours(path: Path) -> str:

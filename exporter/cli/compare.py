@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,13 +52,14 @@ def compare_command(
     """Compare files that any tool made with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
     from converters.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
+    from exporter.remote.fetching import nearby
     from exporter.reports.entry import Entry
 
     console.prepare()
-    with console.progress() as progress:
+    with ExitStack() as fetched, console.progress() as progress:
         report = compare_artefacts(
-            reference,
-            candidates,
+            fetched.enter_context(nearby(reference)),
+            [fetched.enter_context(nearby(candidate)) for candidate in candidates],
             names=pairs(mapped, "--map"),
             runtimes=runtimes,
             options=options,

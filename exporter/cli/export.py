@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     default=Path("exported"),
     show_default=True,
-    help="Folder for the bundles.",
+    help="Folder for the bundles, or an address.",
 )
 @click.option(
     "--to",
@@ -110,6 +110,7 @@ def export_command(
 
     This is the command that is meant where none is named.
     """
+    from converters.fetch import address_of
     from exporter.export.pipeline import ExportOptions, export
     from exporter.fleet.sources import is_many
 
@@ -129,7 +130,7 @@ def export_command(
         labels,
         profile,
     )
-    if jobs is not None or again or fail_fast or is_many(sources):
+    if jobs is not None or again or fail_fast or is_many(sources) or address_of(out) is not None:
         from exporter.cli.fleet import run_fleet
 
         run_fleet(sources, job, jobs or 1, again, fail_fast, console)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from converters.fetch import address_of
 from exporter.cli.console import Console
 from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
@@ -101,13 +102,14 @@ class _Tally:
 
 def _lines(outcome: Outcome, *, failed: bool = False) -> list[str]:
     """What is said of a source; ``failed``: only what went wrong."""
-    lines = [f"{outcome.path}: unchanged"] if outcome.unchanged else []
+    lines = [f"{address_of(outcome.path) or outcome.path}: unchanged"] if outcome.unchanged else []
     for policy in outcome.policies:
         if failed and policy.passed is not False:
             continue
         verdict = {True: "passed", False: f"FAILED: {policy.failure}", None: "not verified"}[policy.passed]
         note = "" if policy.renamed is None else f" ({policy.renamed})"
-        lines.append(f"{outcome.path}: {policy.what} -> {policy.folder}: {verdict}{note}")
+        where = address_of(policy.folder) or policy.folder
+        lines.append(f"{address_of(outcome.path) or outcome.path}: {policy.what} -> {where}: {verdict}{note}")
     if outcome.error is not None:
         lines.append(f"error: {outcome.error.message}")
     return lines

@@ -74,6 +74,7 @@ def inspect_command(
     With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
     """
     from converters.graph.options import CompileOptions
+    from exporter.remote.fetching import nearby
 
     if len(sources) > 1 and (logdir is not None or svg is not None):
         raise UsageError("--logdir and --svg are for one source", fix="name one")
@@ -94,13 +95,14 @@ def inspect_command(
     status, found = 0, list[dict[str, Any]]()
     for source in sources:
         try:
-            if releases:
-                answer, report = _unity(source, releases, sensors, actions, brain_parameters, as_json, svg)
-                found.append(report)
-                status = max(status, answer)
-            else:
-                read = read_options(step, sensors, trust_source, activation)
-                found.append(_inspected(source, compiling, read, logdir, svg, as_json))
+            with nearby(source) as here:
+                if releases:
+                    answer, report = _unity(here, releases, sensors, actions, brain_parameters, as_json, svg)
+                    found.append(report)
+                    status = max(status, answer)
+                else:
+                    read = read_options(step, sensors, trust_source, activation)
+                    found.append(_inspected(here, compiling, read, logdir, svg, as_json))
         except ExportModelError as error:
             if len(sources) == 1:
                 raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,11 +57,17 @@ def verify_command(
     from converters.bundle.bundle import bundles_in
     from exporter.export.again import verify_folder
     from exporter.export.pipeline import counted
+    from exporter.remote.fetching import nearby
 
     console.prepare()
-    bundles = tuple(found for place in bundles for found in bundles_in(place) or [place])
     reports = []
-    with console.progress() as progress:
+    with ExitStack() as fetched, console.progress() as progress:
+        bundles = tuple(
+            found
+            for place in map(fetched.enter_context, map(nearby, bundles))
+            for found in bundles_in(place) or [place]
+        )
+        source = None if source is None else fetched.enter_context(nearby(source))
         for number, folder in enumerate(bundles, 1):
             report = verify_folder(
                 folder,
@@ -75,10 +82,10 @@ def verify_command(
             reports.append(report)
             progress.clear()
             console.verified(report, folder)
-    console.whole(reports)
-    console.check_rules(reports)
-    console.json({"reports": [r.to_dict() for r in reports]})
-    console.write_reports(lambda: _bundle_entries(reports, bundles, options.steps))
+        console.whole(reports)
+        console.check_rules(reports)
+        console.json({"reports": [r.to_dict() for r in reports]})
+        console.write_reports(lambda: _bundle_entries(reports, bundles, options.steps))
     if any(r.passed is False for r in reports):
         sys.exit(1)
 

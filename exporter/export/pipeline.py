@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,8 @@ from converters.source import ReadOptions, SourceModel
 from exporter.export.labels import Labels, check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
 from exporter.export.sources import Source, read_source
+from exporter.remote.fetching import nearby
+from exporter.remote.sending import check_free, check_sendable, landing
 from exporter.verify.checks.size import check_budget
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import check_rules
@@ -150,6 +152,7 @@ class Exporter:
             self.runtimes, self._known = chosen_runtimes(options.verify, self._formats)
         if self.runtimes:
             check_budget(options.parity.budget, {f.key: 0 for f in self._formats})
+        check_sendable(options.out)
         self._labels = read_labels(options.labels)
 
     def check(self, paths: Sequence[Path | str | Source], progress: Progress) -> None:
@@ -161,14 +164,18 @@ class Exporter:
             return
         names, outputs = Names(), dict[str, list[str]]()
         for path in paths:
-            with contextlib.suppress(ExportModelError):
-                for job in self.compiled(path, names, progress):
+            with contextlib.suppress(ExportModelError), near(path) as here:
+                for job in self.compiled(here, names, progress, path):
                     outputs[job.policy.name] = [s.name for s in job.policy.signature.outputs]
         check_rules(rules, outputs, {f.key: f.runtimes for f in self._formats}, self.runtimes)
         check_labels(self._labels, list(outputs))
 
-    def compiled(self, path: Path | str | Source, names: Naming, progress: Progress) -> list[Job]:
-        """The policies of a source, under the names that they will have. Raises ExportModelError."""
+    def compiled(
+        self, path: Path | str | Source, names: Naming, progress: Progress, given: Path | str | Source | None = None
+    ) -> list[Job]:
+        """The policies of a source, under the names that they will have; ``given`` is what it was called where it is
+        another's copy. Raises ExportModelError.
+        """
         options, dress = self.options, self._dress
         progress(f"reading {path.path if isinstance(path, Source) else path}")
         source = path if isinstance(path, Source) else read_source(path, options.read)
@@ -178,7 +185,8 @@ class Exporter:
                 raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
             found = [(model, replace(policy, name=options.name)) for model, policy in found]
         jobs = []
-        called = names.claim(source.path, [safe_name(policy.name) for _, policy in found])
+        origin = Path(given) if isinstance(given, Path | str) else source.path
+        called = names.claim(origin, [safe_name(policy.name) for _, policy in found])
         for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
             dressed = labelled(own if dress is None else dress(own), self._labels)
@@ -190,7 +198,7 @@ class Exporter:
         ExportModelError, before the first is written if it can.
         """
         for job in jobs:
-            bundle.check_replaceable(self.options.out / job.policy.name)
+            check_free(self.options.out, job.policy.name)
         made = [(j, *_write(j, self._formats, self.options)) for j in jobs]
         for number, (job, contract, artifacts, notes) in enumerate(made, 1):
             result = self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
@@ -202,7 +210,8 @@ class Exporter:
         """The bundle of a policy, verified and put in its place."""
         options, policy = self.options, job.policy
         with (
-            bundle.staged(options.out / policy.name, contract, artifacts) as stage,
+            landing(options.out) as (out, put),
+            bundle.staged(out / policy.name, contract, artifacts) as stage,
             scratch_folder() if self.runtimes else nullcontext(Path()) as folder,
         ):
             report = None
@@ -217,11 +226,10 @@ class Exporter:
                     under = tested_in(plain, self._formats, folder / "own")
                     rules = replace(options.parity, rules=(), golden=None, budget={})
                     report = joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
-                with bundle.writing(options.out):
+                with bundle.writing(out):
                     (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
             failed = report is not None and report.passed is False
-            place = options.out / (f"{policy.name}.failed" if failed else policy.name)
-            bundle.put_in_place(stage, place)
+            place = put(stage, f"{policy.name}.failed" if failed else policy.name)
         return ExportResult(policy, place, contract, {a.format.key: a.size for a in artifacts}, report, job.note)
 
 
@@ -255,7 +263,8 @@ def export(
         for number, path in enumerate(paths, 1):
             try:
                 told = counted(progress, number, len(paths))
-                yield from exporter.written(exporter.compiled(path, names, told), pool, told)
+                with near(path) as here:
+                    yield from exporter.written(exporter.compiled(here, names, told, path), pool, told)
             except ExportModelError as error:
                 if len(paths) == 1:
                     raise
@@ -264,6 +273,11 @@ def export(
                     refused(error)
     if errors and refused is None:
         raise RefusedError(errors, len(paths))
+
+
+def near(path: Path | str | Source) -> AbstractContextManager[Path | Source]:
+    """A source where it can be read; what is at an address is fetched."""
+    return nullcontext(path) if isinstance(path, Source) else nearby(Path(path))
 
 
 def counted(progress: Progress, number: int, total: int) -> Progress:

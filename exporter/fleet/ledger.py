@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from converters.fetch import address_of
 from exporter.export.labels import read_labels
 from exporter.export.pipeline import ExportOptions
+from exporter.remote.fetching import version
 from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.digest import sha256_hex
-from signatures.errors import BundleError
+from signatures.errors import BundleError, SourceError
 
 _NAME = ".exported.jsonl"
 #: size, time of the last change in ns, sha256
@@ -31,6 +33,8 @@ class Ledger:
         self._out = options.out
         self._key = _key(options, runtimes)
         self._lines: dict[str, Mapping[str, Any]] = {}
+        #: what is at an address is not looked at: all is exported
+        self._keeps = address_of(options.out) is None
         try:
             text = self._path.read_text(encoding="utf-8") if self._path.is_file() else ""
         except (OSError, ValueError):
@@ -50,14 +54,17 @@ class Ledger:
                 entry.get("options") == self._key
                 and entry["folder"] == _listing(source)
                 and all(_is_same(Path(path), stamp) for path, stamp in entry["files"].items())
+                and entry["files"]
                 and all(sha256_hex((self._out / n / POLICY).read_bytes()) == h for n, h in entry["policies"].items())
             )
             return [str(name) for name in entry["policies"]] if same else None
-        except (OSError, LookupError, TypeError, ValueError, AttributeError):
+        except (OSError, LookupError, TypeError, ValueError, AttributeError, SourceError):
             return None
 
     def record(self, source: Path, files: Mapping[str, Stamp], policies: Iterable[str]) -> None:
         """Note that a source was exported. Raises BundleError."""
+        if not self._keeps:
+            return
         try:
             hashes = {n: sha256_hex((self._out / n / POLICY).read_bytes()) for n in policies}
             entry = {
@@ -75,14 +82,21 @@ class Ledger:
             ) from error
 
 
-def stamps(files: Iterable[Path]) -> dict[str, Stamp]:
-    """What tells whether files are as they are now. Raises OSError."""
+def stamps(source: Path, files: Iterable[Path]) -> dict[str, Stamp]:
+    """What tells whether a source's files are as they are now; nothing where its service does not say. Raises OSError,
+    SourceError.
+    """
+    if address_of(source) is not None:
+        known = version(source)
+        return {} if known is None else {str(source): [0, 0, known]}
     return {str(f): [*_times(f), sha256_hex(f.read_bytes())] for f in sorted(set(files))}
 
 
 def _is_same(path: Path, stamp: Stamp) -> bool:
     """By size and time, as git does it; a file that was only touched is read."""
     size, time, digest = stamp
+    if address_of(path) is not None:
+        return bool(version(path) == digest)
     now = _times(path)
     return now == [size, time] or (now[0] == size and sha256_hex(path.read_bytes()) == digest)
 

@@ -11,6 +11,7 @@ from converters.bundle import BUNDLE
 from converters.fetch import Fetched, unreadable
 from converters.recognise import recognised
 from converters.source import ReadOptions
+from exporter.remote.filesystem import is_pattern, matching, remote
 from signatures.errors import SourceError, UsageError
 
 _MAGIC = frozenset("*?[")
@@ -22,7 +23,8 @@ def is_many(given: Sequence[Path]) -> bool:
     """Whether one of the paths stands for others: a pattern, a list, or a folder that is no source itself."""
     try:
         return any(
-            (path.is_dir() and not _is_source(path))
+            remote(path) is not None
+            or (path.is_dir() and not _is_source(path))
             or (not path.exists() and not _MAGIC.isdisjoint(str(path)))
             or (path.suffix == ".txt" and path.is_file())
             for path in given
@@ -35,8 +37,8 @@ def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
     """The sources that the paths stand for, each once, in their order; those of a pattern or folder by name.
 
     ``**`` goes through all folders. A ``.txt`` has a path a line, from where the command is called; ``#`` begins a
-    comment. What lies in ``out`` is no source. Raises UsageError where there is none, or a path
-    stands for none.
+    comment. What is at an address is fetched later, one by one. What lies in ``out`` is no source. Raises UsageError
+    where there is none, or a path stands for none.
     """
     if not given:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
@@ -56,7 +58,10 @@ def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
 
 
 def _expanded(path: Path, out: Path) -> Iterator[Path]:
-    if path.is_dir():
+    address = remote(path)
+    if address is not None:
+        yield from matching(address) if is_pattern(address) else [path]
+    elif path.is_dir():
         yield from _walked(path, out)
     elif path.suffix == ".txt" and path.is_file():
         for line in _lines(path):

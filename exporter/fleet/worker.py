@@ -14,7 +14,7 @@ from typing import Any
 from converters.runtimes.child import end_with_parent
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claimed, Naming
-from exporter.export.pipeline import Exporter, ExportOptions, ExportResult
+from exporter.export.pipeline import Exporter, ExportOptions, ExportResult, near
 from exporter.fleet.ledger import Stamp, stamps
 from exporter.reports.entry import Entry, of_result
 from signatures.errors import ExportModelError, SourceError
@@ -72,10 +72,11 @@ def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, w
     policies: list[Written] = []
     files: Mapping[str, Stamp] | None = None
     try:
-        jobs = exporter.compiled(path, names, _silent)
-        files = stamps(f for job in jobs for f in job.model.files)
-        steps = exporter.options.parity.steps
-        policies.extend(_written(result, wanted, steps) for result in exporter.written(jobs, pool, _silent))
+        with near(path) as here:
+            jobs = exporter.compiled(here, names, _silent, path)
+            files = stamps(path, (f for job in jobs for f in job.model.files))
+            steps = exporter.options.parity.steps
+            policies.extend(_written(result, wanted, steps) for result in exporter.written(jobs, pool, _silent))
     except ExportModelError as error:
         return Outcome(path, tuple(policies), error)
     except OSError as error:

@@ -156,8 +156,9 @@ def test_a_missing_file_names_the_one_that_was_probably_meant(tmp_path: Path) ->
 
 
 def test_an_address_is_no_path() -> None:
-    ran = export_model("https://example.com/models/3DBall.onnx")
-    is_refused(ran, "https://example.com/models/3DBall.onnx: is an address", "download it")
+    """tests/remote has those that are fetched."""
+    ran = export_model("ftp://example.com/models/3DBall.onnx")
+    is_refused(ran, "ftp://example.com/models/3DBall.onnx: is an address", "download it")
 
 
 def test_a_saved_model_without_its_variables_is_told_to_bring_its_folder(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Sources and bundles by address, through fsspec (the extra ``remote``)."""

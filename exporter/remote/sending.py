@@ -1,0 +1,91 @@
+"""Bundles by address: made whole here, sent file by file, policy.json last, so that one that has it is whole."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from converters.bundle import bundle
+from converters.fetch import address_of, fetches
+from converters.folders import scratch_folder
+from exporter.remote.filesystem import asking, filesystem, remote
+from signatures.contract import POLICY
+from signatures.errors import BundleError, UsageError
+
+#: Puts a staged bundle in its place, and says where that is.
+Put = Callable[[Path, str], Path]
+
+
+@contextlib.contextmanager
+def landing(out: Path) -> Iterator[tuple[Path, Put]]:
+    """A folder to stage a bundle in, and what puts it into ``out``, a folder or an address. Raises BundleError."""
+    address = remote(out)
+    if address is None:
+        yield out, lambda staged, name: _put(staged, out / name)
+        return
+    with scratch_folder() as folder:
+        here = Path(folder)
+        yield here, lambda staged, name: _send(_put(staged, here / name), f"{address}/{name}")
+
+
+def check_free(out: Path, name: str) -> None:
+    """Raise BundleError where something in the way of a bundle is none."""
+    address = remote(out)
+    if address is None:
+        bundle.check_replaceable(out / name)
+    else:
+        _there(f"{address}/{name}")
+
+
+def check_sendable(out: Path) -> None:
+    """Raise UsageError where nothing can be written to an address."""
+    address = address_of(out)
+    if address is not None and (remote(out) is None or address.startswith(("http://", "https://"))):
+        raise UsageError(
+            "nothing can be written there",
+            where=address,
+            why=None if fetches() else "that needs fsspec: pip install 'export-model[remote]'",
+            fix="give a folder, or an address of s3, gs or hf",
+        )
+
+
+def _put(staged: Path, place: Path) -> Path:
+    bundle.put_in_place(staged, place)
+    return place
+
+
+def _there(address: str) -> set[str]:
+    """The files of the bundle at an address, by their paths in it. Raises BundleError where they are another's."""
+    system, root = filesystem(address)
+    with asking(address, writes=True):
+        system.invalidate_cache()
+        found = {path[len(root) :].lstrip("/") for path in system.find(root)} if system.exists(root) else set()
+    name = address.rpartition("/")[2].removesuffix(".failed")
+    # Where sending was cut short, policy.json is not there yet; what is there has the policy's name, or our folders'.
+    ours = {file for file in found if file.startswith((f"{name}.", "saved_model/", "tfjs/", "policy.", "parity."))}
+    if found and POLICY not in found and found != ours:
+        raise BundleError(
+            "is in the way and is not a bundle",
+            where=address,
+            why=f"it has no {POLICY}, so it is not this tool's to replace",
+            fix="move it, or choose another address with -o or another --name",
+        )
+    return found
+
+
+def _send(folder: Path, address: str) -> Path:
+    before = _there(address)
+    system, root = filesystem(address)
+    files = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
+    last = files.pop(POLICY)
+    with asking(address, writes=True):
+        if POLICY in before:
+            system.rm_file(f"{root}/{POLICY}")
+        for name, file in files.items():
+            system.makedirs(f"{root}/{name}".rpartition("/")[0], exist_ok=True)
+            system.put_file(str(file), f"{root}/{name}")
+        for name in sorted(before - files.keys() - {POLICY}):
+            system.rm_file(f"{root}/{name}")
+        system.put_file(str(last), f"{root}/{POLICY}")
+    return Path(address)

@@ -1,0 +1,202 @@
+"""Sources and bundles by address: a memory file system, and a web server on this machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from converters import fetch
+from exporter import export_model
+from exporter.export.pipeline import ExportOptions
+from exporter.fleet.fleet import export_fleet
+from exporter.fleet.sources import sources_in
+from exporter.fleet.worker import Outcome
+from exporter.remote import fetching, sending
+from exporter.remote.fetching import nearby
+from exporter.remote.filesystem import remote
+from fixtures import path as fixture
+from signatures.contract import POLICY
+from signatures.errors import BundleError, SourceError, UsageError
+from tests.commands import export_model as command
+
+fsspec = pytest.importorskip("fsspec")
+
+
+@pytest.fixture
+def memory() -> Iterator[Any]:
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    system.pseudo_dirs[:] = [""]
+    for name in ("a/continuous", "a/discrete", "b/continuous"):
+        system.pipe(f"/runs/{name}.bytes", fixture(Path(name).name).read_bytes())
+    system.pipe("/runs/notes.txt", b"no model")
+    yield system
+    system.store.clear()
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def run(given: list[str], out: str | Path, **more: Any) -> list[Outcome]:
+    options = ExportOptions(Path(out), verify="none")
+    return list(export_fleet(sources_in([Path(g) for g in given], Path(out)), options, **more))
+
+
+def test_what_is_written_is_what_files_give(memory: Any, tmp_path: Path) -> None:
+    for name in ("a/continuous", "a/discrete", "b/continuous"):
+        (tmp_path / "runs" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(fixture(Path(name).name), tmp_path / "runs" / f"{name}.bytes")
+    run([str(tmp_path / "runs")], tmp_path / "out")
+    made = run(["memory://runs/**/*.bytes"], "memory://out")
+    assert not [o.error for o in made if o.error is not None]
+    local = {k: v for k, v in files(tmp_path / "out").items() if k != ".exported.jsonl"}
+    sent = {path.removeprefix("/out/"): memory.cat(path) for path in memory.find("/out")}
+    assert sent == local
+    assert {name.split("/")[0] for name in sent} == {"continuous", "discrete", "b-continuous"}
+
+
+def test_policy_json_is_sent_last_and_goes_first(memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(["memory://runs/a/discrete.bytes"], "memory://out")
+    memory.pipe("/out/discrete/policy.old", b"of an older version")
+    done: list[str] = []
+    kind = type(memory)
+    put, rm = kind.put_file, kind.rm_file
+    monkeypatch.setattr(kind, "put_file", lambda s, a, b, **k: (done.append(b), put(s, a, b, **k)))
+    monkeypatch.setattr(kind, "rm_file", lambda s, a: (done.append(f"- {a}"), rm(s, a)))
+    run(["memory://runs/a/discrete.bytes"], "memory://out")
+    assert done[0] == "- /out/discrete/policy.json"
+    assert done[-1] == "/out/discrete/policy.json"
+    assert "- /out/discrete/policy.old" in done
+    assert not memory.exists("/out/discrete/policy.old")
+
+
+def test_what_was_cut_short_is_sent_again_and_what_is_anothers_stays(memory: Any) -> None:
+    run(["memory://runs/a/discrete.bytes"], "memory://out")
+    memory.rm_file(f"/out/discrete/{POLICY}")
+    memory.rm_file("/out/discrete/discrete.onnx")
+    assert run(["memory://runs/a/discrete.bytes"], "memory://out")[0].error is None
+    assert memory.exists("/out/discrete/discrete.onnx")
+    memory.pipe("/out/continuous/thesis.tex", b"mine")
+    (refused,) = run(["memory://runs/a/continuous.bytes"], "memory://out")
+    assert isinstance(refused.error, BundleError)
+    assert "memory://out/continuous: is in the way" in refused.error.message
+    assert memory.ls("/out/continuous", detail=False) == ["/out/continuous/thesis.tex"]
+
+
+def test_unchanged_addresses_are_left_out(memory: Any, tmp_path: Path) -> None:
+    given = ["memory://runs/**/*.bytes"]
+    run(given, tmp_path)
+    assert all(o.unchanged for o in run(given, tmp_path))
+    memory.pipe("/runs/a/discrete.bytes", fixture("twobrains").read_bytes())
+    assert [o.path.name for o in run(given, tmp_path) if not o.unchanged] == ["discrete.bytes"]
+
+
+def test_a_folder_is_one_source_and_errors_name_the_address(memory: Any) -> None:
+    with nearby(Path("memory://runs/a")) as here:
+        assert sorted(p.name for p in here.iterdir()) == ["continuous.bytes", "discrete.bytes"]
+    assert not here.exists()
+    with pytest.raises(SourceError, match=r"^memory://runs/notes\.txt: "):
+        export_model("memory://runs/notes.txt", "memory://out", verify="none")
+    with pytest.raises(SourceError, match=r"memory://gone\.onnx: there is no such file"):
+        export_model("memory://gone.onnx", "memory://out", verify="none")
+
+
+def test_more_than_is_fetched_is_refused(memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetching, "MAX_BYTES", 1000)
+    with pytest.raises(SourceError, match="has more than"), nearby(Path("memory://runs/a/discrete.bytes")):
+        pass
+    monkeypatch.setattr(fetching, "MAX_FILES", 1)
+    with pytest.raises(SourceError, match="has 2 files"), nearby(Path("memory://runs/a")):
+        pass
+
+
+@pytest.mark.parametrize("name", ["..", "a\\b", "x" * 300])
+def test_names_stay_below_the_folder(name: str, memory: Any, tmp_path: Path) -> None:
+    memory.store[f"/odd/{name}/m.bytes"] = memory.store["/runs/notes.txt"]
+    with pytest.raises(SourceError, match="has a name that it cannot have here"), nearby(Path("memory://odd")):
+        pass
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["file:///etc/passwd", "local://etc/passwd", "simplecache::memory://a", "memory://a::file://b", "zip://a::s3://b"],
+)
+def test_protocols_that_are_not_named_are_no_addresses(address: str) -> None:
+    assert remote(Path(address)) is None
+
+
+def test_without_fsspec_an_address_is_no_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(fetch.importlib.util, "find_spec", lambda name, real=importlib.util.find_spec: None)
+    with pytest.raises(SourceError, match=r"is an address, not a file(.|\n)*nothing is fetched(.|\n)*\[remote\]"):
+        export_model("https://example.com/models/3DBall.onnx", tmp_path, verify="none")
+    with pytest.raises(UsageError, match="nothing can be written there"):
+        export_model(fixture("discrete"), "s3://bucket/out", verify="none")
+
+
+def test_nothing_is_written_by_http() -> None:
+    with pytest.raises(UsageError, match="nothing can be written there"):
+        sending.check_sendable(Path("https://example.com/out"))
+
+
+# ------------------------------------------------------------------ a web server
+
+
+class _Redirecting(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        self.send_response(302)
+        self.send_header("Location", f"file://{fixture('discrete')}")
+        self.end_headers()
+
+    do_HEAD = do_GET  # noqa: N815
+
+    def log_message(self, *args: Any) -> None:
+        pass
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def serving() -> Iterator[Any]:
+    servers = []
+
+    def serve(handler: Any) -> str:
+        server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        servers.append(server)
+        return f"http://127.0.0.1:{server.server_port}"
+
+    yield serve
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def test_a_web_server(serving: Any, tmp_path: Path) -> None:
+    shutil.copy(fixture("discrete"), tmp_path / "discrete.bytes")
+    place = serving(partial(_Quiet, directory=str(tmp_path)))
+    run([f"{place}/discrete.bytes?raw=true"], tmp_path / "one")
+    export_model(fixture("discrete"), tmp_path / "two", verify="none")
+    assert files(tmp_path / "one" / "discrete") == files(tmp_path / "two" / "discrete")
+    ran = command("inspect", f"{place}/discrete.bytes")
+    assert (ran.status, "discrete" in ran.out) == (0, True)
+    ran = command(f"{place}/gone.bytes", "-o", tmp_path / "out", "--verify", "none")
+    assert ran.status == 2
+    assert f"{place}/gone.bytes" in ran.err
+
+
+def test_a_redirect_leads_to_no_file(serving: Any) -> None:
+    place = serving(_Redirecting)
+    with pytest.raises(SourceError, match=r"cannot be fetched|no such file"), nearby(Path(f"{place}/policy.bytes")):
+        pass
