@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     help="auto, full, browser, none, or runtimes by name.",
 )
 @click.option("--jobs", type=int, metavar="N", help="Export N sources at a time (default: 1).")
+@click.option("--cluster", metavar="ADDRESS", help="Export on a Dask cluster: tcp://host:8786.")
 @click.option("--again", is_flag=True, help="Of many sources, export the unchanged ones too.")
 @click.option("--fail-fast", is_flag=True, help="Of many sources, stop at the first that fails.")
 @reporting
@@ -100,6 +101,7 @@ def export_command(
     trust_source: bool,
     labels: Path | None,
     jobs: int | None,
+    cluster: str | None,
     again: bool,
     fail_fast: bool,
     compiling: CompileOptions,
@@ -130,10 +132,11 @@ def export_command(
         labels,
         profile,
     )
-    if jobs is not None or again or fail_fast or is_many(sources) or address_of(out) is not None:
+    many = again or fail_fast or is_many(sources) or address_of(out) is not None
+    if many or jobs is not None or cluster is not None:
         from exporter.cli.fleet import run_fleet
 
-        run_fleet(sources, job, jobs or 1, again, fail_fast, console)
+        run_fleet(sources, job, jobs, cluster, again, fail_fast, console)
         return
     results: list[ExportResult] = []
     refused: list[ExportModelError] = []

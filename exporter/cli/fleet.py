@@ -14,6 +14,7 @@ from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
 from exporter.fleet.worker import Outcome, Wanted
+from signatures.errors import UsageError
 
 if TYPE_CHECKING:
     from exporter.export.pipeline import ExportOptions
@@ -24,16 +25,26 @@ _MOST_SHOWN = 50
 
 
 def run_fleet(
-    given: Sequence[Path], options: ExportOptions, jobs: int, again: bool, fail_fast: bool, console: Console
+    given: Sequence[Path],
+    options: ExportOptions,
+    jobs: int | None,
+    cluster: str | None,
+    again: bool,
+    fail_fast: bool,
+    console: Console,
 ) -> None:
     """Export what the paths stand for. Ends with status 2 where a source was refused, 1 where formats disagree."""
+    if cluster is not None and jobs is not None:
+        raise UsageError("--jobs and --cluster contradict each other", fix="a cluster's workers are as many as it has")
     paths = sources_in(given, options.out)
     wanted = Wanted(console.as_json, console.wants_reports)
     tally = _Tally(len(paths))
     entries: list[Entry] = []
     answers: list[Any] = []
     refused: list[Any] = []
-    outcomes = export_fleet(paths, options, jobs=jobs, again=again, fail_fast=fail_fast, wanted=wanted)
+    outcomes = export_fleet(
+        paths, options, jobs=jobs or 1, cluster=cluster, again=again, fail_fast=fail_fast, wanted=wanted
+    )
     with console.progress_bar(len(paths)) as bar:
         for outcome in outcomes:
             tally.count(outcome)

@@ -19,6 +19,7 @@ from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Names
 from exporter.export.pipeline import Exporter, ExportOptions
 from exporter.fleet.ledger import Ledger
+from exporter.fleet.turns import Turns
 from exporter.fleet.worker import Claim, Outcome, Wanted, exported, work
 from signatures.errors import SourceError, UsageError
 
@@ -33,9 +34,11 @@ def export_fleet(
     jobs: int = 1,
     again: bool = False,
     fail_fast: bool = False,
+    cluster: str | None = None,
     wanted: Wanted | None = None,
 ) -> Iterator[Outcome]:
-    """Export every source, ``jobs`` at a time; what ended last comes last.
+    """Export every source, ``jobs`` at a time, or by the workers of the Dask cluster at ``cluster``; what ended last
+    comes last.
 
     A source that was exported to the same folder with the same options, and is unchanged, is left out unless ``again``
     is set. ``fail_fast`` ends with the first source that is refused or disagrees. Raises UsageError,
@@ -58,11 +61,14 @@ def export_fleet(
         for name in done:
             names.reserve(path, name)
         yield Outcome(path, unchanged=True)
-    made = (
-        _here(exporter, waiting, names, wanted)
-        if jobs == 1 or len(waiting) < 2
-        else _Crew(options, wanted, names, waiting).run(min(jobs, len(waiting)))
-    )
+    if cluster is not None:
+        from exporter.fleet.cluster import Cluster
+
+        made = Cluster(cluster, options, wanted, Turns(names), waiting).run()
+    elif jobs == 1 or len(waiting) < 2:
+        made = _here(exporter, waiting, names, wanted)
+    else:
+        made = _Crew(options, wanted, Turns(names), waiting).run(min(jobs, len(waiting)))
     for outcome in made:
         if not outcome.failed and outcome.files is not None:
             ledger.record(outcome.path, outcome.files, [p.name for p in outcome.policies])
@@ -87,19 +93,12 @@ class _Worker:
 
 @dataclass
 class _Crew:
-    """Workers, each with one source at a time. Names are given to the sources in their order, so that they do not
-    depend on who is quick: a worker waits until all sources before its own have theirs.
-    """
+    """Workers, each with one source at a time."""
 
     options: ExportOptions
     wanted: Wanted
-    names: Names
+    turns: Turns[_Worker]
     paths: Sequence[Path]
-    #: workers that wait for names, by their source
-    asking: dict[int, tuple[_Worker, Claim]] = field(default_factory=dict)
-    #: sources that have names, or ended without
-    named: set[int] = field(default_factory=set)
-    first_unnamed: int = 0
     workers: list[_Worker] = field(default_factory=list)
     #: workers that have nothing left to do, and end
     ending: list[_Worker] = field(default_factory=list)
@@ -137,28 +136,19 @@ class _Crew:
                 ),
             )
         if isinstance(message, Claim):
-            self.asking[worker.at] = (worker, message)
+            self.turns.asks(worker.at, worker, message)
             self._give_names()
             return None
         assert isinstance(message, Outcome)
         return message
 
     def _settle(self, index: int) -> None:
-        self.asking.pop(index, None)
-        if index >= self.first_unnamed:
-            self.named.add(index)
+        self.turns.ends(index)
         self._give_names()
 
     def _give_names(self) -> None:
-        while True:
-            if self.first_unnamed in self.named:
-                self.named.remove(self.first_unnamed)
-            elif self.first_unnamed in self.asking:
-                worker, claim = self.asking.pop(self.first_unnamed)
-                self._send(worker, self.names.claim(claim.path, claim.names))
-            else:
-                return
-            self.first_unnamed += 1
+        for _, worker, names in self.turns.answers():
+            self._send(worker, names)
 
     def _next(self, worker: _Worker, index: int | None) -> None:
         if not worker.process.is_alive():

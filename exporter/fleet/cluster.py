@@ -1,0 +1,253 @@
+"""The fleet on a Dask cluster: its workers take sources as this machine's processes do, and ask for names alike.
+
+A source is two tasks. The first reads and compiles it until it asks for names, and returns with the question. The
+second, on the same worker where it can be, hands in the names, and ends with the outcome. So no task waits for another,
+and one whose worker died is run again elsewhere, by the scheduler, from the source: its names are known by then. A
+bundle is put in its place in one step, and is the same bytes whoever makes it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from converters.fetch import address_of
+from converters.runtimes.pool import RuntimePool
+from exporter.export.labels import read_labels
+from exporter.export.names import Claimed
+from exporter.export.pipeline import Exporter, ExportOptions
+from exporter.fleet.turns import Turns
+from exporter.fleet.worker import Claim, Outcome, Wanted, exported
+from exporter.version import __version__
+from signatures.errors import RuntimeUnavailableError, SourceError
+
+#: Seconds in which a scheduler answers.
+_PATIENCE = 15
+#: Sources at a time for each thread of a worker: one at work, one that waits for its names.
+_AHEAD = 2
+
+
+@dataclass(frozen=True)
+class Run:
+    """What every task of a run is told."""
+
+    identity: str
+    options: ExportOptions
+    wanted: Wanted
+
+
+# ------------------------------------------------------------------ on a worker
+
+
+class _Station:
+    """What a worker keeps from task to task: runtimes that have started, and sources that wait for their names."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.exporter, self.pool = Exporter(run.options), RuntimePool()
+        self.waiting: dict[Path, _Working] = {}
+        #: one source at a time, however many threads the worker has
+        self.lock = threading.Lock()
+
+    def close(self) -> None:
+        for working in self.waiting.values():
+            working.answers.put(None)
+        self.waiting.clear()
+        self.pool.__exit__(None, None, None)
+
+
+class _Working:
+    """A source in a thread of its own, which rests while its names are not known."""
+
+    def __init__(self, station: _Station, path: Path) -> None:
+        self.station, self.path = station, path
+        self.said: SimpleQueue[Claim | Outcome] = SimpleQueue()
+        self.answers: SimpleQueue[list[Claimed] | None] = SimpleQueue()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def claim(self, path: Path, names: Sequence[str]) -> list[Claimed]:
+        """As ``Naming`` says; raises SystemExit, which ends the thread, where the run has ended."""
+        self.said.put(Claim(self.path, names))
+        answer = self.answers.get()
+        if answer is None:
+            raise SystemExit
+        return answer
+
+    def _work(self) -> None:
+        station = self.station
+        try:
+            self.said.put(exported(station.exporter, self.path, self, station.pool, station.run.wanted))
+        except BaseException as error:
+            self.said.put(
+                Outcome(self.path, error=SourceError("was not exported", where=str(self.path), why=repr(error)))
+            )
+            raise
+
+
+_stations: dict[str, _Station] = {}
+_entering = threading.Lock()
+
+
+def _station(run: Run) -> _Station:
+    with _entering:
+        if run.identity not in _stations:
+            for left in list(_stations):  # of a run whose own process was killed
+                _stations.pop(left).close()
+            _stations[run.identity] = _Station(run)
+        return _stations[run.identity]
+
+
+def ask(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
+    """The worker's address, and what a source asks for; or its outcome, where it came to no names."""
+    from distributed import get_worker
+
+    station = _station(run)
+    with station.lock:
+        working = _Working(station, path)
+        said = working.said.get()
+        if isinstance(said, Claim):
+            station.waiting[path] = working
+        return get_worker().address, said
+
+
+def answer(run: Run, path: Path, names: list[Claimed]) -> Outcome:
+    """The outcome of a source under these names; from its beginning where it does not wait for them here."""
+    station = _station(run)
+    with station.lock:
+        working = station.waiting.pop(path, None)
+        if working is None:
+            working = _Working(station, path)
+            said = working.said.get()
+            if isinstance(said, Outcome):
+                return said
+        working.answers.put(names)
+        said = working.said.get()
+        assert isinstance(said, Outcome)
+        return said
+
+
+def leave(identity: str) -> None:
+    """End what a worker keeps of a run."""
+    with _entering:
+        station = _stations.pop(identity, None)
+    if station is not None:
+        station.close()
+
+
+def program_version() -> str:
+    """The version of this program on a worker."""
+    return __version__
+
+
+# ------------------------------------------------------------------ on the machine that asks
+
+
+@dataclass
+class Cluster:
+    """Sources spread over a cluster's workers: an executor of a fleet, as its own processes are."""
+
+    address: str
+    options: ExportOptions
+    wanted: Wanted
+    #: of the sources' first tasks, by the workers that they were on
+    turns: Turns[str]
+    paths: Sequence[Path]
+
+    def run(self) -> Iterator[Outcome]:
+        """What becomes of the sources, as it comes. Raises RuntimeUnavailableError."""
+        client = _connected(self.address)
+        run = Run(uuid.uuid4().hex, _anywhere(self.options), self.wanted)
+        try:
+            yield from self._outcomes(client, run)
+        finally:
+            client.run(leave, run.identity, on_error="ignore")
+            client.close()
+
+    def _outcomes(self, client: Any, run: Run) -> Iterator[Outcome]:
+        index: dict[Any, int] = {}
+        done = _dask(self.address).as_completed(loop=client.loop)
+        todo = iter(range(len(self.paths)))
+
+        def submit(number: int, function: Any, *given: Any, **where: Any) -> None:
+            # A source's place is its priority: names are given in that order.
+            future = client.submit(
+                function, run, _absolute(self.paths[number]), *given, pure=False, priority=-number, **where
+            )
+            index[future.key] = number
+            done.add(future)
+
+        for _, number in zip(range(_AHEAD * sum(client.nthreads().values())), todo, strict=False):
+            submit(number, ask)
+        for future in done:
+            number = index.pop(future.key)
+            worker, said = self._said(future, number)
+            if isinstance(said, Claim):
+                self.turns.asks(number, worker, replace(said, path=self.paths[number]))
+            else:
+                self.turns.ends(number)
+                if (following := next(todo, None)) is not None:
+                    submit(following, ask)
+                yield replace(said, path=self.paths[number])
+            for named, where, names in self.turns.answers():
+                submit(named, answer, names, workers=[where], allow_other_workers=True)
+
+    def _said(self, future: Any, number: int) -> tuple[str, Claim | Outcome]:
+        error = future.exception()
+        if error is None:
+            result = future.result()
+            future.release()
+            return result if isinstance(result, tuple) else ("", result)
+        path = self.paths[number]
+        failed = SourceError(
+            "was not exported by the cluster",
+            where=address_of(path) or str(path),
+            why=f"{type(error).__name__}: {error}",
+            fix="export it alone to see more; if memory ran out, give the workers more",
+        )
+        return "", Outcome(path, error=failed)
+
+
+def _dask(address: str) -> Any:
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise RuntimeUnavailableError(
+            f"--cluster {address} needs Dask", why=str(error), fix="pip install 'export-model[cluster]'"
+        ) from error
+
+
+def _connected(address: str) -> Any:
+    try:
+        client = _dask(address).Client(address, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise RuntimeUnavailableError(
+            f"no scheduler answers at {address}", why=str(error), fix="start one: dask scheduler"
+        ) from error
+    # A worker without this program gives an error for its version.
+    found = client.run(program_version, on_error="return") if client.nthreads() else {}
+    why = next((f"on {w} export-model is {v}, here {__version__}" for w, v in found.items() if v != __version__), None)
+    if why is None and found:
+        return client
+    client.close()
+    raise RuntimeUnavailableError(
+        f"the cluster at {address} cannot be used",
+        why=why or "it has no workers",
+        fix="start workers where this version of export-model is installed: dask worker ADDRESS --nthreads 1",
+    )
+
+
+def _anywhere(options: ExportOptions) -> ExportOptions:
+    """Options that say the same in another folder."""
+    golden = options.parity.golden
+    parity = options.parity if golden is None else replace(options.parity, golden=Path(golden).absolute())
+    return replace(options, out=_absolute(options.out), labels=read_labels(options.labels), parity=parity)
+
+
+def _absolute(path: Path) -> Path:
+    return path if address_of(path) is not None else path.absolute()

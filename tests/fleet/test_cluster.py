@@ -1,0 +1,102 @@
+"""A Dask cluster on this machine: a scheduler and two workers as processes, one of them killed midway."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from exporter.export.pipeline import ExportOptions
+from exporter.fleet.fleet import export_fleet
+from fixtures import path as fixture
+from signatures.errors import RuntimeUnavailableError
+from tests.commands import ROOT, export_model
+from tests.fleet.test_fleet import contents, lines
+
+distributed = pytest.importorskip("distributed")
+
+pytestmark = pytest.mark.runtimes
+
+NAMES = ("continuous", "discrete", "twobrains", "recurrent")
+COPIES = 6
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> list[Path]:
+    """Policies of the same names in many folders, and one that is none."""
+    for number in range(COPIES):
+        folder = tmp_path / f"run{number:02}"
+        folder.mkdir()
+        for name in NAMES:
+            shutil.copy(fixture(name), folder)
+    (tmp_path / "run03" / "broken.bytes").write_bytes(fixture("discrete").read_bytes()[:-700])
+    return sorted(tmp_path.glob("run*/*.bytes"))
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """The scheduler's address, and its workers."""
+    place = tmp_path / "scheduler.json"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__DAEMON": "false"}
+    log = (tmp_path / "dask.log").open("wb")
+
+    def start(*arguments: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "dask", *arguments, "--no-dashboard", "--scheduler-file", str(place)]
+        return subprocess.Popen(command, env=environment, cwd=tmp_path, stdout=log, stderr=log)
+
+    scheduler = start("scheduler", "--host", "127.0.0.1", "--port", "0")
+    workers = [start("worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny") for _ in range(2)]
+    try:
+        deadline = time.monotonic() + 120
+        while not place.exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        with distributed.Client(scheduler_file=str(place), set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=120)
+            address = client.scheduler.address
+        yield address, workers
+    finally:
+        for process in (*workers, scheduler):
+            process.terminate()
+        for process in (*workers, scheduler):
+            process.wait()
+        log.close()
+
+
+def test_a_worker_is_killed(
+    sources: list[Path], cluster: tuple[str, list[subprocess.Popen[bytes]]], tmp_path: Path
+) -> None:
+    address, workers = cluster
+    one = list(export_fleet(sources, ExportOptions(tmp_path / "one", verify="none")))
+    made = []
+    for outcome in export_fleet(sources, ExportOptions(tmp_path / "many", verify="none"), cluster=address):
+        made.append(outcome)
+        if len(made) == 5:
+            os.kill(workers[0].pid, signal.SIGKILL)
+    assert workers[0].wait() == -signal.SIGKILL
+    assert [o.path.name for o in made if o.error is not None] == ["broken.bytes"]
+    assert Counter(o.path for o in made) == Counter(o.path for o in one) == Counter(sources)
+    written = Counter(p.name for o in made for p in o.policies)
+    assert written == Counter(p.name for o in one for p in o.policies)
+    assert set(written.values()) == {1}
+    assert contents(tmp_path / "many") == contents(tmp_path / "one")
+    assert len({e["source"] for e in lines(tmp_path / "many" / ".exported.jsonl")}) == len(sources) - 1
+    assert len((tmp_path / "many" / ".exported.jsonl").read_text().splitlines()) == len(sources) - 1
+    ran = export_model(*sources[:2], "-o", tmp_path / "again", "--cluster", address, "--verify", "onnxruntime")
+    assert ran.status == 0, ran.err
+    assert "(2 verified)" in ran.out
+
+
+def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from exporter.fleet import cluster
+
+    monkeypatch.setattr(cluster, "_PATIENCE", 0.5)
+    with pytest.raises(RuntimeUnavailableError, match="no scheduler answers"):
+        list(export_fleet([fixture("discrete")], ExportOptions(tmp_path), cluster="tcp://127.0.0.1:9"))
