@@ -78,6 +78,7 @@ pictures: install browser
 bench: install
 	$(BIN)/python -m tests.bench
 	$(BIN)/python -m tests.bench.verification
+	$(BIN)/python -m tests.bench.throughput --write
 
 # A mutant has a number and is the same every time: python -m tests.fuzz --reader ONNX --keep 1234 writes it.
 N := 20000

@@ -13,6 +13,7 @@ import os
 import shutil
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,13 +22,19 @@ from converters.folders import LeftoverWarning, OwnFolder, left_in, sweep, taken
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _PREFIX = ".export-model-"
+#: To look through a folder of very many bundles takes long: where it took more than this of the processor (seconds), it
+#: is done again no sooner than so many times as long later.
+_QUICK, _REST = 2e-3, 100
+_next_look: dict[tuple[str, Path], float] = {}
 
 
 @contextlib.contextmanager
 def stage(place: Path) -> Iterator[Path]:
     """A new folder to fill, beside ``place``; what is left of it afterwards is removed. Raises OSError."""
     place.parent.mkdir(parents=True, exist_ok=True)
-    sweep(place.parent, _PREFIX)
+    with _looking("sweep", place.parent) as due:
+        if due:
+            sweep(place.parent, _PREFIX)
     with OwnFolder(place.parent, f"{_PREFIX}{place.name}-") as outer:
         new = outer / "new"
         new.mkdir()
@@ -50,12 +57,25 @@ def exchange(new: Path, place: Path) -> None:
 
 def recover(place: Path) -> None:
     """Put back what a run that was killed between two renames had moved out of ``place``. Raises OSError."""
-    if place.parent.is_dir() and not place.exists():
-        for left in left_in(place.parent, _PREFIX):
+    if not place.parent.is_dir() or place.exists():
+        return
+    with _looking("recover", place.parent) as due:
+        for left in left_in(place.parent, _PREFIX) if due else ():
             with taken(left) as ours:
                 if ours is not False and (left / "old" / place.name).is_dir() and not place.exists():
                     (left / "old" / place.name).rename(place)
                     shutil.rmtree(left, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _looking(purpose: str, folder: Path) -> Iterator[bool]:
+    """Whether a folder is to be looked through, which is what happens inside."""
+    now, begun = time.monotonic(), time.thread_time()
+    due = now >= _next_look.get((purpose, folder), 0.0)
+    yield due
+    took = time.thread_time() - begun
+    if due and took > _QUICK:
+        _next_look[purpose, folder] = now + _REST * took
 
 
 def _two_renames(new: Path, place: Path) -> None:

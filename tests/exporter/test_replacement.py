@@ -383,3 +383,14 @@ def test_what_is_swept_is_held_meanwhile(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(folders.shutil, "rmtree", look)
     folders.sweep(tmp_path, "x-")
     assert seen == [False]
+
+
+def test_a_folder_of_very_many_is_not_looked_through_for_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exchange, "_QUICK", -1.0)
+    monkeypatch.setattr(exchange, "_REST", 1e9)
+    monkeypatch.setattr(exchange, "_next_look", {})
+    for looks in (True, False):
+        left = folders.OwnFolder(tmp_path, exchange._PREFIX)
+        folders._forget(left.path)  # its process has died
+        with exchange.stage(tmp_path / "3DBall"):
+            assert left.path.exists() is not looks
