@@ -61,7 +61,7 @@ def recover(place: Path) -> None:
         return
     with _looking("recover", place.parent) as due:
         for left in left_in(place.parent, _PREFIX) if due else ():
-            with taken(left) as ours:
+            with contextlib.suppress(FileNotFoundError), taken(left) as ours:  # another process is done with its own
                 if ours is not False and (left / "old" / place.name).is_dir() and not place.exists():
                     (left / "old" / place.name).rename(place)
                     shutil.rmtree(left, ignore_errors=True)

@@ -394,3 +394,11 @@ def test_a_folder_of_very_many_is_not_looked_through_for_each(tmp_path: Path, mo
         folders._forget(left.path)  # its process has died
         with exchange.stage(tmp_path / "3DBall"):
             assert left.path.exists() is not looks
+
+
+def test_a_folder_that_goes_while_it_is_looked_at_is_nobodys_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two processes one may be done with its own while the other looks for what was left."""
+    monkeypatch.setattr(exchange, "left_in", lambda parent, prefix: iter([tmp_path / ".export-model-gone"]))
+    bundle.check_replaceable(tmp_path / "3DBall")
