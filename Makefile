@@ -79,6 +79,7 @@ bench: install
 	$(BIN)/python -m tests.bench
 	$(BIN)/python -m tests.bench.verification
 	$(BIN)/python -m tests.bench.throughput --write
+	$(BIN)/python -m tests.bench.big
 
 # A mutant has a number and is the same every time: python -m tests.fuzz --reader ONNX --keep 1234 writes it.
 N := 20000

@@ -62,7 +62,7 @@ class Network(Builder):
         self.at(module)
         weight = self.state.array(f"{module}.weight", out, self.width(x))
         bias = self.state.array(f"{module}.bias", len(weight))
-        product = matmul(self, x, self.const(weight.T.copy(), "kernel"))
+        product = matmul(self, x, self.const(weight.T, "kernel"))
         return self.add("BiasAdd", [product, self.const(bias, "bias")])
 
     def normalised(self, x: str, module: str) -> str:
@@ -83,8 +83,8 @@ class Network(Builder):
         self.at(module)
         flat = self.reshape(memory, (-1, 2 * hidden))
         h, c = self.slice(flat, 1, 0, hidden), self.slice(flat, 1, hidden, 2 * hidden)
-        product = self.add("MatMul", [x, self.const(kernel.T.copy(), "kernel")])
-        recurrent = self.const(inner.T.copy(), "recurrent_kernel")
+        product = self.add("MatMul", [x, self.const(kernel.T, "kernel")])
+        recurrent = self.const(inner.T, "recurrent_kernel")
         result, cell = lstm(self, product, h, c, recurrent, np.asarray(bias, FLOAT32), "ifgo")
         return result, self.reshape(self.concat([result, cell], 1), (-1, 1, 2 * hidden))
 
@@ -120,13 +120,13 @@ class Network(Builder):
             h = self.slice(memory, 1, layer * hidden, (layer + 1) * hidden)
             if gates == 4:
                 c = self.slice(memory, 1, (layers + layer) * hidden, (layers + layer + 1) * hidden)
-                product = self.add("MatMul", [x, self.const(kernel.T.copy(), "kernel")])
-                recurrent = self.const(inner.T.copy(), "recurrent_kernel")
+                product = self.add("MatMul", [x, self.const(kernel.T, "kernel")])
+                recurrent = self.const(inner.T, "recurrent_kernel")
                 x, cell = lstm(self, product, h, c, recurrent, biases[0] + biases[1], "ifgo")
                 after["c"].append(cell)
             else:
                 order = (1, 0, 2)  # PyTorch has r, z, n; the layer is given z, r, n
-                parts = [np.split(w, 3)[i].T.copy() for w in (kernel, inner) for i in order]
+                parts = [np.split(w, 3)[i].T for w in (kernel, inner) for i in order]
                 kernels = [self.const(w, "kernel") for w in parts]
                 shifts = [np.split(v, 3)[i] for v in biases for i in order]
                 x = gru(self, x, h, kernels[:3], kernels[3:], shifts, linear_before_reset=True)

@@ -21,6 +21,8 @@ class Cost:
 
     seconds: float
     peak_mib: float
+    #: seconds of the processor
+    processor: float = 0.0
 
 
 def measure(command: Sequence[str], env: Mapping[str, str]) -> Cost:
@@ -40,4 +42,4 @@ def measure(command: Sequence[str], env: Mapping[str, str]) -> Cost:
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if usage.ru_maxrss <= own:
         raise RuntimeError(f"{command[0]} needs less memory than the process that measures it")
-    return Cost(seconds, usage.ru_maxrss * _UNIT / 2**20)
+    return Cost(seconds, usage.ru_maxrss * _UNIT / 2**20, usage.ru_utime + usage.ru_stime)
