@@ -1,8 +1,9 @@
 """Inputs to try a policy on, drawn from the policy itself and seeded.
 
 Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, 30 to 300, 1e3, float32
-denormals, every two inputs at opposite extremes, all but one action masked, a memory far from zero), images in 0..1,
-pixels at their ends, batches of 1, 2 and 7, and a large odd one (a smaller one of large images).
+denormals, every two inputs at opposite extremes, all but one action masked, a memory far from zero), in the patterns
+that observations have (one number alone, zeros and ones …), images in 0..1, dim and bright, pixels at their ends,
+batches of 1 to 8, and a large odd one (a smaller one of large images).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
 #: Tried once; with images, which take long, the largest whose pixels are no more than these.
-LARGE_BATCH = 131
+LARGE_BATCH = 259
 LARGE_BATCHES_OF_IMAGES = (67, 33, 17, 9)
 MAX_PIXELS = 1 << 21
 #: Values that are far from typical ones and near enough to be met: between eight deviations and 1e3.
@@ -45,8 +46,8 @@ class Case:
         return {n: np.where(denormal[n], 0, a).astype(a.dtype) if n in denormal else a for n, a in self.feeds.items()}
 
 
-#: A memory far from zero, in its standard deviations: what an LSTM's cell may reach.
-_FAR_MEMORY = 5.0
+#: How far noise goes in the cases that are not typical: a draw of N(0, 1) hardly ever does.
+_FAR_NOISE = 6.0
 
 #: Quoted: naming the generator's class would load numpy.random, which an export that verifies nothing does not need.
 Style: TypeAlias = "Callable[[np.random.Generator, TensorSpec, tuple[int, ...]], np.ndarray]"
@@ -69,16 +70,16 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     large = _large_batch(signature)
     if any(s.role is Role.VISUAL for s in signature.inputs):
         cases.append(_case(signature, rng, "pixels at their ends", 3, _pixel_ends))
-        cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
+        cases.append(_case(signature, rng, f"typical, batch {large}", large, _light))
         if any(_is_free(s) for s in signature.inputs):
             cases.append(_case(signature, rng, "30 to 300", len(FAR), _far(signature, few=True)))
         return cases
     cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
-    if not any(_is_free(s) for s in signature.inputs):
-        return cases
-    pattern = len(_opposed(signature))
-    cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature)))
-    cases.append(_case(signature, rng, "30 to 300", pattern * len(FAR), _far(signature)))
+    if any(_is_free(s) for s in signature.inputs):
+        pattern = len(_opposed(signature))
+        cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature)))
+        cases.append(_case(signature, rng, "30 to 300", pattern * len(FAR), _far(signature)))
+    cases += [_case(signature, rng, name, batch, style) for name, batch, style in _PATTERNS]
     return cases
 
 
@@ -121,16 +122,19 @@ def _other(
         return np.stack([rng.integers(0, sizes[min(i, len(sizes) - 1)], shape[0]) for i in range(shape[1])], axis=1)
     if spec.role is Role.VISUAL:
         pixels = _ends(rng, shape) if style is _pixel_ends else rng.random(shape)
+        if style is _light:
+            pixels = _dim_and_bright(rng, pixels)
         return pixels * float((spec.distribution or {}).get("high", 1.0))
+    drawn = style in (_typical, _light, _pixel_ends)
     if spec.role is Role.NOISE:
-        return rng.standard_normal(shape)
+        return rng.standard_normal(shape) if drawn else rng.uniform(-_FAR_NOISE, _FAR_NOISE, shape)
     if spec.role is Role.MEMORY_IN:
-        return rng.standard_normal(shape) * (_FAR_MEMORY if style in (_clip_edges, _beyond) else 0.5)
+        return rng.standard_normal(shape) * _MEMORIES.get(style, 0.5)
     if np.dtype(spec.dtype).kind in "iu":
         high = int((spec.distribution or {}).get("high", 1))
         return rng.integers(0, high + 1, shape)
     if spec.role is Role.PARAMETER:
-        return rng.random(shape)
+        return rng.random(shape) if style not in (_equal, _whole) else style(rng, spec, shape)
     return style(rng, spec, shape)
 
 
@@ -144,6 +148,18 @@ def _statistics(spec: TensorSpec) -> tuple[np.ndarray, np.ndarray]:
 def _typical(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     mean, std = _statistics(spec)
     return np.asarray(mean + std * rng.standard_normal(shape))
+
+
+def _light(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """Of images, which are dim, bright, flat; what else is observed is typical."""
+    return _typical(rng, spec, shape)
+
+
+def _dim_and_bright(rng: np.random.Generator, pixels: np.ndarray) -> np.ndarray:
+    """Images of which each has a range of its own within 0..1, but for the first third."""
+    low, high = np.sort(rng.random((2, len(pixels), *(1,) * (pixels.ndim - 1))), axis=0)
+    low[: len(pixels) // 3], high[: len(pixels) // 3] = 0, 1
+    return np.asarray(low + (high - low) * pixels)
 
 
 def _pixel_ends(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
@@ -174,6 +190,43 @@ def _beyond(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) 
 
 def _large(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(1e3 * rng.choice([-1.0, 1.0], shape))
+
+
+def _alone(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """One number is 1, the others are 0."""
+    count = _numbers((None, *shape[1:]))
+    return np.eye(count)[rng.integers(0, count, shape[0] if shape else 1)].reshape(shape)
+
+
+def _bits(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    return rng.integers(0, 2, shape).astype(np.float64)
+
+
+def _equal(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """All numbers of a row are the same one."""
+    rows = rng.uniform(-3.0, 3.0, (*shape[:1], *(1,) * (len(shape) - 1)))
+    return np.asarray(np.broadcast_to(rows, shape))
+
+
+def _near_zero(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    return np.asarray(0.01 * rng.standard_normal(shape))
+
+
+def _whole(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    return rng.integers(-9, 10, shape).astype(np.float64)
+
+
+#: What observations often look like though no statistics say so, each with another number of rows.
+_PATTERNS: tuple[tuple[str, int, Style], ...] = (
+    ("one number alone", 3, _alone),
+    ("zeros and ones", 4, _bits),
+    ("all numbers equal", 5, _equal),
+    ("near zero", 6, _near_zero),
+    ("whole numbers", 8, _whole),
+)
+
+#: A memory far from zero, in its standard deviations: what an LSTM's cell may reach, soon and after long.
+_MEMORIES: dict[Style, float] = {_clip_edges: 5.0, _beyond: 5.0, _whole: 50.0}
 
 
 def _denormals(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:

@@ -105,6 +105,13 @@ def _refuse_links(group: Any, h5py: Any, depth: int = 0) -> None:
             raise DamagedFileError(f"its {key!r} lies in another file", fix="save the model again, in one file")
 
 
+def stateful_layer(config: Any) -> str | None:
+    """The first layer that keeps its state in itself from call to call."""
+    inner = (entry.get("config") for entry in _objects(config))
+    named = (str(c.get("name")) for c in inner if isinstance(c, dict) and c.get("stateful") is True)
+    return next(named, None)
+
+
 def refuse_code(config: Any) -> None:
     """Raise NotAPolicyError where a configuration names anything but layers and settings of Keras itself."""
     for named in _objects(config):

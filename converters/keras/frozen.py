@@ -12,7 +12,7 @@ from pathlib import Path
 
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.runtimes.python import child_command
-from converters.saved_model.signature import ModelSignature, Tensor
+from converters.saved_model.signature import ModelSignature, signature_of
 from signatures.errors import RuntimeUnavailableError, SourceError
 
 _CHILD = "converters.runtimes.tensorflow.freeze_child"
@@ -39,5 +39,4 @@ def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
             fix="load it where it was made, and save it as a SavedModel with a signature, or freeze it to a GraphDef",
         ) from error
     names = json.loads(answer["names"].tobytes())
-    tensors = [{key: Tensor(name) for key, name in names[side].items()} for side in ("inputs", "outputs")]
-    return answer["graph"].tobytes(), ModelSignature(tensors[0], tensors[1], names["signature"])
+    return answer["graph"].tobytes(), signature_of(names["inputs"], names["outputs"], names["signature"])

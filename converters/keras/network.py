@@ -24,7 +24,7 @@ _MAX_DEPTH = 32
 #: What a layer may be told in a call, beside its tensors.
 _ARGUMENTS = frozenset(
     (
-        *("initial_state", "query", "value", "key", "attention_mask", "mask"),
+        *("initial_state", "states", "query", "value", "key", "attention_mask", "mask"),
         *("use_causal_mask", "return_attention_scores"),
     )
 )

@@ -18,13 +18,13 @@ from converters.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph
 from converters.graph.ops.base import MISFIT
 from converters.graph.ops.table import is_fed
-from converters.keras.config import config_of, refuse_code
+from converters.keras.config import config_of, refuse_code, stateful_layer
 from converters.keras.frozen import frozen_by_tensorflow
 from converters.keras.hdf5 import stored_in
 from converters.keras.model import model_of
 from converters.keras.network import Network, UnknownLayerError
 from converters.keras.weights import Groups, Listed, Weights
-from converters.saved_model.signature import declared, expose, output_names
+from converters.saved_model.signature import declared, expose, exposed, output_names
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError, RuntimeUnavailableError
@@ -39,27 +39,43 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     RuntimeUnavailableError without h5py; SourceError and its kinds.
     """
     try:
-        model = _as_data(given)
-        return [_beside_keras(model, given.path) if options.trust_source else model]
-    except UnknownLayerError as error:
-        if options.trust_source:
-            return [_through_keras(given.path)]
-        fix = "--trust-source (trust_source=True) has Keras itself load it, if you know where it comes from"
-        raise UnknownLayerError(error.what, why=error.why, fix=f"{fix}; or save it without that layer") from error
+        config, weights, version = _stored(given)
     except RuntimeUnavailableError:
         if options.trust_source:
             return [_through_keras(given.path)]
         raise
+    stateful = stateful_layer(config)
+    try:
+        model = layered((given.path,), config, weights, version)
+    except UnknownLayerError as error:
+        if not options.trust_source:
+            fix = "--trust-source (trust_source=True) has Keras itself load it, if you know where it comes from"
+            raise UnknownLayerError(error.what, why=error.why, fix=f"{fix}; or save it without that layer") from error
+        if stateful is None:
+            return [_through_keras(given.path)]
+        raise UnknownLayerError(
+            error.what,
+            why=f"Keras itself could load it, but its layer {stateful!r} keeps its state in itself: what TensorFlow "
+            "freezes of that has no memory",
+            fix="save it with the state as an input and an output (initial_state=…, return_state=True)",
+        ) from error
+    if not options.trust_source:
+        return [model]
+    if stateful is None:
+        return [_beside_keras(model, given.path)]
+    note = f"not compared with Keras' own run: its layer {stateful} keeps its state in itself"
+    return [replace(model, facts=replace(model.facts, notes=(*model.facts.notes, note)))]
 
 
-def _as_data(given: Fetched) -> SourceModel:
+def _stored(given: Fetched) -> tuple[Any, Weights, str]:
+    """(the configuration, the weights, Keras' version) of a file. Raises NotAPolicyError where it names code."""
     path = given.path
     if given.data.startswith(b"PK"):
         config = config_of(path)
         refuse_code(config)
         stored = stored_in(path)
         version = str((config_of(path, "metadata.json") or {}).get("keras_version", ""))
-        return layered((path,), config, Groups({name: a for (_, name), a in stored.arrays.items()}), version)
+        return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version
     stored = stored_in(path)
     if stored.config is None:
         raise DamagedFileError(
@@ -73,7 +89,7 @@ def _as_data(given: Fetched) -> SourceModel:
         raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
     refuse_code(config)
     entries = [(name, array) for (_, name), array in stored.arrays.items()]
-    return layered((path,), config, Listed(entries, [layer for layer, _ in stored.arrays]), stored.version or "")
+    return config, Listed(entries, [layer for layer, _ in stored.arrays]), stored.version or ""
 
 
 def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str) -> SourceModel:
@@ -131,6 +147,5 @@ def _through_keras(path: Path) -> SourceModel:
     """What TensorFlow freezes of the model that Keras builds."""
     data, signature = frozen_by_tensorflow(path)
     definition = schema.parse(schema.GraphDef, data, "TensorFlow graph")
-    graph, roles = expose(from_graph_def(definition), signature)
-    original = OriginalRun("tensorflow", path, definition=definition)
-    return SourceModel(graph, (path,), SourceFacts(roles=roles, outputs=declared(signature)), None, original)
+    graph, facts = exposed(from_graph_def(definition), signature)
+    return SourceModel(graph, (path,), facts, None, OriginalRun("tensorflow", path, definition=definition))

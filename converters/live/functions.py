@@ -13,9 +13,8 @@ from typing import Any
 
 from converters.frozen_graph.reader import read_graph
 from converters.runtimes.tensorflow.freeze import keras_call, keras_outputs, named_function, saved_function
-from converters.saved_model.signature import ModelSignature, Tensor, expose
+from converters.saved_model.signature import exposed, signature_of
 from converters.source import OriginalRun, SourceModel
-from converters.understand.facts import SourceFacts
 from signatures.errors import SourceError, UsageError
 
 NAME = "policy"
@@ -119,8 +118,7 @@ def _read(tensorflow: Any, concrete: Callable[[], Any], folder: Path, name: str)
             fix="give a function of tensors that returns a tensor or a dictionary of tensors; see that "
             "tf.saved_model.save writes it",
         ) from error
-    sides = [{key: Tensor(tensor) for key, tensor in side.items()} for side in (frozen.inputs, frozen.outputs)]
     graph = read_graph(frozen.graph_def.SerializeToString(deterministic=True))
-    graph, roles = expose(graph, ModelSignature(sides[0], sides[1], frozen.signature))
+    graph, facts = exposed(graph, signature_of(frozen.inputs, frozen.outputs, frozen.signature))
     options = {"kind": "function", "form": "saved_model", "signature": frozen.signature}
-    return SourceModel(graph, (), SourceFacts(roles=roles), name, OriginalRun("tensorflow", folder, options))
+    return SourceModel(graph, (), facts, name, OriginalRun("tensorflow", folder, options))

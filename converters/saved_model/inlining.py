@@ -15,7 +15,7 @@ from typing import Any
 from converters import schema
 from converters.frozen_graph.subgraph import COMPUTING, is_pivot
 from converters.graph.nodes import NameScope, Node, ref, split_ref
-from converters.graph.ops.outside import CALLING, IFS, ORDERING, READS, WHILES
+from converters.graph.ops.outside import CALLING, EFFECTS, IFS, ORDERING, READS, WHILES
 from converters.graph.ops.table import RESULTS, unsupported
 from signatures.errors import DamagedFileError, NotAPolicyError
 
@@ -94,6 +94,12 @@ class _Flattening:
     def _check(self, nodes: Iterable[Any]) -> None:
         refused = [n for n in nodes if n.op not in _ALLOWED and n.op not in self.functions]
         if refused and not self.restoring:
+            if changed := next((n for n in refused if n.op.startswith(EFFECTS)), None):
+                raise NotAPolicyError(
+                    f"the SavedModel writes to a variable whenever it is called (node {changed.name!r}, {changed.op})",
+                    why="it keeps a memory in itself, which a frozen graph does not have",
+                    fix="save it with the memory as an input and an output; or without what counts or learns",
+                )
             raise unsupported(Node(n.name, n.op) for n in refused)
 
     def _resolved(self, reference: str) -> str:

@@ -9,7 +9,7 @@ does not name is no output.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any
 
@@ -21,6 +21,7 @@ from converters.graph.ops.table import is_fed
 from converters.graph.types import Symbols, TensorType
 from converters.renaming import renamed
 from converters.schema import dtype_number
+from converters.understand.facts import SourceFacts
 from converters.understand.inputs import role_by_name
 from converters.understand.memories import float_rows, paired_memories
 from signatures.contract import EMBEDDED
@@ -61,6 +62,18 @@ class ModelSignature:
         return inputs, outputs
 
 
+def signature_of(inputs: Mapping[str, Any], outputs: Mapping[str, Any], key: str) -> ModelSignature:
+    """What TensorFlow says of a function that it froze: each tensor's name, dtype, and shape or None."""
+    inward, outward = (
+        {
+            k: Tensor(name, np.dtype(kind), TensorShape(None if shape is None else tuple(shape)))
+            for k, (name, kind, shape) in side.items()
+        }
+        for side in (inputs, outputs)
+    )
+    return ModelSignature(inward, outward, key)
+
+
 def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Role]]:
     """(the graph with its outputs under telling names, the roles that the inputs' keys say).
 
@@ -99,6 +112,13 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
 def declared(signature: ModelSignature) -> dict[str, Role | None]:
     """The outputs that a signature declares, as they are called once exposed, with the roles that their names say."""
     return {name: OUTPUT_NAMES.get(name.rpartition("/")[2]) for name in output_names(signature).values()}
+
+
+def exposed(graph: Graph, signature: ModelSignature, notes: Sequence[str] = ()) -> tuple[Graph, SourceFacts]:
+    """The graph with its outputs under telling names, and what its signature says of it. Raises DamagedFileError."""
+    graph, roles = expose(graph, signature)
+    memories = memories_of(signature, roles)
+    return graph, SourceFacts(roles=roles, outputs=declared(signature), memories=memories, notes=tuple(notes))
 
 
 def memories_of(signature: ModelSignature, roles: Mapping[str, Role]) -> tuple[SeparateMemory, ...]:

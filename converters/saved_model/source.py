@@ -18,9 +18,8 @@ from converters.frozen_graph import source as frozen_graph
 from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
-from converters.saved_model.signature import ModelSignature, declared, expose, fed_by_signature, memories_of
+from converters.saved_model.signature import ModelSignature, exposed, fed_by_signature
 from converters.source import OriginalRun, SourceModel
-from converters.understand.facts import SourceFacts
 from signatures.errors import NotAPolicyError
 from signatures.records import dataclass
 
@@ -43,13 +42,7 @@ def read(given: Fetched) -> list[SourceModel]:
     graph, contract = recalled(frozen.graph)
     facts = facts_of(graph, contract)
     if contract is None:
-        graph, roles = expose(frozen.graph, frozen.signature)
-        facts = SourceFacts(
-            roles=roles,
-            outputs=declared(frozen.signature),
-            memories=memories_of(frozen.signature, roles),
-            notes=_notes(saved),
-        )
+        graph, facts = exposed(frozen.graph, frozen.signature, _notes(saved))
     original = OriginalRun("tensorflow", folder, definition=frozen.definition, detached=saved.detached)
     return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
 

@@ -12,11 +12,10 @@ from converters.bundle.embed import contract_of, facts_of, redrawn
 from converters.fetch import Fetched
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.renaming import renamed
-from converters.saved_model.signature import declared, expose, memories_of
+from converters.saved_model.signature import exposed
 from converters.source import SourceModel
 from converters.tfjs.reader import content_of, model_file, read_model, weights_of
 from converters.tfjs.unfuse import unfuse
-from converters.understand.facts import SourceFacts
 from signatures.contract import Contract
 
 
@@ -28,16 +27,8 @@ def read(given: Fetched) -> list[SourceModel]:
     model = read_model(given)
     graph = unfuse(model.graph)
     if model.contract is None:
-        graph, roles = expose(graph, model.signature)
-        return [
-            SourceModel(
-                graph,
-                model.files,
-                SourceFacts(
-                    roles=roles, outputs=declared(model.signature), memories=memories_of(model.signature, roles)
-                ),
-            )
-        ]
+        graph, facts = exposed(graph, model.signature)
+        return [SourceModel(graph, model.files, facts)]
     contract = contract_of(model.contract)
     graph = _retyped(redrawn(graph, contract), contract)
     return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]

@@ -119,8 +119,13 @@ def test_a_denormal_that_is_taken_for_zero_is_no_fault(tmp_path: Path, processes
 
 
 REGIONS = {
-    "rows from the 65th on": lambda x: np.arange(len(x)) >= 64,
-    "the last of an odd number of rows": lambda x: np.arange(len(x)) == 130,
+    "rows from the 257th on": lambda x: np.arange(len(x)) >= 256,
+    "the last of an odd number of rows": lambda x: np.arange(len(x)) == 258,
+    "the third of three": lambda x: (np.arange(len(x)) == 2) & (len(x) == 3),
+    "one number alone": lambda x: (x != 0).sum(1) == 1,
+    "zeros and ones": lambda x: np.isin(x, (0, 1)).all(1) & (x.sum(1) > 1),
+    "all numbers equal": lambda x: (x == x[:, :1]).all(1) & (np.abs(x[:, 0]) % 5 > 0),
+    "near zero": lambda x: (np.abs(x).max(1) < 0.1) & (np.abs(x).max(1) > 1e-6),
     "large observations": lambda x: (np.abs(x) > 12).any(1) & (np.abs(x) < 900).all(1),
     "opposite extremes": lambda x: (x[:, 0] > 4) & (x[:, 5] < -4),
     "far and opposite": lambda x: (x[:, 7] < -200) & (x[:, 6] > 200) & (np.abs(x) < 900).all(1),
@@ -137,6 +142,7 @@ IMAGES = {
     "rows from the 65th on": lambda x: np.arange(len(x)) >= 64,
     "black": lambda x: (x == 0).all((1, 2, 3)),
     "white": lambda x: (x == 1).all((1, 2, 3)),
+    "dim": lambda x: (x.max((1, 2, 3)) < 0.5) & (x > 0).any((1, 2, 3)),
 }
 
 
@@ -176,6 +182,16 @@ def test_a_memory_that_is_clipped_is_met(tmp_path: Path, processes: RuntimePool)
 
     report = verified("recurrent", tmp_path, processes, honest, clipped)
     assert "recurrent_out" in {f.output for f in report.failures if f.kind == "numbers"}
+
+
+def test_noise_that_is_clipped_is_met(tmp_path: Path, processes: RuntimePool) -> None:
+    """At 3, which a draw is beyond once in 370."""
+
+    def clipped(feeds: Feeds) -> Feeds:
+        return {**feeds, "epsilon": np.clip(feeds["epsilon"], -3, 3)} if "epsilon" in feeds else feeds
+
+    report = verified("continuous", tmp_path, processes, honest, clipped)
+    assert "action" in {f.output for f in report.failures if f.kind == "numbers"}
 
 
 # ------------------------------------------------------------------ draws
@@ -226,6 +242,14 @@ def test_branches_that_are_drawn_from_one_seed_are_seen() -> None:
     p_value, branch, _ = least_likely(np.stack([once, once], axis=2), both, (3, 3))
     assert p_value < 1e-6
     assert branch == 1
+
+
+def test_classes_of_another_dtype_are_met(tmp_path: Path, processes: RuntimePool) -> None:
+    def narrow(feeds: Feeds, answers: Arrays) -> Arrays:
+        return {n: a.astype(np.int32) if n == "action" else a for n, a in answers.items()}
+
+    report = verified("sampled", tmp_path, processes, narrow)
+    assert any("int32" in f.reason for f in report.failures if f.output == "action")
 
 
 # ------------------------------------------------------------------ weights

@@ -67,6 +67,13 @@ def with_states(x: Any) -> Any:
     return [value, h, c]
 
 
+def cells(x: Any) -> list[Any]:
+    """Cells that are called by themselves, with the states that they are given."""
+    states = [k.Dense(5)(x) for _ in range(2)]
+    value, (h, c) = k.LSTMCell(5)(x, states)
+    return [value, h, c, k.GRUCell(5)(x, states[:1])[0], k.SimpleRNNCell(5)(x, states=states[:1])[0]]
+
+
 def operations(x: Any) -> Any:
     value = keras.ops.clip(x, -1, 1) + keras.ops.mean(x, axis=1, keepdims=True)
     value = keras.ops.concatenate([value, x[:, :2], 1.0 - x[:, 2:5]], axis=-1) * 2.0
@@ -197,6 +204,7 @@ MODELS: dict[str, Model] = {
         ],
     ),
     "lstm with states": of_one([3, 4], with_states),
+    "cells": of_one([4], cells),
     "bidirectional lstm": of_one(
         [4, 3],
         lambda x: [

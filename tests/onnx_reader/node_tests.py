@@ -265,13 +265,11 @@ def _stem(name: str) -> str:
 def main() -> None:
     """Run all, print what is wrong, write the page."""
     found = []
-    pool = RuntimePool()
-    with tempfile.TemporaryDirectory() as folder:
+    with RuntimePool() as pool, tempfile.TemporaryDirectory() as folder:
         for test in collected():
             found.append((test, outcome(test, Path(folder), pool)))
             if found[-1][1].state == "wrong":
                 print(test.name, found[-1][1].reason, flush=True)
-    pool.close()
     PAGE.write_text(page(found), encoding="utf-8")
     print(Counter(o.state for _, o in found))
 

@@ -213,14 +213,19 @@ def keras(folder: Path) -> None:
     model.save(folder / "policy.h5")
     model.export(folder / "exported")
     keep(folder, "keras", feeds, results)
-    beyond = tf.keras.Model(observation, tf.keras.layers.Dense(2, activation="sparse_plus", name="action")(observation))
+    h, last = tf.keras.Input([4], name="h_in"), tf.keras.layers.Dense(2, activation="sparse_plus", name="action")
+    value, (after,) = tf.keras.layers.GRUCell(4)(observation, [h])
+    beyond = tf.keras.Model([observation, h], {"action": last(value), "h_out": after})
     beyond.save(folder / "beyond.keras")
-    keep(
-        folder,
-        "beyond",
-        {"vector_observation": feeds["vector_observation"]},
-        {"action": beyond(*[*feeds.values()][:1])},
-    )
+    feeds = {"vector_observation": feeds["vector_observation"], "recurrent_in": draw(3, 4)}
+    results = beyond([*feeds.values()])
+    keep(folder, "beyond", feeds, {"action": results["action"], "recurrent_out": results["h_out"]})
+    one = tf.keras.Input(batch_shape=[1, 1, 6])
+    kept = tf.keras.layers.GRU(4, stateful=True, unroll=True)(one)
+    tf.keras.Model(one, last(kept)).save(folder / "stateful.keras")
+    inside = tf.keras.Model(one, kept)
+    inside.export(folder / "stateful", verbose=False)
+    inside.save(folder / "kept.keras")
 
 
 def history(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,20 @@ def test_keras_is_loaded_only_where_the_caller_trusts_it(models: Path) -> None:
     ) as caught:
         read_source(models / "beyond.keras")
     assert "--trust-source" in str(caught.value.fix)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("stateful.keras", "its layer 'gru.*' keeps its state in itself"), ("stateful", "it keeps a memory in itself")],
+)
+def test_a_memory_that_a_model_keeps_in_itself_is_not_lost(models: Path, name: str, words: str) -> None:
+    """As constants, its variables would be the zeros of the first step; read as data, the layer gives them out."""
+    with pytest.raises(NotAPolicyError) as caught:
+        read_source(models / name, TRUSTED).policies()
+    assert re.search(words, str(caught.value.why))
+    (policy,) = read_source(models / "kept.keras", TRUSTED).policies()
+    assert policy.signature.memory is not None
+    assert any("keeps its state in itself" in note for note in policy.signature.notes)
 
 
 @pytest.mark.parametrize("name", ["policy.keras", "policy.h5"])

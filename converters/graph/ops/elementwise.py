@@ -160,8 +160,15 @@ def _lower_floor_mod(node: Node, builder: OnnxBuilder) -> Any:
     a, b = (builder.value(r) for r in node.inputs)
     if builder.type_of(node.inputs[0]).dtype.kind != "f":
         return builder.emit("Mod", [a, b])
-    whole = builder.emit("Floor", [builder.emit("Div", [a, b])])
-    return builder.emit("Sub", [a, builder.emit("Mul", [whole, b])])
+    if builder.opset < 10:
+        whole = builder.emit("Floor", [builder.emit("Div", [a, b])])
+        return builder.emit("Sub", [a, builder.emit("Mul", [whole, b])])
+    # What C's fmod leaves has the dividend's sign, and is exact; a divisor more where that is not the divisor's.
+    zero = scalar(builder, node, 0.0)
+    rest = builder.emit("Mod", [a, b], fmod=1)
+    signs = builder.emit("Xor", [builder.emit("Less", [rest, zero]), builder.emit("Less", [b, zero])])
+    left = builder.emit("Not", [builder.emit("Equal", [rest, zero])])
+    return builder.emit("Where", [builder.emit("And", [left, signs]), builder.emit("Add", [rest, b]), rest])
 
 
 def _lower_not_equal(node: Node, builder: OnnxBuilder) -> Any:

@@ -1,4 +1,4 @@
-"""LSTM, GRU and SimpleRNN over a history [B, T, n], written out step by step; their cells, stacked; both directions."""
+"""LSTM, GRU and SimpleRNN over a history [B, T, n], written out step by step; their cells, stacked or alone."""
 
 from __future__ import annotations
 
@@ -145,6 +145,20 @@ def _recurrent(step: Step) -> list[str]:
     return [result, *(states if step.get("return_state") else ())]
 
 
+def _one_step(step: Step) -> list[str]:
+    """A cell that is called by itself: what it gives, then its new states."""
+    b = step.net
+    given = [*step.tensors[1:], *(step.kwargs.get("states") or ())]
+    cell = _cell(step, step.layer.kind, b.length(step.x, step.rank - 1))
+    if step.rank != 2 or tuple(b.length(s, -1) for s in given) != cell.widths:
+        raise DamagedFileError(f"the cell {step.path!r} is given other tensors than its own", fix=_SAVE_AGAIN)
+    states = cell.turn(step.x, given)
+    for taken_in, given_out in zip(given, states, strict=True):
+        if b.nodes[b.position[taken_in]].op == "Placeholder":
+            b.states[taken_in] = given_out
+    return [states[0], *states]
+
+
 def _bidirectional(step: Step) -> list[str]:
     """The layer forwards, and one like it backwards, its sequence turned round; joined as ``merge_mode`` says."""
     b = step.net
@@ -178,5 +192,6 @@ def _bidirectional(step: Step) -> list[str]:
 
 LAYERS: Mapping[str, Translate] = {
     **dict.fromkeys(("LSTM", "GRU", "SimpleRNN", "RNN"), _recurrent),
+    **dict.fromkeys(("LSTMCell", "GRUCell", "SimpleRNNCell"), _one_step),
     "Bidirectional": _bidirectional,
 }

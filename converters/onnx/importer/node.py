@@ -32,6 +32,10 @@ DTYPES: Mapping[int, np.dtype] = {
 }
 
 
+#: What TensorProto calls the types that are not read.
+_UNREAD = {0: "undefined", 8: "string", 12: "uint32", 13: "uint64", 14: "complex64", 15: "complex128"}
+
+
 @dataclass(frozen=True, slots=True)
 class Op:
     """One ONNX node. ``inputs`` are references into the new graph, None for one that is left out.
@@ -101,7 +105,8 @@ class Op:
         """A data type attribute; raises UnsupportedOpError for types that no target has."""
         number = self.integer(name, default)
         if number not in DTYPES:
-            raise self.refused(f"{name} {number} is a data type that is not converted", "policies compute in float32")
+            kind = _UNREAD.get(number, number)
+            raise self.refused(f"{name} {kind} is a data type that is not converted", "policies compute in float32")
         return DTYPES[number]
 
     def refused(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:

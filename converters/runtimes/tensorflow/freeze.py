@@ -11,14 +11,19 @@ from typing import Any
 from converters.graph.ops.outside import FUNCTIONAL
 from signatures.records import dataclass
 
+TypedTensor = tuple[str, str, list[int | None] | None]
+
 
 @dataclass(frozen=True)
 class FrozenFunction:
-    """A flat GraphDef, and which of its tensors are the function's arguments and results, by their names."""
+    """A flat GraphDef, and which of its tensors are the function's arguments and results, by their names.
+
+    A tensor is its name, its dtype's, and its shape (None: unknown) with None for a free axis.
+    """
 
     graph_def: Any
-    inputs: dict[str, str]
-    outputs: dict[str, str]
+    inputs: dict[str, TypedTensor]
+    outputs: dict[str, TypedTensor]
     signature: str
 
 
@@ -52,10 +57,14 @@ def frozen_function(path: str, form: str, signature: str | None = None) -> Froze
     frozen = convert_variables_to_constants_v2(function, lower_control_flow=True)
     return FrozenFunction(
         _ordered(frozen.graph.as_graph_def(), [t.op.name for t in frozen.inputs]),
-        dict(zip(names, (t.name for t in frozen.inputs), strict=True)),
-        dict(zip(keys, (t.name for t in frozen.outputs), strict=True)),
+        dict(zip(names, map(_typed, frozen.inputs), strict=True)),
+        dict(zip(keys, map(_typed, frozen.outputs), strict=True)),
         used,
     )
+
+
+def _typed(tensor: Any) -> TypedTensor:
+    return tensor.name, tensor.dtype.name, None if tensor.shape.rank is None else tensor.shape.as_list()
 
 
 def _ordered(graph_def: Any, first: Sequence[str]) -> Any:
@@ -120,6 +129,9 @@ def keras_call(model: Any) -> tuple[Callable[..., Any], list[Any], list[str]]:
 def keras_outputs(model: Any, count: int) -> list[str]:
     """What a Keras model calls its outputs, each its own name: several of one layer are called alike."""
     found: list[str] = []
+    structure = getattr(model, "_outputs_struct", None)
+    if isinstance(structure, dict) and not any(isinstance(v, list | tuple | dict) for v in structure.values()):
+        return sorted(structure)  # results are flattened in the order of their keys
     for wish in getattr(model, "output_names", None) or [f"output_{i}" for i in range(count)]:
         name = wish
         while name in found:  # as converters/keras/model.py calls them

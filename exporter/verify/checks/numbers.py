@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from converters.formats import narrows
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Bisection, Finding, Numbers, Shape
 from exporter.verify.histogram import added
@@ -33,7 +34,7 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
         got = participant.run(case.feeds, list(participant.outputs))
         for name in participant.outputs:
             if trial.drawn(name, participant):
-                difference = plausible(trial.signature, name, got[name], case)
+                difference = plausible(trial.signature, name, got[name], case, narrowed=narrows(participant.format))
             elif name in expected:
                 difference = trial.difference(name, expected, got[name], participant, case)
             else:
@@ -59,8 +60,12 @@ def _upstream(trial: Trial, name: str, constants: Sequence[Bisection]) -> Bisect
     return next((c for c in constants if c.tensor in upstream), None)
 
 
-def plausible(signature: PolicySignature, name: str, got: np.ndarray, case: Case) -> Difference:
+def plausible(
+    signature: PolicySignature, name: str, got: np.ndarray, case: Case, *, narrowed: bool = False
+) -> Difference:
     """A drawn output: shape, dtype and range; how it is distributed is for other checks.
+
+    ``narrowed``: the format lacks dtypes, and only the kind of number is its own.
 
     An action without chance that is drawn is wrong, whatever it is.
     """
@@ -70,7 +75,7 @@ def plausible(signature: PolicySignature, name: str, got: np.ndarray, case: Case
         return wrong("it is the action without chance, and it is drawn")
     if got.shape != wanted:
         return wrong(f"shape {list(got.shape)} instead of {list(wanted)}")
-    if got.dtype.kind != np.dtype(spec.dtype).kind:
+    if got.dtype.kind != np.dtype(spec.dtype).kind or (got.dtype != spec.dtype and not narrowed):
         return wrong(f"dtype {got.dtype.name} instead of {spec.dtype}")
     if not np.isfinite(got).all():
         return wrong("NaN or infinity was drawn")

@@ -20,17 +20,19 @@ STATISTICS = {
 }  # fmt: skip
 
 
-def recurrent(op: str, gates: int, title: str, *, bias: bool = True, states: Sequence[str] = (), **more: Any) -> Case:
-    """A layer of one step; all of its outputs are asked for."""
+def recurrent(
+    op: str, gates: int, title: str, *, bias: bool = True, states: Sequence[str] = (), steps: int = 1, **more: Any
+) -> Case:
+    """A layer of ``steps`` steps; all of its outputs are asked for."""
     constants = {"w": floats(1, gates * H, N, seed=5), "r": floats(1, gates * H, H, seed=6)}
     inputs = ["x", "w", "r", "b" if bias else "", "", *states]
     if bias:
         constants["b"] = floats(1, 2 * gates * H, seed=7)
     outputs = ["y", "yh", "yc"][: 3 if op == "LSTM" else 2]
-    feeds = {"x": SEQUENCE, **{s: STATES[s] for s in states}}
+    feeds = {"x": floats(steps, B, N), **{s: STATES[s] for s in states}}
     return Case(
         op, title, lambda _: [node(op, inputs, outputs, hidden_size=H, **more)], feeds, constants, tuple(outputs),
-        shapes=SHAPES,
+        shapes=SHAPES | {"x": [steps, "batch", N]},
     )  # fmt: skip
 
 
@@ -107,6 +109,9 @@ CASES = [
     batch_first("GRU", 3),
     recurrent("RNN", 1, "with a state", states=("h",)),
     recurrent("RNN", 1, "from zero", bias=False),
+    recurrent("LSTM", 4, "over a history", states=("h", "c"), steps=3),
+    recurrent("GRU", 3, "over a history, backwards", steps=3, direction="reverse"),
+    recurrent("RNN", 1, "over a history, backwards", states=("h",), steps=2, direction="reverse"),
     Case("If", "taken", conditional(True), {"x": X}),
     Case("If", "not taken", conditional(False), {"x": X}),
     Case("Scan", "one step", scan, {"x": SEQUENCE, "s": floats(B, H, seed=9)}, {"w": floats(N, H, seed=10)},

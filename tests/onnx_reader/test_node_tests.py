@@ -1,0 +1,24 @@
+"""A part of ONNX's own tests of its operators, and the page on all of them (docs/onnx-operators.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.onnx_reader.node_tests import PAGE, collected, outcome, subject
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning"),  # what onnx pads with is NaN, cast to integers
+]
+
+
+def test_what_is_converted_is_right_and_what_is_refused_stands_on_the_page(tmp_path: Path) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert "\n0 give others," in page
+    for test in collected()[7::25]:
+        found = outcome(test, tmp_path, None)
+        assert found.state != "wrong", (test.name, found.reason)
+        if found.state == "refused":
+            assert f"| {subject(test)} | {found.reason} |" in page, test.name
