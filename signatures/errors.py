@@ -27,6 +27,10 @@ from typing import Any
 from signatures.fields import printable
 
 
+#: Characters of a line of a message: a file may hold names of any length.
+MAX_LINE = 1 << 13
+
+
 class ExportModelError(Exception):
     """Base of all errors of this project.
 
@@ -45,7 +49,7 @@ class ExportModelError(Exception):
         parts = [self.what if self.where is None else f"{self.where}: {self.what}"]
         parts += [f"  {key}: {text}" for key, text in (("why", self.why), ("fix", self.fix)) if text]
         return "\n".join(
-            "\n       ".join(printable(line) for line in part.expandtabs().replace("\r\n", "\n").split("\n"))
+            "\n       ".join(printable(_cut(line)) for line in part.expandtabs().replace("\r\n", "\n").split("\n"))
             for part in parts
         )
 
@@ -69,6 +73,10 @@ class ExportModelError(Exception):
             "fix": self.fix,
             "exit_status": self.exit_status,
         }
+
+
+def _cut(line: str) -> str:
+    return line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]} … ({len(line)} characters)"
 
 
 class UsageError(ExportModelError):

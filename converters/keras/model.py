@@ -67,17 +67,24 @@ def model_of(config: Any) -> LayeredModel:
 
 def layer_of(entry: Mapping[str, Any]) -> Layer:
     """One layer of a configuration."""
-    kind, config = str(entry["class_name"]), entry["config"]
+    kind, config = _text(entry["class_name"]), entry["config"]
     module = str(entry.get("module") or "")
     if kind in MODELS:
-        name = str(config["name"] if isinstance(config, Mapping) else entry.get("name", kind.lower()))
+        name = _text(config["name"] if isinstance(config, Mapping) else entry.get("name", kind.lower()))
         model = _sequential(name, config) if kind == "Sequential" else _functional(name, config)
-        return Layer(kind, str(entry.get("name", name)), {}, _calls(entry.get("inbound_nodes") or ()), model)
-    name = str(entry.get("name") or config.get("name") or kind.lower())
+        return Layer(kind, _text(entry.get("name", name)), {}, _calls(entry.get("inbound_nodes") or ()), model)
+    name = _text(entry.get("name") or config.get("name") or kind.lower())
     nodes: Sequence[Any] = entry.get("inbound_nodes") or ()
     # An .h5 of Keras 3 does not say the module: Multiply may be either.
     bare = not module and bool(nodes) and isinstance(nodes[0], Mapping) and "trainable" not in config
     return Layer(kind, name, config, _calls(nodes), operation=bare or ".ops." in f"{module}.")
+
+
+def _text(value: object) -> str:
+    """A name; what else stands there may be a tree of any size, which no message should hold."""
+    if not isinstance(value, str):
+        raise TypeError(f"a name is a {type(value).__name__}")
+    return value
 
 
 def _functional(name: str, config: Mapping[str, Any]) -> LayeredModel:

@@ -16,7 +16,7 @@ from converters.barracuda.writer import policy_model
 from converters.frozen_graph.reader import read_graph
 from converters.graph import compile
 from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
+from signatures.errors import MAX_LINE, DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.barracuda.nn_files import write_nn
 from tests.handmade import constant, continuous_policy, graph_bytes, node
 from tests.hostile import zoo
@@ -156,3 +156,20 @@ def test_a_nn_of_more_joined_tensors_than_any_policy_has_is_refused(
     monkeypatch.setattr(lower_base, "MAX_PIECES", MANY - 1)
     with pytest.raises(UnsupportedOpError, match=f"{MANY} tensors are joined"):
         policy_model(policy)
+
+
+def test_what_a_layer_is_called_is_a_text(tmp_path: Path) -> None:
+    """A tree of lists there was written out into the message, which took seconds."""
+    for wrong in ({"class_name": [["x"]]}, {"class_name": "Dense", "config": {"name": [["x"]]}}):
+        layers = {"class_name": "Sequential", "config": {"name": "s", "layers": [{"config": {}, **wrong}]}}
+        content = {"modelTopology": {"model_config": layers}, "weightsManifest": []}
+        (tmp_path / "model.json").write_text(json.dumps(content))
+        with pytest.raises(DamagedFileError, match="a name is a list"):
+            read_source(tmp_path)
+
+
+def test_a_message_holds_no_name_of_any_length() -> None:
+    said = str(DamagedFileError("a" * 100_000, why=f"it is so\n{'b' * 100_000}"))
+    assert "(100000 characters)" in said
+    assert "it is so\n" in said
+    assert len(said) < 4 * MAX_LINE
