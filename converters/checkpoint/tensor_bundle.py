@@ -22,6 +22,7 @@ import numpy as np
 from converters import schema
 from converters.checkpoint.crc32c import crc32c, masked
 from converters.checkpoint.table import read_table
+from converters.fetch import read_bytes
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 
 _MAX_AXES = 32
@@ -45,7 +46,7 @@ class Checkpoint:
         self._read: dict[str, np.ndarray] = {}
         self.index = prefix.with_name(prefix.name + ".index")
         try:
-            self._entries = dict(read_table(self.index.read_bytes()))
+            self._entries = dict(read_table(read_bytes(self.index)))
         except ExportModelError as error:
             raise error.at(self.index.name) from error.__cause__
         except OSError as error:

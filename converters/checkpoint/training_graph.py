@@ -18,6 +18,7 @@ import numpy as np
 from converters import schema
 from converters.checkpoint.tensor_bundle import Extents
 from converters.detached import Detached
+from converters.fetch import read_bytes
 from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.tensors import to_array
 from converters.graph.nodes import Graph, node_of, split_ref
@@ -46,7 +47,7 @@ class TrainingGraph:
 
 def read_training_graph(path: Path) -> TrainingGraph:
     """The graph in ``raw_graph_def.pb`` or a ``.meta``. Raises DamagedFileError, NotAPolicyError, GraphError."""
-    data = path.read_bytes()
+    data = read_bytes(path)
     if path.name.endswith(".meta"):
         graph_def = schema.parse(schema.MetaGraphDef, data, "MetaGraph").graph_def
     else:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.fetch import Fetched
+from converters.fetch import Fetched, read_bytes
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.graph.ops.outside import IFS, WHILES
 from converters.graph.ops.table import is_fed
@@ -109,9 +109,9 @@ def read_model(given: Fetched) -> WebModel:
 
 
 def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
-    """(the signature, node → op) of a model.json, without its weights. Raises DamagedFileError."""
+    """(the signature, node → op) of a model.json, without its weights. Raises SourceError, DamagedFileError."""
     try:
-        model = json.loads(path.read_bytes())
+        model = json.loads(read_bytes(path))
         signature = model.get("signature") or (model.get("userDefinedMetadata") or {}).get("signature") or {}
         nodes = {str(n["name"]): str(n["op"]) for n in model["modelTopology"]["node"]}
         return _signature(signature), nodes

@@ -14,6 +14,8 @@ from converters.source import ReadOptions
 from exporter.remote.filesystem import is_pattern, matching, remote
 from signatures.errors import SourceError, UsageError
 
+#: Bytes of a list of paths.
+MAX_LIST = 16 << 20
 _MAGIC = frozenset("*?[")
 #: What a folder holds besides models is passed over, but for what stands there in a model's place.
 _TELLING = ("lfs_pointer",)
@@ -65,7 +67,10 @@ def _expanded(path: Path, out: Path) -> Iterator[Path]:
         yield from _walked(path, out)
     elif path.suffix == ".txt" and path.is_file():
         for line in _lines(path):
-            yield from _expanded(Path(line), out)
+            listed = Path(line)
+            if listed.suffix == ".txt" and listed.is_file():  # one that names itself has no end
+                raise UsageError(f"{path} names another list", where=line, fix="put its lines in its place")
+            yield from _expanded(listed, out)
     elif not path.exists() and not _MAGIC.isdisjoint(str(path)):
         yield from _matching(path, out)
     else:
@@ -75,9 +80,8 @@ def _expanded(path: Path, out: Path) -> Iterator[Path]:
 def _matching(pattern: Path, out: Path) -> Iterator[Path]:
     """What a pattern finds; of a folder that is a source itself, nothing that lies in it."""
     whole: set[Path] = set()
-    matches = sorted(glob.glob(str(pattern), recursive=True))  # noqa: PTH207 (a Path cannot glob from anywhere)
-    for match in map(Path, matches):
-        if not whole.isdisjoint(match.parents) or out in (match.resolve(), *match.resolve().parents):
+    for match in sorted(set(_found(pattern))):
+        if not whole.isdisjoint(match.parents) or _lies_in(match, out):
             continue
         if match.is_file():
             yield from [match] if _is_source(match) else []
@@ -86,8 +90,32 @@ def _matching(pattern: Path, out: Path) -> Iterator[Path]:
             yield from _walked(match, out)
 
 
+def _lies_in(path: Path, out: Path) -> bool:
+    real = Path(os.path.realpath(path))  # ``resolve`` raises where a link leads to itself
+    return out in (real, *real.parents)
+
+
+def _found(pattern: Path) -> Iterator[Path]:
+    """What a pattern matches. ``**`` goes through no link: two that lead back have no end (glob follows them)."""
+    parts = pattern.parts
+    at = parts.index("**") if "**" in parts else len(parts)
+    tops = glob.glob(str(Path(*parts[:at])))  # noqa: PTH207 (a Path cannot glob from anywhere)
+    rest = parts[at + 1 :]
+    for top in tops if at < len(parts) else ():
+        for folder, folders, files in os.walk(top):
+            folders[:] = [f for f in folders if not f.startswith(".")]
+            if rest:
+                yield from _found(Path(glob.escape(folder), *rest))
+            else:
+                yield from (Path(folder, *f) for f in ((), *((n,) for n in files if not n.startswith("."))))
+    if at == len(parts):
+        yield from map(Path, tops)
+
+
 def _lines(path: Path) -> Iterator[str]:
     try:
+        if path.stat().st_size > MAX_LIST:
+            raise ValueError(f"it has more than {MAX_LIST} bytes")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise UsageError(
@@ -98,24 +126,25 @@ def _lines(path: Path) -> Iterator[str]:
             yield line.strip()
 
 
-def _walked(folder: Path, out: Path) -> Iterator[Path]:
-    """What is a source in a folder: itself, or the first on each way down."""
-    if folder.resolve() == out:
-        return
-    if _is_source(folder):
-        yield from _parts(folder)
-        return
-    try:
-        inside = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError as error:
-        raise unreadable(folder, error) from error
-    for entry in inside:
-        if entry.name.startswith("."):
+def _walked(top: Path, out: Path) -> Iterator[Path]:
+    """What is a source in a folder: itself, or the first on each way down, however deep; no link is gone through."""
+    left = [top]
+    while left:
+        path = left.pop()
+        if not path.is_dir() or (path.is_symlink() and path != top):
+            if path.is_file() and _is_source(path):
+                yield path
             continue
-        if entry.is_dir(follow_symlinks=False):
-            yield from _walked(Path(entry.path), out)
-        elif entry.is_file() and _is_source(Path(entry.path)):
-            yield Path(entry.path)
+        if path.resolve() == out:
+            continue
+        if _is_source(path):
+            yield from _parts(path)
+            continue
+        try:
+            inside = sorted(path.iterdir(), key=lambda p: p.name, reverse=True)
+        except OSError as error:
+            raise unreadable(path, error) from error
+        left += [p for p in inside if not p.name.startswith(".")]
 
 
 def _parts(folder: Path) -> list[Path]:
