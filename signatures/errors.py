@@ -26,7 +26,6 @@ from typing import Any
 
 from signatures.fields import printable
 
-
 #: Characters of a line of a message: a file may hold names of any length.
 MAX_LINE = 1 << 13
 
