@@ -16,7 +16,6 @@ from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, ref, split_ref
 from converters.graph.passes.fold import fold
 from converters.graph.passes.naming import name_tensors
-from converters.graph.passes.repeated import broadcast_rows
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.types import FLOAT32, INT32, static_shape
@@ -47,8 +46,6 @@ class Dressing:
     branches: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        graph = broadcast_rows(self.policy.graph, [*self.policy.feeds.values(), *self.policy.fetches.values()])
-        self.policy = replace(self.policy, graph=graph)
         self.builder = Builder(NameScope(n.name for n in self.policy.graph.nodes))
 
     def refuse(self, what: str, *, why: str, fix: str) -> NoReturn:

@@ -8,8 +8,11 @@ are float32 outputs, as the torch exporter wrote them.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from converters.graph.passes.repeated import broadcast_rows
 from converters.policy import Policy
 from converters.targets.mlagents import feeding
 from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities
@@ -22,7 +25,9 @@ VECTOR = "vector_observation"
 
 def dress(policy: Policy, profile: str) -> Policy:
     """The policy under the names of API version 2. Raises ProfileError where it cannot be held."""
-    dressing = Dressing(policy, profile)
+    # Barracuda 1.1 has no Tile to repeat a constant for every agent with.
+    graph = broadcast_rows(policy.graph, [*policy.feeds.values(), *policy.fetches.values()])
+    dressing = Dressing(replace(policy, graph=graph), profile)
     feeding.refuse_parameters(dressing)
     if policy.signature.memory is not None:
         dressing.refuse(
