@@ -27,12 +27,13 @@ SUICIDE = """
 import os, shutil, signal, sys
 from pathlib import Path
 from converters.bundle import exchange as swap
+from converters.pieces import Pieces
 from exporter.cli.main import main
 
 point, *arguments = sys.argv[1:]
 kind, _, number = point.partition(":")
 left = int(number or 0)
-write, rename, exchange, remove = Path.write_bytes, Path.rename, swap._exchanged, shutil.rmtree
+write, pieces, rename, exchange, remove = Path.write_bytes, Pieces.write, Path.rename, swap._exchanged, shutil.rmtree
 
 def die():
     os.kill(os.getpid(), signal.SIGKILL)
@@ -44,6 +45,13 @@ def dying_write(path, data):
         die()
     left -= path.name != "stage.txt"
     return write(path, data)
+
+def dying_pieces(data, path):
+    global left
+    if left == 0:
+        dying_write(path, b"".join(map(bytes, data.chunks())))
+    left -= 1
+    return pieces(data, path)
 
 def dying_rename(path, target):
     global left
@@ -60,7 +68,7 @@ def dying_exchange(a, b):
     return done
 
 if kind == "write":
-    Path.write_bytes = dying_write
+    Path.write_bytes, Pieces.write = dying_write, dying_pieces
 elif kind.endswith("exchange"):
     swap._exchanged = dying_exchange
 else:  # a system without an exchange
