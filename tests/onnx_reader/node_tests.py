@@ -43,9 +43,10 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class NodeTest:
-    """One of ONNX's tests: ``ops`` are the operators of its model, the first set of its data."""
+    """One of ONNX's tests and the first set of its data; ``subject`` is the operator that it is about."""
 
     name: str
+    subject: str
     model: Any
     inputs: tuple[Any, ...]
     outputs: tuple[Any, ...]
@@ -70,10 +71,13 @@ def collected(only: str | None = None) -> list[NodeTest]:
         from onnx.backend.test.case.node import collect_testcases
 
         cases = collect_testcases(only)
+    kinds = {case.name: case.model.graph.node[-1].op_type for case in cases}
     found = []
     for case in cases:
         inputs, outputs = case.data_sets[0]
-        found.append(NodeTest(case.name, case.model, tuple(inputs), tuple(outputs), case.rtol, case.atol))
+        whole = case.name.partition("_expanded")[0]  # the same operator, as ONNX defines it by others
+        subject = kinds[case.name] if whole == case.name else f"{kinds.get(whole, whole)}, written out"
+        found.append(NodeTest(case.name, subject, case.model, tuple(inputs), tuple(outputs), case.rtol, case.atol))
     return found
 
 
@@ -224,10 +228,10 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
     """docs/onnx-operators.md: counts, and what is refused, with the reason. Expansions of an operator count with it."""
     states = Counter(o.state for _, o in outcomes)
     refused: dict[str, dict[str, int]] = {}
-    right = Counter(subject(t) for t, o in outcomes if o.state == "right")
+    right = Counter(t.subject for t, o in outcomes if o.state == "right")
     for test, found in outcomes:
         if found.state == "refused":
-            reasons = refused.setdefault(subject(test), {})
+            reasons = refused.setdefault(test.subject, {})
             reasons[found.reason] = reasons.get(found.reason, 0) + 1
     lines = [
         "# Operators of ONNX",
@@ -250,16 +254,6 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
     return "\n".join(
         [*lines, "", "`python -m tests.onnx_reader.node_tests` writes this page; a test holds a part of it.", ""]
     )
-
-
-def subject(test: NodeTest) -> str:
-    """The operator that a test is about: its definition by others, written out, is named after it."""
-    kinds = [n.op_type for n in test.model.graph.node]
-    return kinds[-1] if not test.name.endswith("expanded") else f"{_stem(test.name)} (by its definition)"
-
-
-def _stem(name: str) -> str:
-    return name.removeprefix("test_").partition("_expanded")[0].split("_")[0]
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.onnx_reader.node_tests import PAGE, collected, outcome, subject
+from tests.onnx_reader.node_tests import PAGE, collected, outcome
 
 pytestmark = [
     pytest.mark.slow,
@@ -21,4 +21,4 @@ def test_what_is_converted_is_right_and_what_is_refused_stands_on_the_page(tmp_p
         found = outcome(test, tmp_path, None)
         assert found.state != "wrong", (test.name, found.reason)
         if found.state == "refused":
-            assert f"| {subject(test)} | {found.reason} |" in page, test.name
+            assert f"| {test.subject} | {found.reason} |" in page, test.name

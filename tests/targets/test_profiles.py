@@ -156,7 +156,9 @@ def test_a_branch_of_one_action_is_held_beside_others(wanted: Profile, tmp_path:
     assert pair.difference(3, 0) is None
 
 
-@pytest.mark.parametrize(("wanted", "form"), [(p, f) for p in PROFILES for f in p.formats], ids=str)
+@pytest.mark.parametrize(
+    ("wanted", "form"), [(p, f) for p in PROFILES for f in p.formats], ids=lambda v: getattr(v, "name", v)
+)
 def test_a_policy_of_a_single_action_keeps_its_inputs(wanted: Profile, form: str, tmp_path: Path) -> None:
     """Its action hangs on nothing; Unity looks for the observation and the masks all the same."""
     path = tmp_path / "single.bytes"
