@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 
 from exporter.serve.server import DATA, INDEX
+from signatures.errors import DamagedFileError
 
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "(\.[^"]+)";$', re.M)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) ([\w$]+))", re.M)
@@ -22,11 +23,11 @@ _MAIN = "main.mjs"
 
 
 def one_file(site: Mapping[str, bytes]) -> bytes:
-    """The files of a site (by path) as one HTML file."""
+    """The files of a site (by path) as one HTML file. Raises DamagedFileError where a file of the bundle is no JSON."""
     script = f'"use strict";\n{_bundled(site)}'
     style = _without_comments(site["page.css"].decode())
     files = {name: _embedded(name, data) for name, data in sorted(site.items()) if PurePosixPath(name).suffix in DATA}
-    held = json.dumps(files, separators=(",", ":")).replace("<", "\\u003c")
+    held = _as_json(files).replace("<", "\\u003c")
     icon = f"data:image/svg+xml;base64,{base64.b64encode(site['icon.svg']).decode()}"
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data: blob:; "
@@ -47,7 +48,23 @@ def one_file(site: Mapping[str, bytes]) -> bytes:
 
 
 def _embedded(name: str, data: bytes) -> object:
-    return json.loads(data) if name.endswith(".json") else base64.b64encode(data).decode()
+    if not name.endswith(".json"):
+        return base64.b64encode(data).decode()
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise _damaged(f"{name} is no JSON", str(error)[:200]) from error
+
+
+def _as_json(files: Mapping[str, object]) -> str:
+    try:
+        return json.dumps(files, separators=(",", ":"), allow_nan=False)
+    except ValueError as error:
+        raise _damaged("a number in its files is not finite", "no browser reads such JSON") from error
+
+
+def _damaged(what: str, why: str) -> DamagedFileError:
+    return DamagedFileError(what, why=why, fix="export the policy again")
 
 
 def _hash(text: str) -> str:

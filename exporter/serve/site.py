@@ -11,9 +11,11 @@ import converters.tfjs
 from converters.bundle.bundle import Bundle, dumps, writing
 from converters.bundle.embed import runnable
 from converters.bundle.exchange import exchange, stage
+from converters.fetch import Fetched
 from converters.formats import WRITTEN
 from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from converters.runtimes.js import KERNELS
+from converters.tfjs.reader import content_of
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, TYPES
@@ -31,6 +33,8 @@ SITE = "site.json"
 MADE_BY = "export-model serve"
 #: ... and a page of one file.
 MARK = f'<meta name="generator" content="{MADE_BY}">'.encode()
+#: Bytes at the beginning of a page of one file, among which the mark is.
+_HEAD = 2000
 
 _TFJS = "@tensorflow/tfjs"
 
@@ -88,10 +92,14 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
 
 
 def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
-    """The page as one HTML file, which needs no server and no network, on its own kernels. Raises as ``assemble``."""
+    """The page as one HTML file, which needs no server and no network, on its own kernels. Raises as ``assemble``,
+    and DamagedFileError.
+    """
     from exporter.serve.onefile import one_file
 
     site, said = _content(folder, scene)
+    with naming(folder):  # it stands in the page as JSON, so it has to be some
+        content_of(Fetched(folder / "tfjs"))
     for place in said["models"].values():
         site.pop(place.pop("onnx", ""), None)
     if said["scene"] is not None:
@@ -100,7 +108,8 @@ def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
         )
     absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
     site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
-    return one_file(site)
+    with naming(folder):
+        return one_file(site)
 
 
 def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]]:
@@ -160,17 +169,23 @@ def write_site(site: Mapping[str, bytes], place: Path) -> None:
 def write_file(page: bytes, place: Path) -> None:
     """Write a page of one file, in place of an older one. Raises BundleError where something else is in the way."""
     with writing(place):
-        if place.is_symlink() or (place.exists() and not (place.is_file() and MARK in place.read_bytes()[:2000])):
+        if place.is_symlink() or (place.exists() and not _is_page(place)):
             raise BundleError(
                 "is in the way and is not a page of ours",
                 where=str(place),
                 why=f"it does not say that {MADE_BY} wrote it",
                 fix="move it, or choose another name with --out",
             )
-        place.parent.mkdir(parents=True, exist_ok=True)
-        beside = place.with_name(f".{place.name}.new")
-        beside.write_bytes(page)
-        beside.replace(place)
+        with stage(place) as new:
+            (new / place.name).write_bytes(page)
+            (new / place.name).replace(place)
+
+
+def _is_page(place: Path) -> bool:
+    if not place.is_file():
+        return False
+    with place.open("rb") as file:
+        return MARK in file.read(_HEAD)
 
 
 def _replaceable(place: Path) -> bool:

@@ -11,7 +11,7 @@ import pytest
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
-from tests.runtimes.graph_models import batch, edit, node, twins, twins_by_numpy
+from tests.runtimes.graph_models import batch, edit, info, node, twins, twins_by_numpy, write_model
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="Node is not on PATH")
 
@@ -44,3 +44,27 @@ def test_what_is_no_model_of_ours_is_refused(
     model.unload()
     for name, wanted in twins_by_numpy(**batch(2)).items():
         np.testing.assert_allclose(answers[name], wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("op", "inputs"),
+    [
+        ("BroadcastTo", {"x": np.zeros(1, np.float32), "shape": np.array([1 << 15, 1 << 15], np.int32)}),
+        ("Tile", {"x": np.zeros(1, np.float32), "times": np.array([(1 << 31) - 1], np.int32)}),
+        ("Transpose", {"x": np.zeros(1 << 10, np.float32), "order": np.zeros(4, np.int32)}),
+        (
+            "OneHot",
+            {
+                "x": np.zeros(1, np.int32), "depth": np.array((1 << 31) - 1, np.int32),
+                "on": np.array(1, np.float32), "off": np.array(0, np.float32),
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_larger_than_any_tensor_is_refused_before_it_is_made(
+    op: str, inputs: dict[str, np.ndarray], tmp_path: Path, processes: RuntimePool
+) -> None:
+    nodes = [node("big", op, *inputs), node("out", "Identity", "big")]
+    folder = write_model(tmp_path / "m", nodes, inputs, {}, {"y": info("out:0", "float32", [None])})
+    with pytest.raises(RunFailedError, match="no tensor has the shape"):
+        processes.process("js").load(str(folder)).predict({}, [])

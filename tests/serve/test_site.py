@@ -196,6 +196,36 @@ def test_one_file_replaces_only_its_own(bundle: Bundle, tmp_path: Path) -> None:
     assert files_in(tmp_path / "deep") == {"page.html"}
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"{oops",
+        b"\xff",
+        b"[" * 100_000,
+        b'{"modelTopology": {"a": 1' + b"0" * 5_000 + b"}}",
+        b'{"modelTopology": {"a": NaN}}',
+    ],
+)
+def test_a_page_is_not_made_of_a_damaged_model(bundle: Bundle, content: bytes, tmp_path: Path) -> None:
+    """policy.json may have the hash of anything."""
+    folder = shutil.copytree(bundle("continuous"), tmp_path / "continuous")
+    (folder / "tfjs" / "model.json").write_bytes(content)
+    contract = json.loads((folder / "policy.json").read_text())
+    contract["files"]["tfjs/model.json"] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    (folder / "policy.json").write_text(json.dumps(contract))
+    is_refused(export_model("serve", folder, "-o", tmp_path / "page.html"), "continuous")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_is_written_through_no_link(bundle: Bundle, tmp_path: Path) -> None:
+    (tmp_path / "victim.txt").write_text("mine")
+    (tmp_path / ".page.html.new").symlink_to("victim.txt")
+    assert export_model("serve", bundle("continuous"), "-o", tmp_path / "page.html").status == 0
+    assert (tmp_path / "victim.txt").read_text() == "mine"
+    assert not (tmp_path / "page.html").is_symlink()
+    assert files_in(tmp_path) == {"victim.txt", ".page.html.new", "page.html"}
+
+
 # ---- --out -----------------------------------------------------------------------------------------------------------
 
 

@@ -308,10 +308,11 @@ export class Stage {
     this.#draw(1);
   }
 
-  /** Steps and what a visitor does come one after the other. */
+  /** Steps and what a visitor does come one after the other; one that fails holds up no other. */
   #queued(job) {
-    this.#busy = this.#busy.then(job);
-    return this.#busy;
+    const done = this.#busy.then(job);
+    this.#busy = done.catch(() => {});
+    return done;
   }
 
   async #step() {

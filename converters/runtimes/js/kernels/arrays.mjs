@@ -1,7 +1,7 @@
 /** Shapes, joining and cutting, slices, gathers, arrays made by rule. */
 
 import {
-  axisOf, broadcast, broadcastOffsets, each, numbers, offsets, picked, reshaped, scalar, sizeOf, stridesOf, vector, zeros,
+  axisOf, broadcast, broadcastOffsets, countOf, each, numbers, offsets, picked, reshaped, scalar, sizeOf, stridesOf, vector, zeros,
 } from "./tensors.mjs";
 
 const same = (_, x) => x;
@@ -114,12 +114,13 @@ function gather(_, x, indices, axis = scalar(0)) {
   const outside = indices.data.find((index) => !(index >= 0 && index < length));
   if (outside !== undefined) throw new Error(`index ${outside} is outside of 0 to ${length - 1}`);
   const width = sizeOf(after);
-  const places = new Int32Array(sizeOf(before) * indices.data.length * width);
+  const shape = [...before, ...indices.shape, ...after];
+  const places = new Int32Array(countOf(shape));
   let place = 0;
   for (let row = 0; row < sizeOf(before); row++) {
     for (const index of indices.data) for (let k = 0; k < width; k++) places[place++] = (row * length + index) * width + k;
   }
-  return picked(x, [...before, ...indices.shape, ...after], places);
+  return picked(x, shape, places);
 }
 
 // ---- by rule ---------------------------------------------------------------------------------------------------------
@@ -130,6 +131,7 @@ function broadcastTo(_, x, shape) {
 }
 
 function tile(_, x, times) {
+  countOf(x.shape.map((n, axis) => n * times.data[axis]));
   const repeated = (y, n, axis) => (n === 0 ? cut(y, y.shape.map((k, i) => [0, i === axis ? 0 : k, 1])) : concat(new Array(n).fill(y), axis));
   return numbers(times).reduce(repeated, x);
 }
@@ -143,7 +145,9 @@ function range(_, start, limit, delta) {
 
 function oneHot({ axis = -1 }, indices, depth, on, off) {
   const at = axisOf(axis, indices.shape.length + 1);
-  const classes = reshaped(vector(Array.from({ length: depth.data[0] }, (_, i) => i)), [-1, ...indices.shape.slice(at).map(() => 1)]);
+  const numbered = zeros("int32", [depth.data[0]]);
+  numbered.data.forEach((_, i, data) => (data[i] = i));
+  const classes = reshaped(numbered, [-1, ...indices.shape.slice(at).map(() => 1)]);
   const index = expandDims({}, indices, scalar(at));
   return each(on.dtype, (i, k) => (i === k ? on.data[0] : off.data[0]), index, classes);
 }

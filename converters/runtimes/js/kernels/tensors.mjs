@@ -12,10 +12,16 @@ const MOST_ELEMENTS = 2 ** 28;
 
 export const sizeOf = (shape) => shape.reduce((product, n) => product * n, 1);
 
-/** A tensor of zeros. */
-export function zeros(dtype, shape) {
+/** The number of elements of a shape that a tensor may have. */
+export function countOf(shape) {
   const count = sizeOf(shape);
   if (!shape.every((n) => Number.isInteger(n) && n >= 0) || count > MOST_ELEMENTS) throw new Error(`no tensor has the shape [${shape}]`);
+  return count;
+}
+
+/** A tensor of zeros. */
+export function zeros(dtype, shape) {
+  const count = countOf(shape);
   if (!Object.hasOwn(ARRAYS, dtype)) throw new Error(`there are no ${dtype} tensors here`);
   return { dtype, shape, data: new ARRAYS[dtype](count) };
 }
@@ -59,6 +65,7 @@ export function broadcastOffsets(x, shape) {
 
 /** The offsets that walking along `shape` with these strides gives, from `start`. */
 export function offsets(shape, strides, start = 0) {
+  countOf(shape);
   let found = Int32Array.of(start);
   shape.forEach((length, axis) => {
     const next = new Int32Array(found.length * length);
