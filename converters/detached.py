@@ -27,6 +27,8 @@ LARGE = 1 << 12
 LARGE_FILE = 1 << 20
 #: Protobuf's own limit.
 MAX_MESSAGE = (2 << 30) - 1
+#: Fields of a message that are looked through: a graph has no more than 131,072 nodes.
+MAX_FIELDS = 1 << 18
 _SECRET = os.urandom(16)
 _MARK = re.compile(re.escape(_SECRET) + b".{8}", re.DOTALL)
 _MARK_BYTES = len(_SECRET) + 8
@@ -119,13 +121,20 @@ class _NoMessageError(Exception):
 
 
 def _large(view: memoryview) -> Iterator[tuple[int, int, int, int]]:
-    return _delimited(view, LARGE)
+    """The large fields. A message of more fields than any model's is left to protobuf, which is quicker with them."""
+    return _delimited(view, LARGE, MAX_FIELDS)
 
 
-def _delimited(view: memoryview, least: int) -> Iterator[tuple[int, int, int, int]]:
-    """(number, end of the tag, start, end) of each field of bytes that has at least so many."""
-    at, size = 0, len(view)
+def _delimited(view: memoryview, least: int, most: int | None = None) -> Iterator[tuple[int, int, int, int]]:
+    """(number, end of the tag, start, end) of each field of bytes that has at least so many.
+
+    Raises _NoMessageError for what is no message, or has more fields than ``most``.
+    """
+    at, size, count = 0, len(view), 0
     while at < size:
+        count += 1
+        if most is not None and count > most:
+            raise _NoMessageError
         tag, tag_end = _read_varint(view, at)
         wire = tag & 7
         if wire == _BYTES:

@@ -194,8 +194,11 @@ def _large(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -
 
 def _alone(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     """One number is 1, the others are 0."""
-    count = _numbers((None, *shape[1:]))
-    return np.eye(count)[rng.integers(0, count, shape[0] if shape else 1)].reshape(shape)
+    rows, count = (shape[0] if shape else 1), _numbers((None, *shape[1:]))
+    made = np.zeros((rows, count))
+    if count:
+        made[np.arange(rows), rng.integers(0, count, rows)] = 1
+    return made.reshape(shape)
 
 
 def _bits(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:

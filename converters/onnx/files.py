@@ -30,4 +30,5 @@ def files_of(model: Any, detached: Detached, name: str) -> dict[str, Pieces]:
         padding = -array.nbytes % _PAGE
         parts += [array, bytes(padding)]
         at += array.nbytes + padding
-    return {name: Pieces(model.SerializeToString(deterministic=True)), f"{name}.data": Pieces(*parts)}
+    whole = detached.whole(model.SerializeToString(deterministic=True))  # constants in nodes and bodies stay in it
+    return {name: whole, f"{name}.data": Pieces(*parts)}

@@ -57,6 +57,7 @@ def decoded(data: bytes, detached: Detached | None = None) -> Any:
         data = detached.without(data, _CONTENTS)
     try:
         model = onnx.ModelProto.FromString(data)
+        model.DiscardUnknownFields()  # what no reader knows is handed to no runtime
     except DecodeError as error:
         raise DamagedFileError(
             "cannot be decoded as ONNX", why="the file is cut off or damaged", fix="export or download it again"
@@ -94,7 +95,7 @@ def _check_texts(model: Any) -> None:
                     )
 
 
-def array_of(tensor: Any, detached: Detached | None = None) -> np.ndarray:
+def array_of(tensor: Any, detached: Detached | None) -> np.ndarray:
     """The values of a TensorProto, a view of what is ``detached``; float64 narrowed to float32.
 
     Raises DamagedFileError, UnsupportedOpError.
@@ -131,7 +132,7 @@ def array_of(tensor: Any, detached: Detached | None = None) -> np.ndarray:
     return array
 
 
-def raw_of(tensor: Any, detached: Detached | None = None) -> np.ndarray:
+def raw_of(tensor: Any, detached: Detached | None) -> np.ndarray:
     """A TensorProto's raw bytes."""
     content = tensor.raw_data
     held = None if detached is None else detached.array(content)
@@ -149,7 +150,7 @@ def _damaged(name: str, why: str) -> DamagedFileError:
     )
 
 
-def attribute_of(attribute: Any) -> Any:
+def attribute_of(attribute: Any, detached: Detached | None) -> Any:
     """The value of an attribute: number, text, tuple, array, or the message of a subgraph.
 
     tf2onnx 1.5.5 wrote ``seed`` with type INT where the operator says FLOAT; the type that is there is taken.
@@ -161,7 +162,7 @@ def attribute_of(attribute: Any) -> Any:
         return None
     value = getattr(attribute, field)
     if field == "t":
-        return array_of(value)
+        return array_of(value, detached)
     if field == "s":
         return value.decode("utf-8", "replace")
     if field == "strings":
@@ -204,15 +205,15 @@ def _dense(sparse: Iterable[Any]) -> Iterator[Any]:
         yield from (tensor.values, tensor.indices)
 
 
-def load_external(graph: Any, folder: Path, detached: Detached | None = None) -> list[Path]:
-    """Bring data that lies in files beside the model into the tensors of a graph (large ones are ``detached``); returns
-    the files.
+def load_external(parts: Iterable[Any], folder: Path, detached: Detached | None = None) -> list[Path]:
+    """Bring data that lies in files beside the model into the tensors of its graph and functions (large ones are
+    ``detached``); returns the files.
 
-    Raises DamagedFileError where a file is missing, too short, too large, or outside of ``folder``.
+    Raises DamagedFileError where a file is missing, too short, or outside of ``folder``, or all are too large.
     """
     files: dict[Path, bytes] = {}
     total = 0
-    for tensor in tensors(graph):
+    for tensor in (t for part in parts for t in tensors(part)):
         if tensor.data_location == _EXTERNAL:
             total += _bring(tensor, folder, files, detached)
             if total > MAX_WEIGHTS:
@@ -226,7 +227,10 @@ def _bring(tensor: Any, folder: Path, files: dict[Path, bytes], detached: Detach
     entries = {e.key: e.value for e in tensor.external_data}
     path = _inside(folder, entries.get("location", ""), tensor.name)
     if path not in files:
-        files[path] = read_bytes(path, most=MAX_WEIGHTS)
+        left = MAX_WEIGHTS - sum(map(len, files.values()))
+        if path.stat().st_size >= left:
+            raise _damaged(tensor.name, f"the files beside the model are {MAX_WEIGHTS >> 30} GiB or more together")
+        files[path] = read_bytes(path, most=left)
     data = files[path]
     try:
         offset = int(entries.get("offset") or 0)

@@ -119,7 +119,7 @@ def _imported(
     """The nodes of a GraphProto, imported; ``axes`` are the batch axes of memories, ``alone``: free lengths are 1."""
     constants = {t.name for t in graph.initializer}
     reserved = [v.name for v in (*declared, *graph.output)] + [c for c in CONSTANT_NAMES if c in constants]
-    importer = Importer(TABLE, opsets, reserved, batch)
+    importer = Importer(TABLE, opsets, reserved, batch, detached)
     for value in declared:
         _input(importer, value, batch, axes.get(value.name, 0), alone=alone)
     for tensor in graph.initializer:
@@ -138,7 +138,7 @@ def parse(given: Fetched, detached: Detached | None = None) -> tuple[Any, list[P
             "the model has sparse weights", issues=[(model.graph.sparse_initializer[0].values.name, "Constant")]
         )
     model = inlined(model)
-    return model, load_external(model.graph, given.path.parent, detached)
+    return model, load_external([model.graph], given.path.parent, detached)
 
 
 def _check_names(names: Sequence[str]) -> None:

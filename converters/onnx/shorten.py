@@ -1,7 +1,7 @@
 """Two nodes that ONNX has one for, where nothing reads what is between them: a runtime starts an op for each.
 
-Of a small policy's run the start of its ops is most. What is made computes the same bits. The models for one consumer
-(``--for``) stay as they were tried in it.
+Of a small policy's run the start of its ops is most. What is made computes the same numbers (a zero's sign apart). The
+models for one consumer (``--for``) stay as they were tried in it.
 """
 
 from __future__ import annotations

@@ -40,8 +40,9 @@ def contained(path: Path, detached: Detached | None = None) -> Any:
     model = decoded(read_bytes(path), detached)
     model.ClearField("training_info")
     own = {(f.domain, f.name) for f in model.functions}
-    for part in (model.graph, *model.functions):
-        load_external(part, path.parent, detached)
+    parts = (model.graph, *model.functions)
+    load_external(parts, path.parent, detached)
+    for part in parts:
         for node in _nodes(part):
             known = node.domain in _DOMAINS and node.op_type not in _LOADING
             if not known and (node.domain, node.op_type) not in own:

@@ -57,7 +57,7 @@ def _variables(meta: Any, detached: Detached, unique: str) -> dict[str, np.ndarr
         read.attr["dtype"].type = kind
         dtype = schema.dtype_of(kind).newbyteorder("<")
         shape = [d.size for d in node.attr["value"].tensor.tensor_shape.dim]
-        found[name] = array if array.dtype == dtype else array.view(dtype).reshape(shape)
+        found[name] = (array if array.dtype == dtype else array.view(dtype)).reshape(shape)
         handles[name] = kind
     _saver(meta, scope, handles)
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -214,3 +215,13 @@ def test_an_episode_depends_on_its_seed_and_not_on_its_length() -> None:
 def test_an_episode_without_a_memory_to_feed_is_just_steps(memory: Memory | None) -> None:
     plain = signature(spec("state", Role.VECTOR, None, 3), memory=memory)
     assert [set(step) for step in draw_rollout(plain, seed=0, steps=3, batch=4)] == [{"state"}] * 3
+
+
+@pytest.mark.parametrize("width", [0, 1 << 15])
+def test_a_wide_or_empty_observation_takes_memory_for_its_own_numbers(width: int) -> None:
+    wide = signature(spec("state", Role.VECTOR, None, width))
+    tracemalloc.start()
+    feeds = sum(a.nbytes for case in draw_cases(wide) for a in case.feeds.values())
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 4 * feeds + (1 << 20)

@@ -17,15 +17,18 @@ _WHOLE = (("slice", None, None, 1), ("slice", 0, None, 1))
 
 
 def parts_for_slices(graph: Graph, roots: Iterable[str]) -> Graph:
-    """The graph with those slices left out; outputs stay."""
-    types, outputs, editor = infer_types(graph), {node_of(r) for r in roots}, Editor(graph)
+    """The graph with those slices left out, and what only they read; outputs and inputs stay."""
+    outputs = {node_of(r) for r in roots}
+    types, editor = infer_types(graph), Editor(graph)
     for node in graph.nodes:
         part = None if node.op != "StridedSlice" or node.name in outputs else _part(graph, types, node)
         if part is None:
             editor.keep(node)
         else:
             editor.redirect(node.name, editor.resolve(part))
-    return editor.graph()
+    made = editor.graph()
+    inputs = [n.name for n in graph.nodes if n.op == "Placeholder"]  # those that nothing reads stay
+    return graph if made is graph else made.pruned([*outputs, *inputs])
 
 
 def _part(graph: Graph, types: Types, node: Node) -> str | None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.detached import Detached
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.ops.base import MISFIT
@@ -35,7 +36,8 @@ class Importer(Builder):
 
     ``opsets`` is the version of each domain, ``reserved`` the values whose names are kept as they are (inputs and
     outputs). ``batch`` is the number of rows that a model was exported for, where that is fixed: its first axes are
-    freed, and shapes that hold the number are read accordingly (``fixed_batch.py``).
+    freed, and shapes that hold the number are read accordingly (``fixed_batch.py``). ``detached`` holds the large
+    tensors of the protos that are run.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class Importer(Builder):
         opsets: Mapping[str, int],
         reserved: Sequence[str],
         batch: int | None = None,
+        detached: Detached | None = None,
     ) -> None:
         own = NameScope(())
         self._reserved = {value: own.fresh(node_name(value)) for value in dict.fromkeys(reserved)}
@@ -51,6 +54,7 @@ class Importer(Builder):
         self.table = table
         self.opsets = opsets
         self.batch = batch
+        self.detached = detached
         self.fixed = None if batch is None else FixedBatch(batch, self.symbols)
         #: ONNX value → tensor
         self.values: dict[str, str] = {}
@@ -157,7 +161,7 @@ class Importer(Builder):
         self._scope = f"{self.prefix}/"
         try:
             for tensor in body.initializer:
-                self.initializer(tensor.name, array_of(tensor))
+                self.initializer(tensor.name, array_of(tensor, self.detached))
             self.run(body.node)
             names = [o.name for o in body.output]
             missing = [n for n in names if n not in self.values]
@@ -176,7 +180,7 @@ class Importer(Builder):
             name = proto.name or next((o for o in proto.output if o), "?")
             op = Op(proto.op_type, proto.domain, name, version, inputs, {}, tuple(proto.output))
             try:
-                op = replace(op, attrs={a.name: attribute_of(a) for a in proto.attribute})
+                op = replace(op, attrs={a.name: attribute_of(a, self.detached) for a in proto.attribute})
             except UnsupportedOpError as error:
                 self._break(op, error)
             else:

@@ -52,7 +52,7 @@ def _einsum(op: Op, net: Importer) -> str:
     equation, tensors = op.text("equation", "").replace(" ", ""), [op.need(i) for i in range(len(op.inputs))]
     lengths: dict[str, set[Dim]] = {}
     for term, tensor in zip(equation.partition("->")[0].split(","), tensors, strict=False):
-        for label, dim in zip(term, net.shape(tensor), strict=False):
+        for label, dim in zip(term if "." not in term else "", net.shape(tensor), strict=False):
             lengths.setdefault(label, set()).add(dim)
     if repeated := [label for label, dims in lengths.items() if 1 in dims and len(dims) > 1]:
         raise op.refused(f"{repeated[0]!r} has length 1 in one operand, and is repeated", "no policy needs that")

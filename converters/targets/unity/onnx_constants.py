@@ -65,7 +65,7 @@ def _read(tensor: Any) -> np.ndarray | None:
     if np.prod(tensor.dims, dtype=np.float64) > _LIMIT:
         return None
     try:
-        return array_of(tensor) if tensor.data_type not in _NARROW else _narrow(tensor)
+        return array_of(tensor, None) if tensor.data_type not in _NARROW else _narrow(tensor)
     except (ExportModelError, ValueError):
         return None
 

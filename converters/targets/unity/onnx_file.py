@@ -129,7 +129,7 @@ def read_onnx_file(path: Path) -> OnnxFile:
         model = decoded(read_bytes(path))
     except DamagedFileError as error:
         raise error.at(str(path)) from error.__cause__
-    load_external(model.graph, path.parent)
+    load_external([model.graph], path.parent)
     for tensor in model.graph.initializer:
         if min(tensor.dims, default=0) < 0:
             raise DamagedFileError(
