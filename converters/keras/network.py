@@ -21,6 +21,8 @@ from signatures.memories import SeparateMemory
 Results = dict[tuple[str, int], list[str]]
 _RECURRENT = frozenset(("LSTM", "GRU", "SimpleRNN", "RNN"))
 _MAX_DEPTH = 32
+#: Calls of models in models: one that is called twice at each level is called 2^levels times.
+_MAX_MODELS = 1 << 12
 #: What a layer may be told in a call, beside its tensors.
 _ARGUMENTS = frozenset(
     (
@@ -42,6 +44,7 @@ class Network(Builder):
         #: ``3.15.1``, ``2.11.0``, ``tfjs-layers 4.22.0``: which defaults and formulas hold
         self.version = version
         self.notes: list[str] = []
+        self.models = 0
         #: a state's placeholder → the tensor that holds it after the last step
         self.states: dict[str, str] = {}
         #: what those of stateful layers are called, which are no outputs of the model
@@ -102,8 +105,11 @@ class Network(Builder):
         self, model: LayeredModel, weights: Weights, given: Mapping[Place, str], prefix: str, depth: int
     ) -> list[str]:
         """The outputs of a model whose inputs are ``given``."""
-        if depth > _MAX_DEPTH:
-            raise DamagedFileError("its models are nested too deep", fix="save the model again")
+        self.models += 1
+        if depth > _MAX_DEPTH or self.models > _MAX_MODELS:
+            raise DamagedFileError(
+                "its models are nested too deep, or call one another too often", fix="save the model again"
+            )
         arrays = weights.among(model.layers)
         results: Results = {(place.layer, place.call): [reference] for place, reference in given.items()}
         waiting = [(layer, n) for layer in model.layers for n in range(len(layer.calls))]

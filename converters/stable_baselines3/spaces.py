@@ -17,8 +17,10 @@ from signatures.errors import DamagedFileError, SourceError
 from signatures.records import dataclass
 
 _NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)", re.IGNORECASE)
-_MEMBER = re.compile(r"""(['"])((?:[^'"\\]|\\.)*)\1\s*[:,]\s*(Box|Discrete|MultiDiscrete|MultiBinary)\(""")
+_MEMBER = re.compile(r"""(['"])((?:[^'"\\]|\\.){0,80})\1\s*[:,]\s*(Box|Discrete|MultiDiscrete|MultiBinary)\(""")
 _KINDS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
+#: Characters of a Dict's text; members of a thousand numbers take some ten thousand.
+_MAX_TEXT = 1 << 17
 _SAVE_AGAIN = "save the model again: model.save"
 
 
@@ -110,11 +112,16 @@ def _whole(value: Any, name: str) -> tuple[int, ...]:
 def _members(text: Any, name: str) -> dict[str, Space]:
     """The members of a Dict, of their text: ``{'arm': Box(-1.0, 1.0, (3,), float32), 'gear': Discrete(4)}``."""
     found: dict[str, Space] = {}
-    for match in _MEMBER.finditer(text if isinstance(text, str) else ""):
+    text = text if isinstance(text, str) else ""
+    if len(text) > _MAX_TEXT:
+        raise DamagedFileError(f"the text of its {name} has {len(text)} characters", fix=_SAVE_AGAIN)
+    for match in _MEMBER.finditer(text):
         key, kind, end, depth = match[2], match[3], match.end(), 1
         while end < len(text) and depth:
             depth += {"(": 1, ")": -1}.get(text[end], 0)
             end += 1
+        if depth:
+            raise DamagedFileError(f"the text of its {name} is cut off in {key[:40]!r}", fix=_SAVE_AGAIN)
         inner = text[match.end() : end - 1]
         if kind == "Box":
             bounds, _, rest = inner.rpartition("(")

@@ -108,7 +108,7 @@ def _check_sizes(path: Path) -> None:
         whole = sum(entry.file_size for entry in archive.infolist())
         for entry in archive.infolist():
             if not entry.filename.endswith(".npy"):
-                continue
+                raise ValueError(f"{entry.filename[:80]!r} is no array")
             with archive.open(entry) as file:
                 shape, dtype = _header(file)
             if math.prod(shape) * dtype.itemsize > entry.file_size:

@@ -135,7 +135,7 @@ def _onnx(runtime: str, path: Path, pool: RuntimePool) -> Iterator[InnerTensors]
 
     detached = Detached()
     model = decoded(path.read_bytes(), detached)
-    load_external(model.graph, path.parent, detached)
+    load_external([model.graph], path.parent, detached)
     graph = model.graph
     notes = {p.key: p.value for p in model.metadata_props}
     names: TensorMap = loads(notes.get(TENSORS_KEY, ""))

@@ -14,7 +14,6 @@ The last entry that covers a comparison decides.
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,6 +25,8 @@ from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
 
 _KEYS = frozenset({"policy", "format", "runtime", "output", "atol", "rtol", "reason"})
+#: What a float holds; a number of TOML or JSON may have any number of digits.
+_LARGEST = 1e300
 _FIX = "each [[tolerance]] has a reason, atol or rtol or both, and any of output, runtime, format, policy"
 
 
@@ -70,7 +71,7 @@ def _rule(entry: Any, where: str) -> ToleranceRule:
     if not bounds:
         raise UsageError("gives neither atol nor rtol", where=where, fix=_FIX)
     for key, bound in bounds.items():
-        if isinstance(bound, bool) or not isinstance(bound, int | float) or not math.isfinite(bound) or bound < 0:
-            raise UsageError(f"{key} is {bound!r}", where=where, fix="give a number that is not negative")
+        if isinstance(bound, bool) or not isinstance(bound, int | float) or not 0 <= bound <= _LARGEST:
+            raise UsageError(f"{key} is {str(bound)[:40]}", where=where, fix="give a number that is not negative")
     tolerance = Tolerance(**{key: float(bound) for key, bound in bounds.items()}, reason=" ".join(reason.split()))
     return ToleranceRule(tolerance, *(entry.get(key) for key in ("policy", "format", "runtime", "output")))

@@ -46,6 +46,14 @@ def test_it_is_refused(name: str, tmp_path: Path) -> None:
         read_golden(path, SIGNATURE)
 
 
+def test_what_is_no_array_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "recorded.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("state", b"hello")
+    with pytest.raises(UsageError, match="'state' is no array"):
+        read_golden(path, SIGNATURE)
+
+
 def test_an_array_alone_of_four_eib(tmp_path: Path) -> None:
     path = tmp_path / "recorded.npy"
     path.write_bytes(header((1 << 60,)))

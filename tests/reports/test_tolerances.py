@@ -65,6 +65,7 @@ def test_the_last_rule_that_covers_a_comparison_decides() -> None:
         ('[[tolerance]]\nreason = "x"', "neither atol nor rtol"),
         ('[[tolerance]]\natol = -1\nreason = "x"', "atol is -1"),
         ('[[tolerance]]\natol = inf\nreason = "x"', "atol is inf"),
+        (f'[[tolerance]]\natol = 1{"0" * 400}\nreason = "x"', "atol is 1000"),
         ('[[tolerance]]\natol = true\nreason = "x"', "atol is True"),
         ('[[tolerance]]\natol = 1\nruntime = "tensorfow"\nreason = "x"', "there is no runtime 'tensorfow'"),
         ('[[tolerance]]\natol = 1\nformat = "pb"\nreason = "x"', "there is no format 'pb'"),

@@ -105,6 +105,9 @@ def _framed(step: Step, key: str, sign: int) -> str:
     axes = step.rank - 2
     pairs = [(sign * a, sign * z) for a, z in _pairs(step.get(key), axes)]
     first = step.get("data_format") == "channels_first"
+    for axis, (a, z) in enumerate(pairs, 2 if first else 1):
+        if sign < 0 and -a - z >= step.net.length(step.x, axis):
+            raise DamagedFileError(f"the layer {step.path!r} leaves nothing of an axis", fix="save the model again")
     return padded(step.net, step.x, [(0, 0), (0, 0), *pairs] if first else [(0, 0), *pairs, (0, 0)])
 
 
