@@ -16,6 +16,9 @@ from signatures.errors import BundleError, UsageError
 #: Puts a staged bundle in its place, and says where that is.
 Put = Callable[[Path, str], Path]
 
+#: Lies beside the files of a bundle while they are sent; where it is left, sending was cut short.
+_SENDING = "policy.sending"
+
 
 @contextlib.contextmanager
 def landing(out: Path) -> Iterator[tuple[Path, Put]]:
@@ -61,10 +64,7 @@ def _there(address: str) -> set[str]:
     with asking(address, writes=True):
         system.invalidate_cache()
         found = {path[len(root) :].lstrip("/") for path in system.find(root)} if system.exists(root) else set()
-    name = address.rpartition("/")[2].removesuffix(".failed")
-    # Where sending was cut short, policy.json is not there yet; what is there has the policy's name, or our folders'.
-    ours = {file for file in found if file.startswith((f"{name}.", "saved_model/", "tfjs/", "policy.", "parity."))}
-    if found and POLICY not in found and found != ours:
+    if found and POLICY not in found and _SENDING not in found:
         raise BundleError(
             "is in the way and is not a bundle",
             where=address,
@@ -80,12 +80,15 @@ def _send(folder: Path, address: str) -> Path:
     files = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
     last = files.pop(POLICY)
     with asking(address, writes=True):
+        system.makedirs(root, exist_ok=True)
+        system.pipe_file(f"{root}/{_SENDING}", f"{POLICY} comes last\n".encode())
         if POLICY in before:
             system.rm_file(f"{root}/{POLICY}")
         for name, file in files.items():
             system.makedirs(f"{root}/{name}".rpartition("/")[0], exist_ok=True)
             system.put_file(str(file), f"{root}/{name}")
-        for name in sorted(before - files.keys() - {POLICY}):
+        for name in sorted(before - files.keys() - {POLICY, _SENDING}):
             system.rm_file(f"{root}/{name}")
         system.put_file(str(last), f"{root}/{POLICY}")
+        system.rm_file(f"{root}/{_SENDING}")
     return Path(address)

@@ -74,22 +74,51 @@ def test_policy_json_is_sent_last_and_goes_first(memory: Any, monkeypatch: pytes
     monkeypatch.setattr(kind, "rm_file", lambda s, a: (done.append(f"- {a}"), rm(s, a)))
     run(["memory://runs/a/discrete.bytes"], "memory://out")
     assert done[0] == "- /out/discrete/policy.json"
-    assert done[-1] == "/out/discrete/policy.json"
+    assert done[-2:] == ["/out/discrete/policy.json", "- /out/discrete/policy.sending"]
     assert "- /out/discrete/policy.old" in done
     assert not memory.exists("/out/discrete/policy.old")
 
 
-def test_what_was_cut_short_is_sent_again_and_what_is_anothers_stays(memory: Any) -> None:
-    run(["memory://runs/a/discrete.bytes"], "memory://out")
-    memory.rm_file(f"/out/discrete/{POLICY}")
-    memory.rm_file("/out/discrete/discrete.onnx")
-    assert run(["memory://runs/a/discrete.bytes"], "memory://out")[0].error is None
-    assert memory.exists("/out/discrete/discrete.onnx")
-    memory.pipe("/out/continuous/thesis.tex", b"mine")
-    (refused,) = run(["memory://runs/a/continuous.bytes"], "memory://out")
+@pytest.mark.parametrize("at", ["discrete.onnx", POLICY])
+def test_what_was_cut_short_is_sent_again(at: str, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = ["memory://runs/a/discrete.bytes"]
+    run(given, "memory://out")
+    whole = memory.find("/out")
+    kind = type(memory)
+    put = kind.put_file
+
+    def cut(system: Any, here: str, there: str, **more: Any) -> None:
+        if there.endswith(f"/{at}"):
+            raise ConnectionResetError("the line went dead")
+        put(system, here, there, **more)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(kind, "put_file", cut)
+        (refused,) = run(given, "memory://out")
     assert isinstance(refused.error, BundleError)
-    assert "memory://out/continuous: is in the way" in refused.error.message
-    assert memory.ls("/out/continuous", detail=False) == ["/out/continuous/thesis.tex"]
+    assert not memory.exists(f"/out/discrete/{POLICY}")
+    assert run(given, "memory://out")[0].error is None
+    assert memory.find("/out") == whole
+
+
+@pytest.mark.parametrize(
+    "theirs",
+    [
+        ["discrete.bytes", "discrete.pt", "discrete.yaml"],
+        ["policy.pt"],
+        ["saved_model/saved_model.pb", "tfjs/model.json"],
+        ["thesis.tex"],
+    ],
+)
+def test_what_is_anothers_stays(theirs: list[str], memory: Any) -> None:
+    for name in theirs:
+        memory.pipe(f"/models/discrete/{name}", fixture("discrete").read_bytes())
+    before = {path: memory.cat(path) for path in memory.find("/models")}
+    given = "memory://models/discrete/discrete.bytes" if len(theirs) == 3 else "memory://runs/a/discrete.bytes"
+    (refused,) = run([given], "memory://models")
+    assert isinstance(refused.error, BundleError)
+    assert "memory://models/discrete: is in the way" in refused.error.message
+    assert {path: memory.cat(path) for path in memory.find("/models")} == before
 
 
 def test_unchanged_addresses_are_left_out(memory: Any, tmp_path: Path) -> None:
