@@ -71,7 +71,7 @@ def export_fleet(
         made = _Crew(options, wanted, Turns(names), waiting).run(min(jobs, len(waiting)))
     for outcome in made:
         if not outcome.failed and outcome.files is not None:
-            ledger.record(outcome.path, outcome.files, [p.name for p in outcome.policies])
+            ledger.record(outcome.path, outcome.seen, outcome.files, [p.name for p in outcome.policies])
         yield outcome
         if fail_fast and outcome.failed:
             return

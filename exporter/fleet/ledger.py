@@ -12,6 +12,7 @@ from converters.fetch import address_of
 from exporter.export.labels import read_labels
 from exporter.export.pipeline import ExportOptions
 from exporter.remote.fetching import version
+from exporter.remote.filesystem import remote
 from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.digest import sha256_hex
@@ -20,6 +21,8 @@ from signatures.errors import BundleError, SourceError
 _NAME = ".exported.jsonl"
 #: size, time of the last change in ns, sha256
 Stamp = list[Any]
+#: of an address what its service says, of a folder its listing, of a file its size and time
+State = str | list[int] | None
 
 
 class Ledger:
@@ -52,17 +55,15 @@ class Ledger:
         try:
             same = (
                 entry.get("options") == self._key
-                and entry["folder"] == _listing(source)
-                and all(_is_same(Path(path), stamp) for path, stamp in entry["files"].items())
-                and entry["files"]
+                and _is_as_it_was(source, entry["seen"], entry["files"])
                 and all(sha256_hex((self._out / n / POLICY).read_bytes()) == h for n, h in entry["policies"].items())
             )
             return [str(name) for name in entry["policies"]] if same else None
         except (OSError, LookupError, TypeError, ValueError, AttributeError, SourceError):
             return None
 
-    def record(self, source: Path, files: Mapping[str, Stamp], policies: Iterable[str]) -> None:
-        """Note that a source was exported. Raises BundleError."""
+    def record(self, source: Path, seen: State, files: Mapping[str, Stamp], policies: Iterable[str]) -> None:
+        """Note that a source was exported, as it was before it was read. Raises BundleError."""
         if not self._keeps:
             return
         try:
@@ -70,7 +71,7 @@ class Ledger:
             entry = {
                 "source": str(source),
                 "options": self._key,
-                "folder": _listing(source),
+                "seen": seen,
                 "files": files,
                 "policies": hashes,
             }
@@ -82,21 +83,38 @@ class Ledger:
             ) from error
 
 
+def state(source: Path) -> State:
+    """What is another as soon as a source is: a run may write a newer checkpoint while this one is exported. None where
+    nothing tells. Raises SourceError.
+    """
+    if remote(source) is not None:
+        return version(source)
+    try:
+        return _listing(source) if source.is_dir() else _times(source)
+    except (OSError, ValueError):  # its reader says why
+        return None
+
+
 def stamps(source: Path, files: Iterable[Path]) -> dict[str, Stamp]:
-    """What tells whether a source's files are as they are now; nothing where its service does not say. Raises OSError,
-    SourceError.
+    """What tells whether the files of a source here are as they are now; of one at an address its state does. Raises
+    OSError.
     """
     if address_of(source) is not None:
-        known = version(source)
-        return {} if known is None else {str(source): [0, 0, known]}
+        return {}
     return {str(f): [*_times(f), sha256_hex(f.read_bytes())] for f in sorted(set(files))}
+
+
+def _is_as_it_was(source: Path, seen: State, files: Mapping[str, Stamp]) -> bool:
+    if address_of(source) is not None:
+        return seen is not None and seen == state(source)
+    if source.is_dir() and seen != state(source):
+        return False
+    return bool(files) and all(_is_same(Path(path), stamp) for path, stamp in files.items())
 
 
 def _is_same(path: Path, stamp: Stamp) -> bool:
     """By size and time, as git does it; a file that was only touched is read."""
     size, time, digest = stamp
-    if address_of(path) is not None:
-        return bool(version(path) == digest)
     now = _times(path)
     return now == [size, time] or (now[0] == size and sha256_hex(path.read_bytes()) == digest)
 
@@ -106,10 +124,7 @@ def _times(path: Path) -> list[int]:
     return [found.st_size, found.st_mtime_ns]
 
 
-def _listing(source: Path) -> str | None:
-    """What lies in a folder: a run may have written a newer checkpoint since."""
-    if not source.is_dir():
-        return None
+def _listing(source: Path) -> str:
     inside = sorted(p for p in source.rglob("*") if p.is_file())
     return sha256_hex(repr([(str(p.relative_to(source)), *_times(p)) for p in inside]).encode())
 

@@ -15,7 +15,7 @@ from converters.runtimes.child import end_with_parent
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claimed, Naming
 from exporter.export.pipeline import Exporter, ExportOptions, ExportResult, near
-from exporter.fleet.ledger import Stamp, stamps
+from exporter.fleet.ledger import Stamp, State, stamps, state
 from exporter.reports.entry import Entry, of_result
 from signatures.errors import ExportModelError, SourceError
 from signatures.records import dataclass
@@ -43,6 +43,8 @@ class Outcome:
     policies: tuple[Written, ...] = ()
     error: ExportModelError | None = None
     unchanged: bool = False
+    #: what tells whether it is unchanged; ``files`` is None where it did not stay so while it was exported
+    seen: State = None
     files: Mapping[str, Stamp] | None = None
 
     @property
@@ -72,6 +74,7 @@ def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, w
     policies: list[Written] = []
     files: Mapping[str, Stamp] | None = None
     try:
+        seen = state(path)
         with near(path) as here:
             jobs = exporter.compiled(here, names, _silent, path)
             files = stamps(path, (f for job in jobs for f in job.model.files))
@@ -81,7 +84,14 @@ def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, w
         return Outcome(path, tuple(policies), error)
     except OSError as error:
         return Outcome(path, tuple(policies), SourceError("cannot be read", where=str(path), why=error.strerror))
-    return Outcome(path, tuple(policies), None, files=files)
+    return Outcome(path, tuple(policies), seen=seen, files=files if _stays(path, seen) else None)
+
+
+def _stays(path: Path, seen: State) -> bool:
+    try:
+        return state(path) == seen
+    except SourceError:  # it has gone
+        return False
 
 
 def _written(result: ExportResult, wanted: Wanted, steps: int) -> Written:

@@ -20,7 +20,10 @@ MAX_FILES = 4096
 _CHUNK = 1 << 20
 _LONGEST_NAME = 200
 #: What tells one version of a file from the next, as file systems call it.
-_VERSIONS = ("ETag", "etag", "md5Hash", "md5", "sha256", "blob_id", "LastModified", "last_modified", "mtime", "created")
+_VERSIONS = (
+    *("ETag", "etag", "md5Hash", "md5", "sha256", "blob_id", "LastModified", "last_modified", "mtime", "created"),
+    *("Last-Modified", "Content-MD5", "Digest"),
+)
 
 
 @contextlib.contextmanager

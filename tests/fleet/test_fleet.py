@@ -8,14 +8,16 @@ import shutil
 import signal
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from exporter.cli.fleet import _Tally
-from exporter.export.pipeline import ExportOptions
+from exporter.export.pipeline import Exporter, ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.worker import Outcome
 from fixtures import path as fixture
+from fixtures.trained import run_folder
 from signatures.errors import UsageError
 from tests.commands import export_model
 
@@ -75,6 +77,31 @@ def test_what_is_unchanged_is_left_out(sources: list[Path], tmp_path: Path) -> N
     assert not any(o.unchanged for o in run(sources, out, again=True).values())
     other = export_fleet(sources, ExportOptions(out, verify="none", targets=("onnx",)))
     assert not any(o.unchanged for o in other)
+
+
+@pytest.mark.parametrize("step", ["compiled", "written"])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_what_changes_while_it_is_exported_is_exported_again(
+    kind: str, step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kind == "file":
+        source = changing = tmp_path / "policy.bytes"
+        shutil.copy(fixture("discrete"), source)
+    else:
+        source = shutil.copytree(run_folder("3DBall"), tmp_path / "3DBall")
+        changing = source / "newer-checkpoint.txt"
+    real = getattr(Exporter, step)
+
+    def change(*given: Any) -> Any:
+        yield from real(*given)
+        shutil.copy(fixture("recurrent"), changing)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Exporter, step, lambda *given: list(change(*given)))
+        (first,) = run([source], tmp_path / "out").values()
+    (second,) = run([source], tmp_path / "out").values()
+    (third,) = run([source], tmp_path / "out").values()
+    assert (first.error, first.unchanged, second.unchanged, third.unchanged) == (None, False, False, True)
 
 
 def test_a_run_that_was_stopped_goes_on(sources: list[Path], tmp_path: Path) -> None:

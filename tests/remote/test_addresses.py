@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
 import threading
 from collections.abc import Iterator
@@ -223,6 +224,14 @@ def test_a_web_server(serving: Any, tmp_path: Path) -> None:
     ran = command(f"{place}/gone.bytes", "-o", tmp_path / "out", "--verify", "none")
     assert ran.status == 2
     assert f"{place}/gone.bytes" in ran.err
+
+
+def test_unchanged_files_of_a_web_server_are_left_out(serving: Any, tmp_path: Path) -> None:
+    shutil.copy(fixture("discrete"), tmp_path / "discrete.bytes")
+    given = [f"{serving(partial(_Quiet, directory=str(tmp_path)))}/discrete.bytes"]  # which tells Last-Modified alone
+    assert [run(given, tmp_path / "out")[0].unchanged for _ in range(2)] == [False, True]
+    os.utime(tmp_path / "discrete.bytes", (1, 1))
+    assert not run(given, tmp_path / "out")[0].unchanged
 
 
 def test_a_redirect_leads_to_no_file(serving: Any) -> None:
