@@ -20,6 +20,10 @@ MAX_WEIGHTS = 16 << 30
 _ADDRESS = re.compile("(https?|ftps?|s3|gs|gcs|hf|memory|ssh|git)://?")
 #: Addresses of these are fetched where fsspec is installed (exporter/remote).
 FETCHED = ("http", "https", "s3", "gs", "gcs", "hf", "memory")
+#: Where a # ends a name.
+_WEB = ("http", "https")
+#: A name there may have any sign, and nobody signs in by it.
+_WITHOUT_SECRETS = ("hf", "memory")
 
 
 class Fetched:
@@ -96,7 +100,7 @@ def _missing(path: Path) -> SourceError:
     known = address.partition("://")[0] in FETCHED
     return SourceError(
         "is an address, not a file",
-        where=address,
+        where=shown(path),
         why=f"only {', '.join(FETCHED)} are fetched" if fetches() else "nothing is fetched from the network",
         fix=f"{fix}; or pip install 'export-model[remote]'" if known and not fetches() else fix,
     )
@@ -106,6 +110,18 @@ def address_of(path: Path) -> str | None:
     """The address that a path is, which keeps one slash of its two; None where it is none."""
     scheme = _ADDRESS.match(path.as_posix())
     return None if scheme is None else f"{scheme[1]}://{path.as_posix()[scheme.end() :]}"
+
+
+def shown(path: Path | str) -> str:
+    """A path as it is told and written down: of an address no user, password or query, which may be a signature."""
+    address = address_of(Path(path))
+    if address is None:
+        return str(path)
+    scheme, _, rest = address.partition("://")
+    if scheme in _WITHOUT_SECRETS:
+        return address
+    place, slash, inside = re.split(r"[?#]" if scheme in _WEB else r"\?", rest, maxsplit=1)[0].partition("/")
+    return f"{scheme}://{place.rpartition('@')[2]}{slash}{inside}"
 
 
 def fetches() -> bool:

@@ -50,6 +50,7 @@ def compare_command(
     options: VerifyOptions,
 ) -> None:
     """Compare files that any tool made with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    from converters.fetch import shown
     from converters.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
     from exporter.remote.fetching import nearby
@@ -68,9 +69,9 @@ def compare_command(
             allow_unverified=allow_unverified,
             progress=progress,
         )
-    console.verified(report, ", ".join(map(str, candidates)))
+    console.verified(report, ", ".join(map(shown, candidates)))
     console.json({"reports": [report.to_dict()]})
-    command = ("compare", str(reference), *map(str, candidates), *(word for m in mapped for word in ("--map", m)))
+    command = ("compare", *map(shown, (reference, *candidates)), *(word for m in mapped for word in ("--map", m)))
     console.write_reports(lambda: [Entry(report, steps=options.steps, command=command)])
     if report.passed is False:
         sys.exit(1)

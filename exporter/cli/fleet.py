@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from converters.fetch import address_of
+from converters.fetch import shown
 from exporter.cli.console import Console
 from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
@@ -48,7 +48,7 @@ def run_fleet(
     with console.progress_bar(len(paths)) as bar:
         for outcome in outcomes:
             tally.count(outcome)
-            bar.advance(outcome.path.name, tally.rate)
+            bar.advance(Path(shown(outcome.path)).name, tally.rate)
             entries.extend(p.entry for p in outcome.policies if p.entry is not None)
             answers.extend(p.answer for p in outcome.policies if p.answer is not None)
             if outcome.error is not None and console.as_json:
@@ -113,14 +113,14 @@ class _Tally:
 
 def _lines(outcome: Outcome, *, failed: bool = False) -> list[str]:
     """What is said of a source; ``failed``: only what went wrong."""
-    lines = [f"{address_of(outcome.path) or outcome.path}: unchanged"] if outcome.unchanged else []
+    source = shown(outcome.path)
+    lines = [f"{source}: unchanged"] if outcome.unchanged else []
     for policy in outcome.policies:
         if failed and policy.passed is not False:
             continue
         verdict = {True: "passed", False: f"FAILED: {policy.failure}", None: "not verified"}[policy.passed]
         note = "" if policy.renamed is None else f" ({policy.renamed})"
-        where = address_of(policy.folder) or policy.folder
-        lines.append(f"{address_of(outcome.path) or outcome.path}: {policy.what} -> {where}: {verdict}{note}")
+        lines.append(f"{source}: {policy.what} -> {shown(policy.folder)}: {verdict}{note}")
     if outcome.error is not None:
         lines.append(f"error: {outcome.error.message}")
     return lines

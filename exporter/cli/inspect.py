@@ -73,6 +73,7 @@ def inspect_command(
 
     With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
     """
+    from converters.fetch import shown
     from converters.graph.options import CompileOptions
     from exporter.remote.fetching import nearby
 
@@ -107,12 +108,12 @@ def inspect_command(
             if len(sources) == 1:
                 raise
             say_lines(f"error: {error.message}", err=True)
-            found.append({"path": str(source), **error.to_dict()})
+            found.append({"path": shown(source), **error.to_dict()})
             status = 2
     if as_json:
         say_json(found[0] if len(sources) == 1 else {"sources": found})
     elif not releases and status == 0:
-        say(f"next: {shlex.join(['export-model', *map(str, sources), *_given_for_both(), '-o', 'exported'])}")
+        say(f"next: {shlex.join(['export-model', *map(shown, sources), *_given_for_both(), '-o', 'exported'])}")
     if status:
         sys.exit(status)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Protocol
 
+from converters.fetch import address_of, shown
 from signatures.contract import safe_name
 
 #: A name, and why it is another than the source's.
@@ -43,12 +44,13 @@ class Names:
         wishes = _numbered(name) if other == path else _wishes(path, name)
         found = next(wish for wish in wishes if wish.casefold() not in self._taken)
         self._taken[found.casefold()] = path
-        return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {other}"
+        return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {shown(other)}"
 
 
 def _wishes(path: Path, name: str) -> Iterator[str]:
     wish = name
-    for part in (path.stem, *reversed(path.absolute().parent.parts[1:])):
+    inside: PurePath = PurePosixPath(f"/{shown(path).partition('://')[2]}") if address_of(path) else path.absolute()
+    for part in (inside.stem, *reversed(inside.parent.parts[1:])):
         if part != name:
             wish = safe_name(f"{part}-{wish}")
             yield wish

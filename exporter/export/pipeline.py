@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from converters.bundle import bundle
+from converters.fetch import shown
 from converters.folders import scratch_folder
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
@@ -82,7 +83,7 @@ class ExportResult:
 
     def __repr__(self) -> str:
         verdict = "not verified" if self.report is None else self.report.verdict
-        return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {str(self.folder)!r}>"
+        return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {shown(self.folder)!r}>"
 
     def _repr_html_(self) -> str:
         from exporter.reports.notebook import notebook
@@ -103,7 +104,7 @@ class ExportResult:
         """For ``--json``."""
         return {
             "name": self.policy.name,
-            "folder": str(self.folder),
+            "folder": shown(self.folder),
             "passed": self.passed,
             "sizes": dict(self.sizes),
             "parity": None if self.report is None else self.report.to_dict(),

@@ -17,7 +17,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from converters.fetch import address_of
+from converters.fetch import address_of, shown
 from converters.runtimes.pool import RuntimePool
 from exporter.export.labels import read_labels
 from exporter.export.names import Claimed
@@ -85,7 +85,7 @@ class _Working:
             self.said.put(exported(station.exporter, self.path, self, station.pool, station.run.wanted))
         except BaseException as error:
             self.said.put(
-                Outcome(self.path, error=SourceError("was not exported", where=str(self.path), why=repr(error)))
+                Outcome(self.path, error=SourceError("was not exported", where=shown(self.path), why=repr(error)))
             )
             raise
 
@@ -206,7 +206,7 @@ class Cluster:
         path = self.paths[number]
         failed = SourceError(
             "was not exported by the cluster",
-            where=address_of(path) or str(path),
+            where=shown(path),
             why=f"{type(error).__name__}: {error}",
             fix="export it alone to see more; if memory ran out, give the workers more",
         )

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from converters.fetch import shown
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Names
 from exporter.export.pipeline import Exporter, ExportOptions
@@ -130,7 +131,7 @@ class _Crew:
                 path,
                 error=SourceError(
                     "the process that exported it ended",
-                    where=str(path),
+                    where=shown(path),
                     why=f"its status is {worker.process.exitcode}",
                     fix="export it alone to see more; if memory ran out, use fewer --jobs",
                 ),

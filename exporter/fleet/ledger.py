@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.fetch import address_of
+from converters.fetch import address_of, shown
 from exporter.export.labels import read_labels
 from exporter.export.pipeline import ExportOptions
 from exporter.remote.fetching import version
@@ -51,7 +51,7 @@ class Ledger:
 
     def unchanged(self, source: Path) -> list[str] | None:
         """The names of a source's policies, where they were exported and all is as it was; else None."""
-        entry = self._lines.get(str(source), {})
+        entry = self._lines.get(_called(source), {})
         try:
             same = (
                 entry.get("options") == self._key
@@ -69,7 +69,7 @@ class Ledger:
         try:
             hashes = {n: sha256_hex((self._out / n / POLICY).read_bytes()) for n in policies}
             entry = {
-                "source": str(source),
+                "source": _called(source),
                 "options": self._key,
                 "seen": seen,
                 "files": files,
@@ -102,6 +102,12 @@ def stamps(source: Path, files: Iterable[Path]) -> dict[str, Stamp]:
     if address_of(source) is not None:
         return {}
     return {str(f): [*_times(f), sha256_hex(f.read_bytes())] for f in sorted(set(files))}
+
+
+def _called(source: Path) -> str:
+    """A source in its line; of an address that has a password or a signature its hash."""
+    address = address_of(source)
+    return shown(source) if address in (None, shown(source)) else sha256_hex(str(address).encode())
 
 
 def _is_as_it_was(source: Path, seen: State, files: Mapping[str, Stamp]) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from converters.bundle import BUNDLE
-from converters.fetch import Fetched, unreadable
+from converters.fetch import Fetched, shown, unreadable
 from converters.recognise import recognised
 from converters.source import ReadOptions
 from exporter.remote.filesystem import is_pattern, matching, remote
@@ -51,7 +51,7 @@ def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
             recognised(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
-                f"{path} stands for no source",
+                f"{shown(path)} stands for no source",
                 why="nothing there is a model in any form that is read",
                 fix="give model files, run folders, or folders that hold them",
             )

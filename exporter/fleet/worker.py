@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from converters.fetch import shown
 from converters.runtimes.child import end_with_parent
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claimed, Naming
@@ -83,7 +84,7 @@ def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, w
     except ExportModelError as error:
         return Outcome(path, tuple(policies), error)
     except OSError as error:
-        return Outcome(path, tuple(policies), SourceError("cannot be read", where=str(path), why=error.strerror))
+        return Outcome(path, tuple(policies), SourceError("cannot be read", where=shown(path), why=error.strerror))
     return Outcome(path, tuple(policies), seen=seen, files=files if _stays(path, seen) else None)
 
 

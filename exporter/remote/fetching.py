@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from converters.fetch import shown
 from converters.folders import scratch_folder
 from exporter.remote.filesystem import asking, filesystem, remote
 from signatures.digest import sha256_hex
@@ -43,7 +44,7 @@ def nearby(path: Path) -> Iterator[Path]:
         except ExportModelError as error:
             for part in ("what", "where", "why", "fix"):
                 if (text := getattr(error, part)) is not None:
-                    setattr(error, part, text.replace(str(local), address))
+                    setattr(error, part, text.replace(str(local), shown(address)))
             error.args = (error.message,)
             raise
 
@@ -66,16 +67,19 @@ def _fetched(address: str, folder: Path) -> Path:
     with asking(address):
         found = _files(system, place)
     if not found:
-        raise SourceError("nothing lies there", where=address, fix="check the address")
+        raise SourceError("nothing lies there", where=shown(address), fix="check the address")
     if len(found) > MAX_FILES:
         raise SourceError(
             f"has {len(found)} files, and of one source {MAX_FILES} are fetched",
-            where=address,
+            where=shown(address),
             fix="give the folder of one run, or a pattern that stands for files: **/*.onnx",
         )
     left = MAX_BYTES - sum(info.get("size") or 0 for info in found.values())
     _within(left, address)
-    left, top = MAX_BYTES, folder / _name(unquote(urlsplit(address).path if _is_http(address) else address), address)
+    left, top = (
+        MAX_BYTES,
+        folder / _name(unquote(urlsplit(address).path) if _is_http(address) else shown(address), address),
+    )
     for name in found:
         inside = PurePosixPath(name).relative_to(place).parts if name != place else ()
         target = top.joinpath(*(_name(part, address) for part in inside))
@@ -108,7 +112,9 @@ def _download(system: Any, name: str, target: Path, left: int, address: str) -> 
 def _within(left: int, address: str) -> None:
     if left < 0:
         raise SourceError(
-            f"has more than {MAX_BYTES >> 30} GiB", where=address, fix="give the model alone, or download it first"
+            f"has more than {MAX_BYTES >> 30} GiB",
+            where=shown(address),
+            fix="give the model alone, or download it first",
         )
 
 
@@ -117,7 +123,7 @@ def _name(path: str, address: str) -> str:
     name = path.rstrip("/").rpartition("/")[2]
     wrong = not name or name in (".", "..") or len(name) > _LONGEST_NAME or any(c in name for c in "\\\0")
     if wrong or (os.name == "nt" and any(c in name for c in ':*?"<>|')):
-        raise SourceError("a file there has a name that it cannot have here", where=address, why=repr(name[:80]))
+        raise SourceError("a file there has a name that it cannot have here", where=shown(address), why=repr(name[:80]))
     return name
 
 

@@ -8,14 +8,17 @@ Only what is named in ``FETCHED`` is asked for: fsspec also knows protocols that
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from converters.fetch import FETCHED, address_of, fetches
+from converters.fetch import FETCHED, address_of, fetches, shown
 from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
 _MAGIC = "*["
+#: In the text of an error.
+_ADDRESS = re.compile(r"\b[a-z0-9]+://[^\s'\"<>]+")
 
 
 def remote(path: Path) -> str | None:
@@ -35,7 +38,7 @@ def filesystem(address: str) -> tuple[Any, str]:
     except ImportError as error:
         raise UsageError(
             f"{address.partition('://')[0]}:// needs another package",
-            where=address,
+            where=shown(address),
             why=str(error),
             fix="install it beside export-model",
         ) from error
@@ -51,12 +54,12 @@ def asking(address: str, *, writes: bool = False) -> Iterator[None]:
     except ExportModelError:
         raise
     except FileNotFoundError as error:
-        raise kind("there is no such file", where=address, fix="check the address") from error
+        raise kind("there is no such file", where=shown(address), fix="check the address") from error
     except Exception as error:  # each library has its own
         raise kind(
             "cannot be written" if writes else "cannot be fetched",
-            where=address,
-            why=f"{type(error).__name__}: {error}",
+            where=shown(address),
+            why=f"{type(error).__name__}: {_ADDRESS.sub(lambda found: shown(found[0]), str(error))}",
             fix="check the address, your rights there, and the connection",
         ) from error
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from converters.bundle import bundle
-from converters.fetch import address_of, fetches
+from converters.fetch import address_of, fetches, shown
 from converters.folders import scratch_folder
 from exporter.remote.filesystem import asking, filesystem, remote
 from signatures.contract import POLICY
@@ -47,7 +47,7 @@ def check_sendable(out: Path) -> None:
     if address is not None and (remote(out) is None or address.startswith(("http://", "https://"))):
         raise UsageError(
             "nothing can be written there",
-            where=address,
+            where=shown(address),
             why=None if fetches() else "that needs fsspec: pip install 'export-model[remote]'",
             fix="give a folder, or an address of s3, gs or hf",
         )
@@ -67,7 +67,7 @@ def _there(address: str) -> set[str]:
     if found and POLICY not in found and _SENDING not in found:
         raise BundleError(
             "is in the way and is not a bundle",
-            where=address,
+            where=shown(address),
             why=f"it has no {POLICY}, so it is not this tool's to replace",
             fix="move it, or choose another address with -o or another --name",
         )

@@ -22,7 +22,7 @@ from exporter.fleet.sources import sources_in
 from exporter.fleet.worker import Outcome
 from exporter.remote import fetching, sending
 from exporter.remote.fetching import nearby
-from exporter.remote.filesystem import remote
+from exporter.remote.filesystem import asking, remote
 from fixtures import path as fixture
 from signatures.contract import POLICY
 from signatures.errors import BundleError, SourceError, UsageError
@@ -224,6 +224,54 @@ def test_a_web_server(serving: Any, tmp_path: Path) -> None:
     ran = command(f"{place}/gone.bytes", "-o", tmp_path / "out", "--verify", "none")
     assert ran.status == 2
     assert f"{place}/gone.bytes" in ran.err
+
+
+def test_passwords_and_signatures_are_told_and_written_nowhere(serving: Any, tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / "there" / name).mkdir(parents=True)
+        shutil.copy(fixture("discrete"), tmp_path / "there" / name / "discrete.bytes")
+    place = serving(partial(_Quiet, directory=str(tmp_path / "there")))
+    signed = f"{place}/b/discrete.bytes?sig=secret"
+    given = [f"{place.replace('://', '://user:secret@')}/a/discrete.bytes", signed]
+    (tmp_path / "here").mkdir()
+    report = ("--html", tmp_path / "here" / "report.html")
+    out = ("-o", tmp_path / "here" / "out", "--verify", "none")
+    gone = [address.replace("discrete", "gone") for address in given]
+    ran = [
+        command(*given, *gone, *out, "-v"),
+        command(*given, *out, "--json"),
+        command("inspect", given[0]),
+        command("inspect", signed),
+        command("inspect", *gone, "--json"),
+        command("compare", given[0], signed, "--runtimes", "none", "--allow-unverified", *report),
+        command(f"{place}/?sig=secret*", *out),
+    ]
+    assert [r.status for r in ran] == [2, 0, 0, 0, 2, 0, 2]
+    assert '"unchanged": 2' in ran[1].out
+    written = files(tmp_path / "here")
+    assert {"out/discrete/policy.json", "out/b-discrete/policy.json", "report.html"} < written.keys()
+    assert [name for name, data in written.items() if b"secret" in data or "secret" in name] == []
+    assert [r for r in ran if "secret" in r.out + r.err] == []
+    assert f"called b-discrete: discrete is the policy of {place}/a/discrete.bytes" in ran[0].out
+
+
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        ("https://u:p@h:8/a//b.onnx?X-Amz-Signature=1#x", "https://h:8/a/b.onnx"),
+        ("s3://key:hidden@bucket/run#1/p.onnx", "s3://bucket/run#1/p.onnx"),
+        ("hf://gpt2@main/p.onnx", "hf://gpt2@main/p.onnx"),
+        ("memory://out/discrete", "memory://out/discrete"),
+        ("runs/a@b/p.onnx", "runs/a@b/p.onnx"),
+    ],
+)
+def test_an_address_is_told_in_its_own_spelling(address: str, told: str) -> None:
+    assert fetch.shown(Path(address)) == told
+    text = f"403, message='Forbidden', url='{address}'"
+    with pytest.raises(SourceError) as raised, asking(address):
+        raise ValueError(text)
+    assert raised.value.why == f"ValueError: {text.replace(address, told)}"
+    assert raised.value.where == told
 
 
 def test_unchanged_files_of_a_web_server_are_left_out(serving: Any, tmp_path: Path) -> None:
