@@ -8,10 +8,12 @@ bundle is put in its place in one step, and is the same bytes whoever makes it.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import threading
 import uuid
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -166,7 +168,10 @@ class Cluster:
         try:
             yield from self._outcomes(client, run)
         finally:
-            client.run(leave, run.identity, on_error="ignore")
+            # One that is lost is asked for nothing: an answer would be waited for.
+            with contextlib.suppress(OSError, CancelledError):
+                if client.status == "running":
+                    client.run(leave, run.identity, on_error="ignore")
             client.close()
 
     def _outcomes(self, client: Any, run: Run) -> Iterator[Outcome]:
@@ -176,6 +181,8 @@ class Cluster:
 
         def submit(number: int, function: Any, *given: Any, **where: Any) -> None:
             # A source's place is its priority: names are given in that order.
+            if client.status != "running":
+                raise self._lost()
             future = client.submit(
                 function, run, _absolute(self.paths[number]), *given, pure=False, priority=-number, **where
             )
@@ -198,11 +205,14 @@ class Cluster:
                 submit(named, answer, names, workers=[where], allow_other_workers=True)
 
     def _said(self, future: Any, number: int) -> tuple[str, Claim | Outcome]:
-        error = future.exception()
-        if error is None:
-            result = future.result()
-            future.release()
-            return result if isinstance(result, tuple) else ("", result)
+        try:
+            error = None if future.cancelled() else future.exception()
+            if error is None:
+                result = future.result()
+                future.release()
+                return result if isinstance(result, tuple) else ("", result)
+        except (CancelledError, OSError) as gone:
+            raise self._lost() from gone
         path = self.paths[number]
         failed = SourceError(
             "was not exported by the cluster",
@@ -211,6 +221,13 @@ class Cluster:
             fix="export it alone to see more; if memory ran out, give the workers more",
         )
         return "", Outcome(path, error=failed)
+
+    def _lost(self) -> RuntimeUnavailableError:
+        return RuntimeUnavailableError(
+            f"the cluster at {self.address} was lost",
+            why="its scheduler ended or was restarted",
+            fix="call again: what was exported is left out",
+        )
 
 
 def _dask(address: str) -> Any:
@@ -225,9 +242,11 @@ def _dask(address: str) -> Any:
 def _connected(address: str) -> Any:
     try:
         client = _dask(address).Client(address, timeout=_PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # the last where tls:// lacks its settings
         raise RuntimeUnavailableError(
-            f"no scheduler answers at {address}", why=str(error), fix="start one: dask scheduler"
+            f"no scheduler answers at {address}",
+            why=str(error),
+            fix="start one: dask scheduler; for tls:// give Dask its keys: distributed.comm.tls",
         ) from error
     # A worker without this program gives an error for its version.
     found = client.run(program_version, on_error="return") if client.nthreads() else {}

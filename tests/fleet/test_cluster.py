@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from exporter.export.pipeline import ExportOptions
+from exporter.fleet import cluster as fleet_cluster
 from exporter.fleet.fleet import export_fleet
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError
@@ -94,9 +95,24 @@ def test_a_worker_is_killed(
     assert "(2 verified)" in ran.out
 
 
-def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from exporter.fleet import cluster
+def test_a_scheduler_that_ends(
+    sources: list[Path], cluster: tuple[str, list[subprocess.Popen[bytes]]], tmp_path: Path
+) -> None:
+    address, _ = cluster
+    with distributed.Client(address, set_as_default=False) as client:
+        scheduler = client.run_on_scheduler(os.getpid)
+    options, made = ExportOptions(tmp_path / "many", verify="none"), []
+    with pytest.raises(RuntimeUnavailableError, match=f"the cluster at {address} was lost"):
+        for outcome in export_fleet(sources, options, cluster=address):
+            made.append(outcome.path)
+            if len(made) == 2:
+                os.kill(scheduler, signal.SIGKILL)
+    rest = list(export_fleet(sources, options))
+    assert {o.path for o in rest if o.unchanged} == set(made)
 
-    monkeypatch.setattr(cluster, "_PATIENCE", 0.5)
+
+@pytest.mark.parametrize("scheme", ["tcp", "tls"])
+def test_a_scheduler_that_is_not_there(scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_cluster, "_PATIENCE", 0.5)
     with pytest.raises(RuntimeUnavailableError, match="no scheduler answers"):
-        list(export_fleet([fixture("discrete")], ExportOptions(tmp_path), cluster="tcp://127.0.0.1:9"))
+        list(export_fleet([fixture("discrete")], ExportOptions(tmp_path), cluster=f"{scheme}://127.0.0.1:9"))
