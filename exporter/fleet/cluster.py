@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import threading
+import time
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -33,6 +34,8 @@ from signatures.errors import RuntimeUnavailableError, SourceError
 _PATIENCE = 15
 #: Sources at a time for each thread of a worker: one at work, one that waits for its names.
 _AHEAD = 2
+#: Seconds after which a run that nothing was heard of has ended: its own process was killed.
+_FORGOTTEN = 900
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,30 @@ class _Station:
         self.waiting: dict[Path, _Working] = {}
         #: one source at a time, however many threads the worker has
         self.lock = threading.Lock()
+        self.used = time.monotonic()
+        self.ended = False
 
-    def close(self) -> None:
+    @contextlib.contextmanager
+    def turn(self) -> Iterator[None]:
+        """A source's; a run that ended meanwhile is closed after it."""
+        try:
+            with self.lock:
+                yield
+        finally:
+            self.used = time.monotonic()
+            if self.ended:
+                self.end()
+
+    def end(self) -> None:
+        """Close it, at once where nothing is at work here."""
+        self.ended = True
+        if self.lock.acquire(blocking=False):
+            try:
+                self._close()
+            finally:
+                self.lock.release()
+
+    def _close(self) -> None:
         for working in self.waiting.values():
             working.answers.put(None)
         self.waiting.clear()
@@ -99,10 +124,13 @@ _entering = threading.Lock()
 def _station(run: Run) -> _Station:
     with _entering:
         if run.identity not in _stations:
-            for left in list(_stations):  # of a run whose own process was killed
-                _stations.pop(left).close()
+            for identity, other in list(_stations.items()):
+                if time.monotonic() - other.used > _FORGOTTEN and not other.lock.locked():
+                    _stations.pop(identity).end()
             _stations[run.identity] = _Station(run)
-        return _stations[run.identity]
+        station = _stations[run.identity]
+        station.used = time.monotonic()
+        return station
 
 
 def ask(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
@@ -110,7 +138,7 @@ def ask(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
     from distributed import get_worker
 
     station = _station(run)
-    with station.lock:
+    with station.turn():
         working = _Working(station, path)
         said = working.said.get()
         if isinstance(said, Claim):
@@ -121,7 +149,7 @@ def ask(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
 def answer(run: Run, path: Path, names: list[Claimed]) -> Outcome:
     """The outcome of a source under these names; from its beginning where it does not wait for them here."""
     station = _station(run)
-    with station.lock:
+    with station.turn():
         working = station.waiting.pop(path, None)
         if working is None:
             working = _Working(station, path)
@@ -139,7 +167,7 @@ def leave(identity: str) -> None:
     with _entering:
         station = _stations.pop(identity, None)
     if station is not None:
-        station.close()
+        station.end()
 
 
 def program_version() -> str:

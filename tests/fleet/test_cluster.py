@@ -11,12 +11,15 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet import cluster as fleet_cluster
 from exporter.fleet.fleet import export_fleet
+from exporter.fleet.worker import Claim, Outcome, Wanted
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT, export_model
@@ -64,10 +67,13 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
             address = client.scheduler.address
         yield address, workers
     finally:
-        for process in (*workers, scheduler):
+        for process in (*workers, scheduler):  # one by one: Dask's worker hangs where its scheduler ends meanwhile
             process.terminate()
-        for process in (*workers, scheduler):
-            process.wait()
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
         log.close()
 
 
@@ -109,6 +115,35 @@ def test_a_scheduler_that_ends(
                 os.kill(scheduler, signal.SIGKILL)
     rest = list(export_fleet(sources, options))
     assert {o.path for o in rest if o.unchanged} == set(made)
+
+
+def test_two_runs_leave_each_other_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distributed, "get_worker", lambda: SimpleNamespace(address="here"))
+    monkeypatch.setattr(fleet_cluster, "_stations", {})
+    begun: list[Path] = []
+    closed: list[str] = []
+    real, close = fleet_cluster.exported, fleet_cluster._Station._close
+
+    def counted(exporter: Any, path: Path, *more: Any) -> Outcome:
+        begun.append(path)
+        return real(exporter, path, *more)
+
+    monkeypatch.setattr(fleet_cluster, "exported", counted)
+    monkeypatch.setattr(fleet_cluster._Station, "_close", lambda s: (closed.append(s.run.identity), close(s)))
+    source = fixture("discrete")
+    a, b, c = (fleet_cluster.Run(n, ExportOptions(tmp_path / n, verify="none"), Wanted()) for n in "abc")
+    for run in (a, b):
+        assert isinstance(fleet_cluster.ask(run, source)[1], Claim)
+    for run in (a, b):
+        assert fleet_cluster.answer(run, source, [("discrete", None)]).error is None
+    assert (len(begun), closed) == (2, [])
+    monkeypatch.setattr(fleet_cluster, "_FORGOTTEN", -1)
+    with fleet_cluster._station(b).turn():  # it is at work
+        fleet_cluster._station(c)
+        assert closed == ["a"]
+        fleet_cluster.leave("b")
+        assert closed == ["a"]
+    assert closed == ["a", "b"]
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "tls"])
