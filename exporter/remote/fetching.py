@@ -11,13 +11,12 @@ from urllib.parse import unquote, urlsplit
 
 from converters.fetch import shown
 from converters.folders import scratch_folder
-from exporter.remote.filesystem import asking, filesystem, remote
+from exporter.remote.filesystem import MAX_FILES, asking, filesystem, is_http, remote
 from signatures.digest import sha256_hex
 from signatures.errors import ExportModelError, SourceError
 
-#: Bytes and files of one source: the largest that is read is one of 2 GiB with its weights beside it.
+#: Bytes of one source: the largest that is read is one of 2 GiB with its weights beside it.
 MAX_BYTES = 8 << 30
-MAX_FILES = 4096
 _CHUNK = 1 << 20
 _LONGEST_NAME = 200
 #: What tells one version of a file from the next, as file systems call it.
@@ -78,19 +77,20 @@ def _fetched(address: str, folder: Path) -> Path:
     _within(left, address)
     left, top = (
         MAX_BYTES,
-        folder / _name(unquote(urlsplit(address).path) if _is_http(address) else shown(address), address),
+        folder / _name(unquote(urlsplit(address).path) if is_http(address) else shown(address), address),
     )
-    for name in found:
-        inside = PurePosixPath(name).relative_to(place).parts if name != place else ()
-        target = top.joinpath(*(_name(part, address) for part in inside))
-        target.parent.mkdir(parents=True, exist_ok=True)
-        left = _download(system, name, target, left, address)
+    with asking(address):  # which may say that a file has files in it, or lies elsewhere
+        for name in found:
+            inside = PurePosixPath(name).relative_to(place).parts if name != place else ()
+            target = top.joinpath(*(_name(part, address) for part in inside))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            left = _download(system, name, target, left, address)
     return top
 
 
 def _files(system: Any, place: str) -> Mapping[str, Mapping[str, Any]]:
     """Name → what is known of it: the file itself, or all that lie in the folder, in the order of their names."""
-    if _is_http(place):  # which has no folders
+    if is_http(place):  # which has no folders
         return {place: system.info(place)}
     info = system.info(place)
     if info["type"] != "directory":
@@ -100,8 +100,8 @@ def _files(system: Any, place: str) -> Mapping[str, Mapping[str, Any]]:
 
 def _download(system: Any, name: str, target: Path, left: int, address: str) -> int:
     """Copy a file; returns what is left of the bytes that one source may have, whatever was said of its size."""
-    how = {"block_size": 0} if _is_http(name) else {}
-    with asking(address), system.open(name, "rb", **how) as source, target.open("xb") as file:
+    how = {"block_size": 0} if is_http(name) else {}
+    with system.open(name, "rb", **how) as source, target.open("xb") as file:
         while chunk := source.read(_CHUNK):
             left -= len(chunk)
             _within(left, address)
@@ -125,7 +125,3 @@ def _name(path: str, address: str) -> str:
     if wrong or (os.name == "nt" and any(c in name for c in ':*?"<>|')):
         raise SourceError("a file there has a name that it cannot have here", where=shown(address), why=repr(name[:80]))
     return name
-
-
-def _is_http(address: str) -> bool:
-    return address.startswith(("http://", "https://"))

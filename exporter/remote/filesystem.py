@@ -8,15 +8,23 @@ Only what is named in ``FETCHED`` is asked for: fsspec also knows protocols that
 from __future__ import annotations
 
 import contextlib
+import fnmatch
+import html
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin
 
 from converters.fetch import FETCHED, address_of, fetches, shown
 from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
+#: Files of one source, or links of one level of a web server's pages; bytes of these pages.
+MAX_FILES = 4096
+MAX_LISTING = 16 << 20
+_CHUNK = 1 << 20
 _MAGIC = "*["
+_LINK = re.compile(r"""\bhref\s*=\s*["']?([^"'\s>]+)""", re.IGNORECASE)
 #: In the text of an error.
 _ADDRESS = re.compile(r"\b[a-z0-9]+://[^\s'\"<>]+")
 
@@ -34,7 +42,7 @@ def filesystem(address: str) -> tuple[Any, str]:
     import fsspec
 
     try:
-        system, path = fsspec.core.url_to_fs(address)
+        system, path = fsspec.core.url_to_fs(address, **(_patience() if is_http(address) else {}))
     except ImportError as error:
         raise UsageError(
             f"{address.partition('://')[0]}:// needs another package",
@@ -43,6 +51,18 @@ def filesystem(address: str) -> tuple[Any, str]:
             fix="install it beside export-model",
         ) from error
     return system, str(path)
+
+
+def is_http(address: str) -> bool:
+    """Whether a web server has it."""
+    return address.startswith(("http://", "https://"))
+
+
+def _patience() -> dict[str, Any]:
+    """How long a web server may be silent; aiohttp's own five minutes are for all of a file, however large."""
+    import aiohttp
+
+    return {"client_kwargs": {"timeout": aiohttp.ClientTimeout(total=6 * 3600, sock_connect=30, sock_read=60)}}
 
 
 @contextlib.contextmanager
@@ -70,7 +90,9 @@ def is_pattern(address: str) -> bool:
 
 
 def matching(address: str) -> list[Path]:
-    """The files that a pattern finds, by name. Raises SourceError."""
+    """The files that a pattern finds, by name. Raises SourceError, UsageError."""
+    if is_http(address):
+        return _linked(address)
     system, pattern = filesystem(address)
     with asking(address):
         found = [p for p, info in system.glob(pattern, detail=True).items() if info.get("type") == "file"]
@@ -79,3 +101,47 @@ def matching(address: str) -> list[Path]:
     fixed = address[: min(address.find(sign) for sign in _MAGIC if sign in address)].rpartition("/")[0]
     # A listing is what a server says: nothing of another one is fetched.
     return [Path(each) for each in sorted(found) if each.startswith(f"{fixed}/")]
+
+
+def _linked(address: str) -> list[Path]:
+    """The files of a web server that a pattern finds, by the links of its pages, level by level."""
+    if "**" in address:
+        raise UsageError(
+            "** is not for a web server",
+            where=shown(address),
+            why="its pages may link without end",
+            fix="give a pattern for each level (*/*.onnx), or a list of addresses in a .txt",
+        )
+    system, _ = filesystem(address)
+    scheme, _, rest = address.partition("://")
+    place, *parts = rest.split("/")
+    tops, size = [f"{scheme}://{place}"], 0
+    first = next(number for number, part in enumerate(parts) if is_pattern(part))
+    for number, part in enumerate(parts):
+        if number < first:
+            tops = [f"{top}/{part}" for top in tops]
+            continue
+        pattern = re.compile(fnmatch.translate(part.replace("?", "[?]")))  # which begins a query
+        end = "/" if number < len(parts) - 1 else ""  # as a folder's link has it
+        found = set[str]()
+        for top in tops:
+            text = bytearray()
+            with asking(address), system.open(f"{top}/", "rb", block_size=0) as page:
+                while size <= MAX_LISTING and (chunk := page.read(_CHUNK)):
+                    text += chunk
+                    size += len(chunk)
+            for link in _LINK.findall(text.decode(errors="replace")):
+                # What a page says: nothing of another place is fetched.
+                each = urljoin(f"{top}/", html.unescape(link))
+                above, _, name = each.removesuffix(end).rpartition("/")
+                if each.endswith(end) and above == top and name[:1] not in ("", "?", "#") and pattern.match(name):
+                    found.add(f"{top}/{name}")
+            if size > MAX_LISTING or len(found) > MAX_FILES:
+                raise SourceError(
+                    "lists more than is read",
+                    where=shown(address),
+                    why=f"of all levels {MAX_LISTING >> 20} MiB and of each {MAX_FILES} links are read",
+                    fix="give a narrower pattern, or a list of addresses in a .txt",
+                )
+        tops = sorted(found)
+    return [Path(top) for top in tops]

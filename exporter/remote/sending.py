@@ -9,7 +9,7 @@ from pathlib import Path
 from converters.bundle import bundle
 from converters.fetch import address_of, fetches, shown
 from converters.folders import scratch_folder
-from exporter.remote.filesystem import asking, filesystem, remote
+from exporter.remote.filesystem import asking, filesystem, is_http, remote
 from signatures.contract import POLICY
 from signatures.errors import BundleError, UsageError
 
@@ -44,7 +44,7 @@ def check_free(out: Path, name: str) -> None:
 def check_sendable(out: Path) -> None:
     """Raise UsageError where nothing can be written to an address."""
     address = address_of(out)
-    if address is not None and (remote(out) is None or address.startswith(("http://", "https://"))):
+    if address is not None and (remote(out) is None or is_http(address)):
         raise UsageError(
             "nothing can be written there",
             where=shown(address),

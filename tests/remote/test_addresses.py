@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 
 from converters import fetch
+from converters.fetch import address_of
 from exporter import export_model
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
 from exporter.fleet.worker import Outcome
-from exporter.remote import fetching, sending
+from exporter.remote import fetching, filesystem, sending
 from exporter.remote.fetching import nearby
-from exporter.remote.filesystem import asking, remote
+from exporter.remote.filesystem import asking, matching, remote
 from fixtures import path as fixture
 from signatures.contract import POLICY
 from signatures.errors import BundleError, SourceError, UsageError
@@ -280,6 +281,55 @@ def test_unchanged_files_of_a_web_server_are_left_out(serving: Any, tmp_path: Pa
     assert [run(given, tmp_path / "out")[0].unchanged for _ in range(2)] == [False, True]
     os.utime(tmp_path / "discrete.bytes", (1, 1))
     assert not run(given, tmp_path / "out")[0].unchanged
+
+
+def test_a_pattern_follows_the_links_of_each_level(
+    serving: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a/p 1.onnx", "a/q.txt", "b/p.onnx", "b/inside/p.onnx", "notes.txt"):
+        (tmp_path / "runs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "runs" / name).write_bytes(b"-")
+    place = serving(partial(_Quiet, directory=str(tmp_path)))
+    found = [address_of(p) for p in matching(f"{place}/runs/*/*.onnx")]
+    assert found == [f"{place}/runs/a/p%201.onnx", f"{place}/runs/b/p.onnx"]
+    assert [address_of(p) for p in matching(f"{place}/runs/[b]/p.onnx")] == [f"{place}/runs/b/p.onnx"]
+    with pytest.raises(UsageError, match=r"\*\* is not for a web server"):
+        matching(f"{place}/runs/**/*.onnx")
+    with monkeypatch.context() as patched, pytest.raises(SourceError, match="lists more than is read"):
+        patched.setattr(filesystem, "MAX_FILES", 1)
+        matching(f"{place}/runs/*/*.onnx")
+    monkeypatch.setattr(filesystem, "MAX_LISTING", 100)
+    with pytest.raises(SourceError, match="lists more than is read"):
+        matching(f"{place}/runs/*/*.onnx")
+
+
+class _Pages(_Redirecting):
+    """Pages that link out of their folder."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        for link in ("../p.onnx", "//elsewhere.example/p.onnx", "/runs/p.onnx", "/else/p.onnx", "?C=N", "p.onnx?x=1"):
+            self.wfile.write(f"<a href='{link}'>p</a>".encode())
+
+
+def test_links_lead_nowhere_else(serving: Any) -> None:
+    place = serving(_Pages)
+    assert [address_of(p) for p in matching(f"{place}/runs/*.onnx")] == [f"{place}/runs/p.onnx"]
+
+
+def test_a_file_may_take_longer_than_five_minutes() -> None:
+    system, _ = filesystem.filesystem("https://example.com/p.onnx")
+    timeout = system.client_kwargs["timeout"]
+    assert (timeout.total >= 3600, timeout.sock_connect, timeout.sock_read) == (True, 30, 60)
+
+
+@pytest.mark.parametrize("listed", [["/odd/a", "/odd/a/b"], ["/elsewhere/x"]])
+def test_a_listing_that_no_folder_can_have(listed: list[str], memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory.pipe("/odd/a", b"-")
+    monkeypatch.setattr(type(memory), "find", lambda *a, **k: {name: {"size": 1} for name in listed})
+    with pytest.raises(SourceError, match=r"^memory://odd: cannot be fetched"), nearby(Path("memory://odd")):
+        pass
 
 
 def test_a_redirect_leads_to_no_file(serving: Any) -> None:
