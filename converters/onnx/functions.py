@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import field
 from typing import Any
 
 from converters.graph.builder import MAX_NODES
 from converters.onnx.importer.node import STANDARD
 from converters.onnx.importer.table import TABLE
 from signatures.errors import DamagedFileError, UnsupportedOpError
+from signatures.records import dataclass
 
 #: Opsets that are read. Before 7 broadcasting was an attribute of each op.
 FIRST_OPSET = 7
+#: Copies of functions may hold this many bytes, and this factor of the model's.
+_BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
+_MAX_DEPTH = 64
+#: What an attribute that a call gives is charged beside its bytes.
+_ATTRIBUTE = 64
 
 
 def inlined(model: Any) -> Any:
@@ -20,9 +28,10 @@ def inlined(model: Any) -> Any:
     import onnx.inliner
 
     if model.functions:
-        _check_unfolding(model)
-        bodies = (model.graph, *model.functions)
-        own = {(f.domain, f.name): f.attribute_proto for f in model.functions}
+        functions = {_identity(f, f.name): f for f in model.functions}
+        called = _Unfolding(functions, int(model.ByteSize())).check(model.graph)
+        bodies = (model.graph, *(functions[name] for name in called))
+        own = {name: functions[name].attribute_proto for name in called}
         _complete([n for body in bodies for n in all_nodes(body)], own)
         try:
             model = onnx.inliner.inline_local_functions(model)
@@ -35,7 +44,8 @@ def inlined(model: Any) -> Any:
     defined = _defined(model)
     if not defined:
         return model
-    _complete(all_nodes(model.graph), {("", kind): _defaults(schema) for kind, schema in defined.items()})
+    nodes = [n for n in all_nodes(model.graph) if n.domain in STANDARD and n.op_type in defined]
+    _complete(nodes, {_identity(n, n.op_type): _defaults(defined[n.op_type]) for n in nodes})
     try:
         chosen = [("", kind) for kind in defined]
         return onnx.inliner.inline_selected_functions(model, chosen, inline_schema_functions=True)
@@ -62,42 +72,110 @@ def _defaults(schema: Any) -> list[Any]:
     return [a.default_value for a in schema.attributes.values() if a.default_value.name]
 
 
-def _complete(nodes: Sequence[Any], defaults: Mapping[tuple[str, str], Sequence[Any]]) -> None:
-    """Write out the attributes that calls of functions, by (domain, name), leave to their defaults.
+def _identity(message: Any, name: str) -> str:
+    """What a function is called by: onnx's inliner joins the three texts, so that a name may hold two of them."""
+    domain = "" if message.domain in STANDARD else message.domain
+    return f"{domain}::{name}::{message.overload}" if message.overload else f"{domain}::{name}"
+
+
+def _complete(nodes: Sequence[Any], defaults: Mapping[str, Sequence[Any]]) -> None:
+    """Write out the attributes that calls of functions, by ``_identity``, leave to their defaults.
 
     onnx's inliner drops an attribute of a function's body that refers to one that is left out: without ``axes``,
     MeanVarianceNormalization would take the mean of everything.
     """
     for node in nodes:
         given = {a.name for a in node.attribute}
-        known = defaults.get(("" if node.domain in STANDARD else node.domain, node.op_type), ())
-        node.attribute.extend(a for a in known if a.name not in given)
+        node.attribute.extend(a for a in defaults.get(_identity(node, node.op_type), ()) if a.name not in given)
 
 
-def _check_unfolding(model: Any) -> None:
+@dataclass
+class _Load:
+    """What a body unfolds to: nodes (a call is one, too), bytes that are copied, names of values.
+
+    ``reads`` is how often it takes an attribute of the function that it is part of.
+    """
+
+    nodes: int = 0
+    bytes: int = 0
+    names: int = 0
+    reads: Counter[str] = field(default_factory=Counter)
+
+    def add(self, other: _Load, times: int = 1) -> None:
+        self.nodes += times * other.nodes
+        self.bytes += times * other.bytes
+        self.names += times * other.names
+        for name, count in other.reads.items():
+            self.reads[name] += times * count
+
+
+class _Unfolding:
     """Functions that call functions that call functions may unfold a small file to any size: refuse before."""
-    functions = {(f.domain, f.name): f for f in model.functions}
-    sizes: dict[tuple[str, str], int] = {}
 
-    def size(nodes: Sequence[Any], callers: frozenset[tuple[str, str]]) -> int:
-        total = 0
-        for node in nodes:
-            key = (node.domain, node.op_type)
-            if key in callers:
-                raise DamagedFileError(f"the function {node.op_type!r} calls itself", fix="export the model again")
-            if key in functions and key not in sizes:
-                sizes[key] = size(all_nodes(functions[key]), callers | {key})
-            total += sizes.get(key, 1)
-            if total > MAX_NODES:
+    def __init__(self, functions: Mapping[str, Any], size: int) -> None:
+        self.functions = functions
+        self.most = _BYTES_FREE + _BYTES_FACTOR * size
+        self.loads: dict[str, _Load] = {}
+
+    def check(self, graph: Any) -> Iterable[str]:
+        """The functions that are called. Raises UnsupportedOpError, DamagedFileError."""
+        self._body(graph, ())
+        return self.loads
+
+    def _body(self, body: Any, within: tuple[str, ...]) -> _Load:
+        """``within`` are the functions and subgraphs around."""
+        if len(within) > _MAX_DEPTH:
+            raise UnsupportedOpError(
+                f"the model's functions call one another more than {_MAX_DEPTH} deep",
+                issues=[(body.name, "function")],
+                why="a policy's are a few deep",
+                fix="give the policy alone, without the training part",
+            )
+        load = _Load()
+        for node in body.node:
+            name = _identity(node, node.op_type)
+            load.add(self._call(node, name, within) if name in self.functions else self._plain(node, within))
+            if load.nodes > MAX_NODES or load.bytes > self.most:
                 raise UnsupportedOpError(
-                    f"the model's functions unfold to more than {MAX_NODES} nodes",
+                    f"the model's functions unfold to more than {MAX_NODES} nodes, or to more bytes than a policy has",
                     issues=[(node.name, node.op_type)],
-                    why="a policy has some hundreds",
+                    why="a policy has some hundreds of nodes",
                     fix="give the policy alone, without the training part",
                 )
-        return total
+        return load
 
-    size(all_nodes(model.graph), frozenset())
+    def _plain(self, node: Any, within: tuple[str, ...]) -> _Load:
+        load = _Load(1, 0, len(node.input) + len(node.output))
+        for attribute in node.attribute:
+            load.add(self._attribute(attribute, within))
+        return load
+
+    def _call(self, node: Any, name: str, within: tuple[str, ...]) -> _Load:
+        """The function is copied, with the call's own names and attributes wherever it reads them."""
+        if name in within:
+            raise DamagedFileError(f"the function {node.op_type!r} calls itself", fix="export the model again")
+        function = self.functions[name]
+        if name not in self.loads:
+            self.loads[name] = self._body(function, (*within, name))
+        called = self.loads[name]
+        values = [*node.input, *node.output]
+        names = called.names * max((len(v.encode()) for v in values), default=0)
+        load = _Load(1, int(function.ByteSize()) + int(node.ByteSize()) + names, len(values))
+        load.add(_Load(called.nodes, called.bytes, called.names))
+        given = {a.name for a in node.attribute}
+        for attribute in (*node.attribute, *(a for a in function.attribute_proto if a.name not in given)):
+            own = self._attribute(attribute, within)
+            own.bytes += _ATTRIBUTE + int(attribute.ByteSize())
+            load.add(own, 1 + called.reads[attribute.name])
+        return load
+
+    def _attribute(self, attribute: Any, within: tuple[str, ...]) -> _Load:
+        load = _Load()
+        if attribute.ref_attr_name:
+            load.reads[attribute.ref_attr_name] = 1
+        for graph in (*([attribute.g] if attribute.HasField("g") else ()), *attribute.graphs):
+            load.add(self._body(graph, (*within, "")))
+        return load
 
 
 def all_nodes(graph: Any) -> list[Any]:
