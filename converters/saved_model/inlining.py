@@ -24,6 +24,8 @@ _BOOL = 10  # DataType
 #: Copies of a graph's functions may hold this many nodes, and bytes: a small file could unfold to any size otherwise.
 MAX_NODES = 1 << 15
 _BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
+#: What a tensor that is handed to a function or back is charged.
+_PASSED = 1 << 8
 _MAX_DEPTH = 64
 
 
@@ -51,10 +53,25 @@ def flat(
     return _Flattening(graph_def, names or {}, restoring=restoring).run(list(roots))
 
 
+class _Function:
+    """What belongs to a function alone, however often it is called: the nodes that its results need."""
+
+    def __init__(self, definition: Any) -> None:
+        self.arguments = [a.name for a in definition.signature.input_arg]
+        self.results = [a.name for a in definition.signature.output_arg]
+        self.made_of = dict(definition.ret)
+        self.own = {n.name: n for n in definition.node_def}
+        wanted = [r.partition(":")[0] for r in self.made_of.values()] + list(definition.control_ret.values())
+        given = set(self.arguments)
+        self.nodes = _upstream(self.own, [w for w in wanted if w not in given], given)
+        self.letters = sum(len(n.name) for n in self.nodes)
+
+
 class _Flattening:
     def __init__(self, graph_def: Any, names: Mapping[str, str], *, restoring: bool) -> None:
         self.graph_def = graph_def
         self.functions = {f.signature.name: f for f in graph_def.library.function}
+        self.known: dict[str, _Function] = {}
         self.restoring = restoring
         self.scope = NameScope(n.name for n in graph_def.node if not self._calls(n))
         self.names = {old: self.scope.fresh(new) for old, new in names.items() if old != new}
@@ -137,16 +154,18 @@ class _Flattening:
             self._branch(node, name, inputs, depth)
         else:
             called = node.op if node.op in self.functions else node.attr["f"].func.name
-            for index, result in enumerate(self._body(called, name if depth else "", inputs, pivot, depth)):
+            results = self._body(called, name if depth else "", inputs, pivot, depth)
+            self._count(len(name) * len(results), 0)
+            for index, result in enumerate(results):
                 self.aliases[ref(name, index)] = result
 
     def _add(self, node: Any) -> None:
         self._count(node.ByteSize())
         self.result.node.append(node)
 
-    def _count(self, size: int) -> None:
+    def _count(self, size: int, places: int = 1) -> None:
         """Count a node or a call; raises NotAPolicyError when that is too much."""
-        self.places_left -= 1
+        self.places_left -= places
         self.bytes_left -= size
         if self.places_left < 0 or self.bytes_left < 0:
             raise NotAPolicyError(
@@ -159,22 +178,16 @@ class _Flattening:
 
     def _body(self, called: str, prefix: str, arguments: Sequence[str], pivot: str, depth: int) -> list[str]:
         """The results of a function, its nodes placed."""
-        self._count(0)
-        function = self.functions.get(called)
-        if function is None:
-            raise _damaged(f"the function {called!r} is called and is not there")
-        signature = function.signature
+        function = self._function(called)
+        passed = len(function.arguments) + len(function.results)
+        self._count(_PASSED * passed + len(prefix) * len(function.nodes) + function.letters)
         if depth >= _MAX_DEPTH:
             raise _damaged(f"the function {called!r} is called {depth} functions deep, or calls itself")
-        if len(arguments) != len(signature.input_arg):
-            taken = len(signature.input_arg)
+        if len(arguments) != len(function.arguments):
+            taken = len(function.arguments)
             raise _damaged(f"the function {called!r} takes {taken} tensors and is given {len(arguments)}")
-        given = dict(zip((a.name for a in signature.input_arg), arguments, strict=True))
-        own = {n.name: n for n in function.node_def}
-        wanted = [r.partition(":")[0] for r in function.ret.values()] + list(function.control_ret.values())
-        nodes = _upstream(own, [w for w in wanted if w not in given], set(given))
-        self._check(nodes)
-        placed = {n.name: self.scope.fresh(f"{prefix}/{n.name}" if prefix else n.name) for n in nodes}
+        given = dict(zip(function.arguments, arguments, strict=True))
+        placed = {n.name: self.scope.fresh(f"{prefix}/{n.name}" if prefix else n.name) for n in function.nodes}
 
         def tensor(reference: str) -> str:
             name, _, rest = reference.partition(":")
@@ -183,17 +196,26 @@ class _Flattening:
             if name not in placed:
                 raise _damaged(f"a node of the function {called!r} reads {reference!r}, which is not there")
             result, _, position = rest.rpartition(":")
-            return ref(placed[name], _index(own[name].op, result, position))
+            return ref(placed[name], _index(function.own[name].op, result, position))
 
-        for node in nodes:
+        for node in function.nodes:
             inputs = [tensor(i) for i in node.input if not i.startswith("^")]
             self._place(node, placed[node.name], inputs, pivot, depth + 1)
         results = []
-        for argument in signature.output_arg:
-            if argument.name not in function.ret:
-                raise _damaged(f"the function {called!r} does not say what its result {argument.name!r} is")
-            results.append(tensor(function.ret[argument.name]))
+        for result in function.results:
+            if result not in function.made_of:
+                raise _damaged(f"the function {called!r} does not say what its result {result!r} is")
+            results.append(tensor(function.made_of[result]))
         return results
+
+    def _function(self, called: str) -> _Function:
+        if called not in self.known:
+            if called not in self.functions:
+                raise _damaged(f"the function {called!r} is called and is not there")
+            function = _Function(self.functions[called])
+            self._check(function.nodes)
+            self.known[called] = function
+        return self.known[called]
 
     def _loop(self, node: Any, name: str, inputs: Sequence[str], depth: int) -> None:
         """``While`` as TensorFlow 1 writes it: Enter, Merge, LoopCond, Switch, NextIteration, Exit."""

@@ -399,6 +399,25 @@ def _saved_cases() -> None:
         function(graph, "f14", [("x", 1)], [("r", 1, "w:z:0")], [*body, added])
         return saved(folder, graph, "called:0")
 
+    def tree(depth: int, results: Sequence[str], body: Sequence[Any] = (), name: str = "a") -> Any:
+        """A function that is called 2^depth times."""
+        graph = calling([call(name, "f0", "y:y:0")], (), f"{name}:output:0")
+        for i in range(depth):
+            two = [call(name, f"f{i + 1}", "x"), call("b", f"f{i + 1}", f"{name}:output:0")]
+            function(graph, f"f{i}", [("x", 1)], [("r", 1, "b:output:0")], two)
+        function(graph, f"f{depth}", [("x", 1)], [(r, 1, "x") for r in results], body)
+        return graph
+
+    def passing(folder: Path, marker: Path) -> Path:
+        return saved(folder, tree(13, [f"{i:x}" for i in range(3500)]), "called:0")
+
+    def unread(folder: Path, marker: Path) -> Path:
+        body = [node(f"{i:x}", "Abs", "x", T=np.float32) for i in range(3000)]
+        return saved(folder, tree(14, ["r"], body), "called:0")
+
+    def naming(folder: Path, marker: Path) -> Path:
+        return saved(folder, tree(13, ["r"], name="a" * 100_000), "called:0")
+
     def missing(folder: Path, marker: Path) -> Path:
         graph = calling([call("inner", "nowhere", "x")], ("inner",))
         return saved(folder, graph, "called:0")
@@ -432,6 +451,9 @@ def _saved_cases() -> None:
         "a function that calls itself": endless,
         "functions that unfold to 2^40 calls": unfolding,
         "functions that unfold to 16 GiB": swelling,
+        "3,500 results of 2^13 calls": passing,
+        "3,000 nodes that none of 2^14 calls reads": unread,
+        "calls whose names are 100 kB": naming,
         "a function that is not there": missing,
         "a call with too many tensors": misfit,
         "an init op": main_op,
