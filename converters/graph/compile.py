@@ -20,7 +20,7 @@ from converters.graph.passes.normalise import normalise
 from converters.graph.passes.ranks import settle_ranks
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.transposes import cancel_transposes
-from converters.graph.passes.unroll import unroll
+from converters.graph.passes.unroll import MAX_NODES, unroll
 from converters.policy import Policy
 from converters.understand.brains import Brain, find_brains
 from converters.understand.derived_outputs import derive_outputs, without_chance
@@ -59,8 +59,8 @@ PASSES = (
 )
 
 
-#: Nodes upstream of a policy's outputs; placeholders among them, and outputs.
-MAX_NODES, MAX_PORTS = 1 << 14, 1 << 10
+#: A policy's placeholders, and its outputs.
+MAX_PORTS = 1 << 10
 
 
 def compile_graph(

@@ -18,7 +18,7 @@ from converters.graph.passes.unroll import MAX_TURNS, unroll
 from converters.graph.run import run_graph
 from fixtures import path
 from fixtures.goldens import read_npz
-from signatures.errors import GraphError, UnsupportedOpError
+from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 from tests import handmade
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.samples import f32, floats, ints
@@ -195,6 +195,21 @@ def test_a_loop_without_a_known_end_names_its_condition(limit: Any, turns: str) 
 def test_a_loop_that_never_ends_is_refused(nodes: list[Any]) -> None:
     with pytest.raises(UnsupportedOpError, match="more than 64 turns"):
         straight(nodes, "x")
+
+
+def test_a_loop_of_too_many_nodes_is_refused_before_they_are_made() -> None:
+    """64 turns of 600 nodes; a few turns of them are nothing."""
+
+    def wide(turns: int) -> list[Any]:
+        nodes = loop(constant("limit", turns))
+        last = next(n for n in nodes if n.name == "loop/next_x")
+        negated = [node(f"loop/wide_{i}", "Neg", last.input[0], T=F32) for i in range(600)]
+        last.input[0] = "loop/all"
+        return [*nodes, *negated, node("loop/all", "AddN", *(n.name for n in negated), T=F32, N=600)]
+
+    with pytest.raises(NotAPolicyError, match="unroll to more than 16384 nodes"):
+        straight(wide(MAX_TURNS), "x")
+    assert [n.op for n in straight(wide(2), "x").nodes].count("Neg") == 1200
 
 
 @pytest.mark.parametrize("inside", ["loop/x", "loop/next_x"])

@@ -6,7 +6,8 @@ arrays become the tensors that were written to them. Nothing is assumed of the c
 cells go the same way, as do ``tf.cond`` branches whose predicate is a constant.
 
 Precondition: normalised graph, ``sequence_length`` constant. Postcondition: no control flow is left. Raises
-UnsupportedOpError where a predicate is not constant or a loop runs for more than ``MAX_TURNS``.
+UnsupportedOpError where a predicate is not constant or a loop runs for more than ``MAX_TURNS``; NotAPolicyError where
+the turns are more than ``MAX_NODES`` together.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from converters.graph.nodes import Graph, Node, ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
 from converters.graph.shapes import Types, infer_types, run_kernel
 from converters.graph.types import INT32
-from signatures.errors import GraphError, UnsupportedOpError
+from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 from signatures.records import dataclass
 
 MAX_TURNS = 64
+#: Of a policy, before its loops are unrolled and after.
+MAX_NODES = 1 << 14
 
 
 #: How many inputs each has; a Merge has any number.
@@ -130,6 +133,7 @@ class _Unroller:
             inputs = tuple(self.plain(r, turn) for r in node.inputs)
         except _DeadError:
             return None
+        self._room(1)
         name = node.name if not turn else self.editor.add_name(f"{node.name}/turn_{turn}")
         copy = Node(name, node.op, inputs, node.attrs, node.value, node.origin)
         self.editor.nodes.append(copy)
@@ -220,6 +224,7 @@ class _Unroller:
         value = self.constant(self.plain(reference, turn))
         if value is None:
             raise _undecided(node, "the indices of a tensor array")
+        self._room(value.size)  # each becomes nodes
         return [int(i) for i in np.atleast_1d(value)]
 
     def _index(self, node: Node, turn: int | None) -> int:
@@ -308,12 +313,23 @@ class _Unroller:
 
     # ---- new nodes
 
+    def _room(self, count: int) -> None:
+        """Raise NotAPolicyError where so many more nodes would be too many."""
+        if len(self.editor.nodes) + count > MAX_NODES:
+            raise NotAPolicyError(
+                f"the graph's loops unroll to more than {MAX_NODES} nodes",
+                why="no more are converted; a policy has some hundreds",
+                fix="give the policy alone; where a placeholder decides the number of turns, set it: --set NAME=VALUE",
+            )
+
     def _add(self, op: str, inputs: list[str], name: str, **attrs: Any) -> str:
+        self._room(1)
         made = self.editor.add(op, inputs, name, **attrs)
         self.made[made] = self.editor.nodes[-1]
         return made
 
     def _const(self, array: np.ndarray, name: str) -> str:
+        self._room(1)
         made = self.editor.const(array, name)
         self.made[made] = self.editor.nodes[-1]
         return made
