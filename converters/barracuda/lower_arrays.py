@@ -358,6 +358,7 @@ def _tiled(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
     lengths = [(1 if isinstance(d, str) else d, n) for d, n in zip(shape, array.shape, strict=True)]
     if any(wanted % length for wanted, length in lengths):
         raise b.refused(f"a constant of shape {list(array.shape)} to {list(shape)}", _MIXED)
+    b.made_up(math.prod(wanted for wanted, _ in lengths))
     return Value(shape, array=np.tile(array, [wanted // length for wanted, length in lengths]))
 
 
@@ -365,7 +366,7 @@ def broadcast_to(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Axes of length 1 repeated."""
     value, shape = args[0], b.shape_of(b.node.name)
     if value.array is not None:
-        return constant_of(value.array, shape)
+        return constant_of(b, value.array, shape)
     value = b.settled(value)
     lead = len(shape) - len(value.shape)
     value = replace(value, shape=(*[1] * lead, *value.shape), axes=(*[None] * lead, *value.axes))
@@ -386,12 +387,13 @@ def filled(b: NnBuilder, args: Sequence[Value]) -> Value:
         number = b.known(1, "what it fills with")
     else:
         number = np.array(0 if b.node.op == "ZerosLike" else 1, b.type_of(b.node.inputs[0]).dtype)
-    return constant_of(number, shape)
+    return constant_of(b, number, shape)
 
 
-def constant_of(array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
+def constant_of(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
     """A constant broadcast to ``shape``; the batch counts as one row."""
     lengths = [1 if isinstance(d, str) else d for d in shape]
+    b.made_up(math.prod(lengths))
     return Value(shape, array=np.broadcast_to(array, lengths))
 
 
@@ -414,7 +416,7 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
         for count, at in ((low, 0), (high, 2)):
             if count:
                 lengths = tuple(count if i == axis else d for i, d in enumerate(value.shape))
-                parts.insert(at, constant_of(np.array(fill, np.float32), lengths))
+                parts.insert(at, constant_of(b, np.array(fill, np.float32), lengths))
         longer = tuple(d + low + high if i == axis and isinstance(d, int) else d for i, d in enumerate(value.shape))
         value = joined(b, parts, axis, longer)
     if all(pair == (0, 0) for pair in edges.values()):

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from converters.barracuda.vocabulary import Activation, C, LayerType, N
+from converters.graph.allowance import MAX_MADE, Allowance
 from converters.graph.nodes import NameScope, Node
 from converters.graph.shapes import Types
 from converters.graph.types import BATCH, Dim, TensorType
@@ -149,6 +150,8 @@ class NnBuilder:
         self.types, self.draws = types, draws
         self.drafts: list[Draft] = []
         self.node = Node("", "NoOp")
+        held = sum(t.value.size for t in types.values() if t.value is not None)
+        self._allowance = Allowance(MAX_MADE + held)
         self._names = NameScope(names)
         self._inputs: list[str] = []
         self._dims: dict[str, Dims] = {}
@@ -190,6 +193,14 @@ class NnBuilder:
             why=why,
             fix=fix or "leave nn out of --to: the ONNX of the same policy holds it",
         )
+
+    def made_up(self, elements: int) -> None:
+        """Count numbers that are about to be made, beside those of the graph; raises UnsupportedOpError."""
+        if not self._allowance.take(elements):
+            raise self.refused(
+                f"its constants unfold to {elements} numbers more",
+                "a .nn holds each as a plain number, and no policy has so many",
+            )
 
     # ------------------------------------------------------------------ layers
 
@@ -239,6 +250,7 @@ class NnBuilder:
         width = math.prod(self._dims[source][1:])
         if self._dims[source][1:3] != (1, 1):
             source = self.layer(LayerType.FLATTEN, [source], (FREE, 1, 1, width), label=f"{label}/flat")
+        self.made_up(width * row.size)
         return self.dense(source, np.zeros((width, row.size), np.float32), row, label)
 
     def like(self, dims: Dims) -> str | None:
@@ -303,6 +315,7 @@ class NnBuilder:
         """A column [N, 1, 1, 1] as [N, 1, 1, width]: early Barracudas repeat it along the batch instead."""
         key = f"{x} {width}"
         if key not in self._spread:
+            self.made_up(width)
             self._spread[key] = self.dense(x, np.ones((1, width)), np.zeros(width), "spread")
         return self._spread[key]
 

@@ -62,6 +62,7 @@ def _flattened(b: NnBuilder, image: Value, kernel: np.ndarray) -> tuple[str, np.
     places = b.placed(counted, image.axes).reshape(-1).astype(np.int64)
     name = b.stored(image)
     flat = b.layer(LayerType.FLATTEN, [name], (b.dims_of(name)[N], 1, 1, image.size), label="flat")
+    b.made_up(kernel.size)
     return flat, kernel[places]
 
 
@@ -105,6 +106,7 @@ def depthwise(b: NnBuilder, args: Sequence[Value]) -> Value:
     bias = np.zeros(channels * many, np.float32)
     if many == 1:
         return _convolved(b, args[0], kernel.transpose(0, 1, 3, 2), bias, LayerType.DEPTHWISE_CONV2D)
+    b.made_up(kernel.size * channels)
     full = np.zeros((height, width, channels, channels * many), np.float32)
     for channel in range(channels):
         full[:, :, channel, channel * many : (channel + 1) * many] = kernel[:, :, channel]
@@ -115,7 +117,9 @@ def _convolved(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray, kin
     down, across = b.node.attrs.get("dilations", (1, 1, 1, 1))[1:3]
     if (down, across) != (1, 1):
         height, width, *rest = kernel.shape
-        grown = np.zeros(((height - 1) * down + 1, (width - 1) * across + 1, *rest), np.float32)
+        shape = ((height - 1) * down + 1, (width - 1) * across + 1, *rest)
+        b.made_up(math.prod(shape))
+        grown = np.zeros(shape, np.float32)
         grown[::down, ::across] = kernel
         kernel = grown
     data = [("kernel", kernel), ("bias", bias.reshape(1, 1, 1, -1))]
@@ -179,6 +183,7 @@ def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None]
     # All pixels of each channel: what is left of the image is one.
     pixels = C not in places and all(length == 1 or place in places for place, length in ((1, h), (2, w)))
     if op in ("Sum", "Mean") and whole:
+        b.made_up(width)
         share = 1.0 if op == "Sum" else 1 / width
         return b.dense(name, np.full((width, 1), share), np.zeros(1))
     if op in ("Sum", "Mean") and pixels:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from types import MappingProxyType
 
@@ -179,8 +181,10 @@ def _computed(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value
         if value is None or value.array is None or entry.kernel is None:
             raise b.refused("it repeats a constant by a number that is computed", "lengths are known in a .nn")
         operands.append(np.asarray(value.array))
+    made = itertools.takewhile(b.types.__contains__, (ref(node.name, i) for i in itertools.count()))
+    shapes = [b.shape_of(r) for r in made]
+    b.made_up(sum(math.prod(d for d in shape if isinstance(d, int)) for shape in shapes))
     arrays_ = run_kernel(entry, node, operands)
-    shapes = [b.shape_of(ref(node.name, i)) for i in range(len(arrays_))]
     for array, shape in zip(arrays_, shapes, strict=True):
         if [1 if d == BATCH else d for d in shape] != list(array.shape):
             raise b.refused(f"a constant of shape {list(shape)}", "its rows are not the same for every agent")

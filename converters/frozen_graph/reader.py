@@ -12,7 +12,8 @@ import numpy as np
 
 from converters import schema
 from converters.detached import Detached
-from converters.frozen_graph.tensors import Allowance, to_array
+from converters.frozen_graph.tensors import to_array
+from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
 from converters.graph.ops.outside import CALLS
 from converters.graph.ops.table import is_fed

@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from converters.detached import LARGE, Detached
+from converters.graph.allowance import Allowance
 from converters.schema import TensorProto, dtype_number, dtype_of
 from signatures.errors import DamagedFileError
 
-#: Constants that are written as one repeated value may not unfold to more elements than this, in all of a graph: a
-#: file of a few bytes could claim the whole memory otherwise. (A dense layer of ML-Agents has 1 << 18.)
-MAX_UNFOLDED = 1 << 24
 _MAX_AXES = 32
 _MAX_ELEMENTS = 1 << 31
 _MAX_STRING_BYTES = 1 << 26
@@ -31,19 +29,6 @@ _VALUE_FIELDS = {
     "uint32": "uint32_val",
     "uint64": "uint64_val",
 }
-
-
-class Allowance:
-    """How many elements the constants of one graph may still unfold to."""
-
-    def __init__(self, elements: int = MAX_UNFOLDED) -> None:
-        self._left = elements
-
-    def take(self, elements: int) -> None:
-        """Count ``elements``; raises DamagedFileError when that is too much."""
-        self._left -= elements
-        if self._left < 0:
-            raise _damaged(f"it claims {elements} elements that the file does not hold")
 
 
 def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached | None = None) -> np.ndarray:
@@ -70,7 +55,9 @@ def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached 
         raise _damaged(f"it holds {values.size} values for {count} elements")
     if values.size < count:
         # TensorFlow's short form: the last value stands for all that are missing, zero if there is none.
-        (allowance or Allowance()).take(count - values.size)
+        claimed = count - values.size
+        if not (allowance or Allowance()).take(claimed):
+            raise _damaged(f"it claims {claimed} elements that the file does not hold")
         last = values[-1] if values.size else dtype.type(0)
         values = np.concatenate([values, np.full(count - values.size, last, dtype)])
     return values.reshape(shape)

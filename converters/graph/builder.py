@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE, op_of
@@ -41,7 +42,7 @@ class Builder:
     def __init__(self, names: NameScope) -> None:
         self.nodes: list[Node] = []
         self.types: Types = {}
-        self.symbols = Symbols()
+        self.symbols, self.allowance = Symbols(), Allowance()
         self.names = names
         #: what the names of new nodes begin with; empty: a name is what ``add`` is given
         self.prefix = ""
@@ -106,7 +107,7 @@ class Builder:
                 fix="give the policy alone, without the training part",
             )
         if self.typed:
-            add_types(self.types, node, self.symbols)
+            add_types(self.types, node, self.symbols, self.allowance)
             if not TABLE[node.op].of_shape and any(r in self.tainted for r in node.inputs):
                 self.tainted.update(ref(node.name, i) for i in range(self.outputs(node.name)))
         self.position[node.name] = len(self.nodes)

@@ -7,16 +7,21 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.base import MISFIT, OpDef, misfit
 from converters.graph.ops.table import CONTROL_FLOW, op_of
-from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, product
+from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, of_array, product
 from signatures.errors import ExportModelError, GraphError
 
 Types = dict[str, TensorType]
 
 #: Folding may not make a constant of more elements than this out of smaller ones.
 _MAX_FOLD = 1 << 20
+#: Results of up to so many elements are folded whatever was folded before: shapes and indices are.
+_SMALL = 1 << 8
+#: ``moves`` of ops whose results mostly are their operand's memory under another shape.
+_VIEWS = ("same", "view")
 #: No tensor may have more elements than this per row (256 MiB in float32), unless one that the op was given has as
 #: many: a Fill, Tile, Pad, Range or OneHot of a few bytes may ask for any amount of memory, thirty Concats of a tensor
 #: with itself, too.
@@ -37,7 +42,7 @@ def infer_types(graph: Graph, *, partial: bool = False) -> Types:
 
 def _inferred(graph: Graph, partial: bool) -> Types:
     types: Types = {}
-    symbols = Symbols()
+    symbols, allowance = Symbols(), Allowance()
     for node in graph.nodes:
         if node.op in CONTROL_FLOW and partial:
             dtype = types[node.inputs[0]].dtype if node.inputs and node.inputs[0] in types else FLOAT32
@@ -47,29 +52,46 @@ def _inferred(graph: Graph, partial: bool) -> Types:
             for index in range(2):
                 types[ref(node.name, index)] = TensorType(node.attrs.get("dtype", dtype), None)
         else:
-            add_types(types, node, symbols)
+            add_types(types, node, symbols, allowance)
     return types
 
 
-def add_types(types: Types, node: Node, symbols: Symbols) -> None:
+def add_types(types: Types, node: Node, symbols: Symbols, allowance: Allowance) -> None:
     """Extend ``types`` by the outputs of a node whose inputs are in it; raises as ``infer_types`` does."""
-    for index, result in enumerate(_known_results(node, _arguments(node, types), symbols)):
+    for index, result in enumerate(_known_results(node, _arguments(node, types), symbols, allowance)):
         types[ref(node.name, index)] = result
 
 
-def _known_results(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+def _known_results(
+    node: Node, args: Sequence[TensorType], symbols: Symbols, allowance: Allowance
+) -> Sequence[TensorType]:
     """What a node gives. Most passes leave most nodes as they are: those are inferred once, unless new symbols come of
-    them, which must be the graph's own.
+    them, which must be the graph's own. What they fold is counted every time.
     """
     if node.inferred is not None:
         before, results = node.inferred
-        if len(before) == len(args) and all(map(operator.is_, before, args)):
+        if (
+            len(before) == len(args)
+            and all(map(operator.is_, before, args))
+            and allowance.take(_folded(node, args, results))
+        ):
             return results
     made = symbols.count
-    results = _results(op_of(node), node, args, symbols)
-    if symbols.count == made:
+    results = _results(op_of(node), node, args, symbols, allowance)
+    if symbols.count == made and allowance.left >= 0:
         object.__setattr__(node, "inferred", (args, results))
     return results
+
+
+def _folded(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> int:
+    """Elements of new memory that the values of results take; one for a view, so that it has its end, too."""
+    values = [r.value for r in results if r.value is not None and r.value.size > _SMALL]
+    if not values or not args:
+        return 0
+    operand = args[0].value
+    if op_of(node).moves in _VIEWS and operand is not None and all(np.may_share_memory(v, operand) for v in values):
+        return 1
+    return sum(v.size for v in values)
 
 
 def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:
@@ -83,7 +105,9 @@ def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:
         ) from error
 
 
-def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+def _results(
+    op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols, allowance: Allowance
+) -> Sequence[TensorType]:
     try:
         results = op.infer(node, args, symbols)
     except ExportModelError:
@@ -96,12 +120,17 @@ def _results(op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols
     values = [a.value for a in args]
     if any(v is None for v in values):
         return results
+    sizes = [_elements(r) for r in results]
+    large = sum(size for size in sizes if size > _SMALL)
+    least = min(large, 1) if op.moves in _VIEWS else large
+    if max(sizes, default=0) > _MAX_FOLD or (least > allowance.left and not allowance.take(least)):
+        return results
     known = [v for v in values if v is not None]
     if all(v.dtype != object for v in known):
-        if any(_elements(r) > _MAX_FOLD for r in results):
-            return results
-        return [TensorType(v.dtype, tuple(int(d) for d in v.shape), v) for v in run_kernel(op, node, known)]
-    return _symbolic(op, node, args, known, results, symbols)
+        folded: Sequence[TensorType] = [of_array(v) for v in run_kernel(op, node, known)]
+    else:
+        folded = _symbolic(op, node, args, known, results, symbols)
+    return folded if allowance.take(_folded(node, args, folded)) else results
 
 
 def _elements(kind: TensorType) -> int:

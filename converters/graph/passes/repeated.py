@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, NameScope, Node, normal_ref
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import Types, infer_types, run_kernel
@@ -21,9 +23,10 @@ def broadcast_rows(graph: Graph, fetches: Iterable[str]) -> Graph:
     """The graph upstream of ``fetches``, whose binary ops take one row in place of the same row for every agent."""
     types, names = infer_types(graph), NameScope(n.name for n in graph.nodes)
     rows: dict[str, np.ndarray] = {}
+    allowance = Allowance()
     nodes: list[Node] = []
     for node in graph.nodes:
-        row = _row(node, rows, types)
+        row = _row(node, rows, types, allowance)
         if row is not None:
             rows[node.name] = row
         elif len(node.inputs) == 2 and op_of(node).elementwise:
@@ -32,7 +35,7 @@ def broadcast_rows(graph: Graph, fetches: Iterable[str]) -> Graph:
     return Graph(tuple(nodes)).pruned(fetches) if rows else graph
 
 
-def _row(node: Node, rows: Mapping[str, np.ndarray], types: Types) -> np.ndarray | None:
+def _row(node: Node, rows: Mapping[str, np.ndarray], types: Types, allowance: Allowance) -> np.ndarray | None:
     """The row [1, …] that a tensor has for every agent; None where it is another tensor."""
     shape = types[node.name].shape if node.name in types else None
     if not shape or shape[0] != BATCH or any(isinstance(d, str) for d in shape[1:]):
@@ -40,15 +43,19 @@ def _row(node: Node, rows: Mapping[str, np.ndarray], types: Types) -> np.ndarray
     lengths = [1, *(int(d) for d in shape[1:])]
     if node.op in _REPEAT:
         if node.op in ("ZerosLike", "OnesLike"):
-            return np.full(lengths, node.op == "OnesLike", types[node.name].dtype)
-        value = types[node.inputs[1 if node.op == "Fill" else 0]].constant
-        fits = value is not None and (node.op != "Tile" or list(value.shape) == lengths)
-        return np.array(np.broadcast_to(value, lengths)) if value is not None and fits else None
+            value: np.ndarray | None = np.array(node.op == "OnesLike", types[node.name].dtype)
+        else:
+            value = types[node.inputs[1 if node.op == "Fill" else 0]].constant
+        if value is None or (node.op == "Tile" and list(value.shape) != lengths):
+            return None
+        return np.array(np.broadcast_to(value, lengths)) if allowance.take(math.prod(lengths)) else None
     operands = [rows.get(normal_ref(r), types[r].constant) for r in node.inputs]
     known = [o for o in operands if o is not None]
     entry = op_of(node)
     repeats = any(normal_ref(r) in rows for r in node.inputs)
     if not repeats or len(known) < len(operands) or not entry.elementwise or entry.kernel is None:
+        return None
+    if not allowance.take(math.prod(lengths)):
         return None
     return run_kernel(entry, node, known)[0]
 

@@ -1,0 +1,77 @@
+"""A graph of some hundred bytes that would fill the memory as a ``.nn`` is refused before anything of it is made."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from converters.barracuda.lower import policy_model
+from converters.frozen_graph.reader import read_graph
+from converters.graph.compile import compile_graph
+from converters.policy import Policy
+from signatures.errors import UnsupportedOpError
+from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
+
+X = "vector_observation"
+MODEST = 64 << 20
+
+
+def policy(*nodes: NodeDef) -> Policy:
+    (read,) = compile_graph(read_graph(graph_bytes(nodes)), "policy")
+    return read
+
+
+def index(value: int | Sequence[int]) -> np.ndarray:
+    return np.array(value, np.int32)
+
+
+def spread(count: int, side: int) -> list[NodeDef]:
+    """Numbers repeated to squares that are larger than what is folded, and summed up again."""
+    made = [placeholder(X), constant("dims", index([side, side])), constant("axes", index([0, 1]))]
+    total = X
+    for i in range(count):
+        made += [
+            *(constant(f"value{i}", 0.5 + i), node(f"square{i}", "BroadcastTo", f"value{i}", "dims")),
+            node(f"sum{i}", "Sum", f"square{i}", "axes", keep_dims=False),
+            node(f"added{i}", "Add", total, f"sum{i}"),
+        ]
+        total = f"added{i}"
+    return [*made, node("action", "Tanh", total)]
+
+
+def hot_constant(depth: int) -> list[NodeDef]:
+    return [
+        *(placeholder(X, (None, 2)), constant("class", index([0, 1])), constant("depth", index(depth))),
+        *(constant("on", 1.0), constant("off", 0.0)),
+        node("kernel", "OneHot", "class", "depth", "on", "off", axis=-1),
+        *(node("action", "MatMul", X, "kernel"),),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "words"),
+    [
+        pytest.param(spread(8, 1 << 13), "unfold to 67108864 numbers", id="large constants"),
+        pytest.param(hot_constant(1 << 24), "unfold to 33554432 numbers", id="OneHot of constants"),
+        pytest.param(spread(30, 1 << 11), "unfold to 4194304 numbers", id="many constants"),
+    ],
+)
+def test_it_is_refused_before_it_is_made(nodes: list[NodeDef], words: str) -> None:
+    read = policy(*nodes)
+    limit = MODEST if "4194304" not in words else 3 * MODEST  # some of the many are made
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnsupportedOpError, match=words) as caught:
+            policy_model(read)
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()
+    assert caught.value.issues
+
+
+@pytest.mark.parametrize("nodes", [spread(1, 1 << 11), hot_constant(64)], ids=["spread", "kernel"])
+def test_what_a_policy_has_of_these_is_written(nodes: list[NodeDef]) -> None:
+    assert policy_model(policy(*nodes)).layers
