@@ -293,7 +293,7 @@ def gather(b: NnBuilder, args: Sequence[Value]) -> Value:
         result = chosen(b, value, axis, flat)
         return _dropped(result, [axis]) if indices.array.ndim == 0 else result
     if value.array is not None and value.array.ndim == 2 and axis % 2 == 0 and indices.size == 1:
-        hot = _hot(b, b.rows(indices), np.arange(value.array.shape[0]), 1.0, 0.0)
+        hot = _hot(b, b.rows(indices), value.array.shape[0], 1.0, 0.0)
         name = b.dense(hot, value.array.astype(np.float32), np.zeros(value.array.shape[1]), "row")
         return b.result(name)
     raise b.refused("its indices are computed", "rows of a constant table by one number per agent can be written")
@@ -314,19 +314,20 @@ def one_hot(b: NnBuilder, args: Sequence[Value]) -> Value:
         raise b.refused(
             f"indices of shape {list(value.shape)}, axis {axis}", "it takes a row per agent, and the last axis"
         )
-    hot = _hot(b, b.rows(value), np.tile(np.arange(depth), columns), on, off, columns)
+    hot = _hot(b, b.rows(value), depth, on, off, columns)
     flat = b.made(hot, (BATCH, columns * depth), (N, C))
     return reshaped(b, flat, shape)
 
 
-def _hot(b: NnBuilder, x: str, classes: np.ndarray, on: float, off: float, columns: int = 1) -> str:
-    """``on`` where an index of ``x`` [N, 1, 1, columns] is its class, else ``off``.
+def _hot(b: NnBuilder, x: str, depth: int, on: float, off: float, columns: int = 1) -> str:
+    """``on`` where an index of ``x`` [N, 1, 1, columns] is the class, else ``off``: ``depth`` classes of each column.
 
     1 − (index − class)² is 1 there, and at most 0 for every other whole number.
     """
-    depth = classes.size // columns
+    b.table(columns, columns * depth)
+    classes = np.tile(np.arange(depth, dtype=np.float32), columns)
     spread = np.kron(np.eye(columns), np.ones((1, depth)))
-    distance = b.dense(x, spread, -classes.astype(np.float32), "distance")
+    distance = b.dense(x, spread, -classes, "distance")
     near = b.shifted(b.scaled(b.two(LayerType.MUL, distance, distance, "square"), -1, "negative"), 1, "near")
     hot = b.activation(Activation.RELU, near, label="hot")
     hot = hot if on - off == 1 else b.scaled(hot, on - off, "on")

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from converters.barracuda.vocabulary import Activation, C, LayerType, N
 from converters.graph.allowance import MAX_MADE, Allowance
+from converters.graph.nn.choosing import MAX_TABLE
 from converters.graph.nodes import NameScope, Node
 from converters.graph.shapes import Types
 from converters.graph.types import BATCH, Dim, TensorType
@@ -201,6 +202,16 @@ class NnBuilder:
                 f"its constants unfold to {elements} numbers more",
                 "a .nn holds each as a plain number, and no policy has so many",
             )
+
+    def table(self, rows: int, columns: int) -> tuple[int, int]:
+        """The shape of a matrix that is about to be made; raises UnsupportedOpError where it is too large."""
+        if rows * columns > MAX_TABLE:
+            raise self.refused(
+                f"a table of {rows}×{columns} numbers",
+                f"it is computed by comparing each with each, and no more than {MAX_TABLE} pairs are",
+            )
+        self.made_up(rows * columns)
+        return rows, columns
 
     # ------------------------------------------------------------------ layers
 

@@ -241,10 +241,11 @@ def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
     x = b.rows(value)
     if width == 1:
         return b.result(b.constant_rows(np.zeros(1, np.float32), "only"))
+    pairs = b.table(width, width)
     kind = LayerType.REDUCE_MAX if b.node.op == "ArgMax" else LayerType.REDUCE_MIN
     top = b.layer(kind, [x], (b.dims_of(x)[N], 1, 1, 1), label="top")
     best = b.two(LayerType.EQUAL, x, b.spread(top, width), "is_best")
-    before = b.dense(best, np.triu(np.ones((width, width)), 1), np.zeros(width), "before")
+    before = b.dense(best, np.triu(np.ones(pairs), 1), np.zeros(width), "before")
     first = b.activation(Activation.RELU, b.two(LayerType.SUB, best, before, "after_none"), label="first")
     return b.result(b.dense(first, np.arange(width).reshape(-1, 1), np.zeros(1)))
 
