@@ -162,6 +162,8 @@ class OpDef:
     elementwise: bool = False
     #: The result depends on the shapes of the operands, not on their elements.
     of_shape: bool = False
+    #: The number that every element of the result is, whatever the operand holds.
+    full_of: int | None = None
     layer: Layer = ""
     sampler: Sampler = ""
     #: What papers call the activation that it is.

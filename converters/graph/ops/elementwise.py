@@ -389,8 +389,8 @@ UNARY = (
         precision="exact",
         elementwise=True,
     ),
-    _unary("ZerosLike", lambda node, x: np.zeros_like(x), _lower_zeros_like, precision="exact"),
-    _unary("OnesLike", lambda node, x: np.ones_like(x), _lower_ones_like, precision="exact"),
+    _unary("ZerosLike", lambda node, x: np.zeros_like(x), _lower_zeros_like, precision="exact", full_of=0),
+    _unary("OnesLike", lambda node, x: np.ones_like(x), _lower_ones_like, precision="exact", full_of=1),
 )
 
 BINARY = (

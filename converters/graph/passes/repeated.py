@@ -16,8 +16,6 @@ from converters.graph.ops.table import op_of
 from converters.graph.shapes import Types, infer_types, run_kernel
 from converters.graph.types import BATCH
 
-_REPEAT = ("Tile", "BroadcastTo", "Fill", "ZerosLike", "OnesLike")
-
 
 def broadcast_rows(graph: Graph, fetches: Iterable[str]) -> Graph:
     """The graph upstream of ``fetches``, whose binary ops take one row in place of the same row for every agent."""
@@ -41,9 +39,10 @@ def _row(node: Node, rows: Mapping[str, np.ndarray], types: Types, allowance: Al
     if not shape or shape[0] != BATCH or any(isinstance(d, str) for d in shape[1:]):
         return None
     lengths = [1, *(int(d) for d in shape[1:])]
-    if node.op in _REPEAT:
-        if node.op in ("ZerosLike", "OnesLike"):
-            value: np.ndarray | None = np.array(node.op == "OnesLike", types[node.name].dtype)
+    entry = op_of(node)
+    if entry.moves == "repeat" or entry.full_of is not None or node.op == "Fill":
+        if entry.full_of is not None:
+            value: np.ndarray | None = np.array(entry.full_of, types[node.name].dtype)
         else:
             value = types[node.inputs[1 if node.op == "Fill" else 0]].constant
         if value is None or (node.op == "Tile" and list(value.shape) != lengths):
@@ -51,7 +50,6 @@ def _row(node: Node, rows: Mapping[str, np.ndarray], types: Types, allowance: Al
         return np.array(np.broadcast_to(value, lengths)) if allowance.take(math.prod(lengths)) else None
     operands = [rows.get(normal_ref(r), types[r].constant) for r in node.inputs]
     known = [o for o in operands if o is not None]
-    entry = op_of(node)
     repeats = any(normal_ref(r) in rows for r in node.inputs)
     if not repeats or len(known) < len(operands) or not entry.elementwise or entry.kernel is None:
         return None
