@@ -115,8 +115,8 @@ def redrawn(graph: Graph, contract: Contract) -> Graph:
     count = NameScope(n.name for n in graph.nodes).fresh("draws")
     draws: dict[str, Node] = {}
     for node in (graph[n] for n in sorted(graph.ancestors(drawn))):
-        shape = graph.constant(node.inputs[1]) if node.op == "Reshape" else None
-        if shape is None or shape.tolist() != [-1, 1]:
+        setting = graph.constant(node.inputs[1]) if node.op in ("Reshape", "ExpandDims") else None
+        if setting is None or setting.tolist() not in ([-1, 1], 1):  # a column, of either
             continue
         best, dtype = graph.producer(node.inputs[0]), None
         while best.op == "Cast":  # of a format that has not the dtype, or whose ArgMax gives another

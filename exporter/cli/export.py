@@ -81,7 +81,7 @@ if TYPE_CHECKING:
     help="auto, full, browser, none, or runtimes by name.",
 )
 @click.option("--jobs", type=int, metavar="N", help="Export N sources at a time (default: 1).")
-@click.option("--cluster", metavar="ADDRESS", help="Export on a Dask cluster: tcp://host:8786.")
+@click.option("--cluster", metavar="ADDRESS", help="Export on the workers of a Dask cluster.")
 @click.option("--again", is_flag=True, help="Of many sources, export the unchanged ones too.")
 @click.option("--fail-fast", is_flag=True, help="Of many sources, stop at the first that fails.")
 @reporting

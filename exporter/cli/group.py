@@ -34,7 +34,7 @@ GROUPS = {
     "How to verify": (
         *("runtimes", "allow_unverified", "samples", "seed", "steps", "atol", "rtol", "tolerances", "golden", "sizes"),
     ),
-    "Many sources": ("jobs", "again", "fail_fast"),
+    "Many sources": ("jobs", "cluster", "again", "fail_fast"),
     "The server": ("host", "port", "opens", "no_open"),
     "Output": ("verbose", "quiet", "as_json", "html", "markdown", "junit", "help"),
 }

@@ -22,8 +22,8 @@ _SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
     short_help="Open a page on which the policy acts.",
     examples=(
         ("export-model serve exported/3DBall --open", "in your browser"),
-        ("export-model serve 3DBall.onnx", "a source: exported for the page"),
-        ("export-model serve exported/3DBall -o page.html", "one file, opened from the disk or sent to somebody"),
+        ("export-model serve 3DBall.onnx", "exported for the page"),
+        ("export-model serve exported/3DBall -o page.html", "one file, to open or send"),
         ("export-model serve exported/3DBall -o site", "files for any web server"),
     ),
 )

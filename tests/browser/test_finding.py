@@ -101,7 +101,7 @@ def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> No
     command = WEBGL.command()
     assert command[0] == "node"
     assert command[2:4] == ["--runtime", "tfjs-webgl"]
-    assert command[-2:] == ["--chromium", "chrome"]
+    assert command[-3:] == ["--chromium", "chrome", "--known"]
     monkeypatch.setattr(browser, "node_executable", lambda: None)
     with pytest.raises(RuntimeUnavailableError, match="Node is not installed"):
         WEBGL.command()

@@ -217,7 +217,7 @@ def test_a_checkpoint_alone_says_what_it_lacks(tmp_path: Path) -> None:
 
 def test_a_metagraph_without_its_values(tmp_path: Path) -> None:
     file = policy().write(tmp_path / "model-1.ckpt.meta", meta=True)
-    with pytest.raises(SourceError, match=r"model-1\.ckpt\.index: cannot be read"):
+    with pytest.raises(SourceError, match=r"model-1\.ckpt\.index: no such file"):
         read_source(file)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tests.faults.artefacts import Artefact, Web
+from tests.faults.artefacts import Artefact, Onnx, Web
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ def _branches_turned(artefact: Artefact) -> None:
 
 
 def _one_bit(artefact: Artefact) -> None:
-    index = "deterministic_action/branch_2/argmax"
+    # in ONNX the index and its column are one node
+    index = f"deterministic_action/branch_2/{'column' if isinstance(artefact, Onnx) else 'argmax'}"
     dtype = np.int32 if isinstance(artefact, Web) else np.int64
     most = artefact.add_constant("fault/most", np.array(1, dtype))
     artefact.redirect(index, artefact.insert("fault/bit", "Minimum", [index, most], (dtype,)))
@@ -147,6 +148,7 @@ FAULTS = (
         "deterministic_action",
         ("deterministic_action/branch_2/column",),
         "Reshape",
+        elsewhere={"onnx": (("deterministic_action",), "ConcatV2")},
     ),
     Fault(
         "an index narrowed to 32 bits",

@@ -131,12 +131,16 @@ def least_likely(drawn: np.ndarray, log_probs: np.ndarray, branches: Sequence[in
     parts = np.split(log_probs, np.cumsum(branches)[:-1], axis=1)
     found = [(fit(drawn[i, :, b], part[i]), b, i) for b, part in enumerate(parts) for i in range(len(drawn))]
     found += [(fit_all(drawn[:, :, b], part), b, 0) for b, part in enumerate(parts)]
+    count = len(found) + len(parts) * (len(parts) - 1) // 2
+    wrong_alone = [f for f in found if f[0] * count < FALSE_ALARM]
     for (a, first), (b, second) in combinations(enumerate(parts), 2):
         joint = drawn[:, :, a] * branches[b] + drawn[:, :, b]
         both = (first[:, :, None] + second[:, None, :]).reshape(len(first), -1)
         found.append((fit_all(joint, both), b, 0))
     p_value, branch, worst = min(found)
-    return min(1.0, p_value * len(found)), branch, worst
+    if wrong_alone:  # what is wrong by itself is wrong beside another, too
+        _, branch, worst = min(wrong_alone)
+    return min(1.0, p_value * count), branch, worst
 
 
 def likely(p_value: float) -> Difference:
