@@ -11,35 +11,51 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from signatures.contract import parse_signature, parse_source_map
+from signatures.contract import _RANKS, parse_signature, parse_source_map
 from signatures.fields import Field
 from signatures.roles import INPUT_ROLES, Role
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec
 
 NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
 NUMBERS = st.integers(-(2**40), 2**40) | st.floats(allow_nan=False, allow_infinity=False)
-SHAPES = st.lists(st.none() | st.integers(0, 512), max_size=4).map(tuple)
+AXES = st.none() | st.integers(0, 9)
+SHAPES = st.lists(AXES, max_size=4).map(tuple)
 SOURCES = st.none() | NAMES | st.lists(NAMES, min_size=1, max_size=3).map(tuple)
 DISTRIBUTIONS = st.none() | st.fixed_dictionaries({"kind": st.just("normal"), "mean": NUMBERS, "std": NUMBERS})
 
 
-def tensors(roles: Sequence[Role], least: int = 0) -> st.SearchStrategy[tuple[TensorSpec, ...]]:
-    one = st.builds(
-        TensorSpec,
-        name=NAMES,
-        role=st.sampled_from(roles),
-        dtype=st.sampled_from(["float32", "int32", "int64", "bool"]),
-        shape=SHAPES,
-        source=SOURCES,
-        distribution=DISTRIBUTIONS,
-    )
-    return st.lists(one, min_size=least, max_size=3, unique_by=lambda s: s.name).map(tuple)
+@st.composite
+def tensor(draw: st.DrawFn, roles: Sequence[Role], total: int) -> TensorSpec:
+    """Of as many axes as its role has; masks and chances are one for each of ``total`` actions, if that is known."""
+    role = draw(st.sampled_from(roles))
+    ranks = _RANKS.get(role, range(5))
+    shape = draw(st.lists(AXES, min_size=min(ranks), max_size=min(max(ranks), 5)))
+    if role in (Role.MASKS, Role.LOG_PROBS, Role.PROBS) and total:
+        shape[-1] = draw(st.sampled_from([None, total]))
+    dtype = draw(st.sampled_from(["float32", "int32", "int64", "bool"]))
+    return TensorSpec(draw(NAMES), role, dtype, tuple(shape), draw(SOURCES), draw(DISTRIBUTIONS))
+
+
+def tensors(roles: Sequence[Role], total: int) -> st.SearchStrategy[list[TensorSpec]]:
+    return st.lists(tensor(roles, total), max_size=3, unique_by=lambda s: s.name)
+
+
+@st.composite
+def actions(draw: st.DrawFn, space: str) -> list[TensorSpec]:
+    kinds = {"hybrid": [Role.CONTINUOUS, Role.SAMPLED], "discrete": [Role.SAMPLED], "continuous": [Role.CONTINUOUS]}
+    shapes = st.tuples(st.none(), st.integers(1, 9))
+    return [
+        TensorSpec(f"head {i}", role, "float32", draw(shapes), draw(SOURCES)) for i, role in enumerate(kinds[space])
+    ]
 
 
 @st.composite
 def signatures(draw: st.DrawFn) -> PolicySignature:
-    inputs = draw(tensors(INPUT_ROLES))
-    outputs = draw(tensors([r for r in Role if r not in INPUT_ROLES], 2))
+    space = draw(st.sampled_from(["continuous", "discrete", "hybrid"]))
+    branches = tuple(draw(st.lists(st.integers(1, 9), max_size=3)))
+    inputs = tuple(draw(tensors(INPUT_ROLES, sum(branches))))
+    others = draw(tensors([r for r in Role if r not in INPUT_ROLES], sum(branches)))
+    outputs = (*draw(actions(space)), *(s for s in others if s.name not in ("head 0", "head 1")))
     name = st.none() | st.sampled_from([s.name for s in inputs]) if inputs else st.none()
     memory = st.builds(
         Memory,
@@ -52,8 +68,8 @@ def signatures(draw: st.DrawFn) -> PolicySignature:
         inputs=inputs,
         outputs=outputs,
         family=draw(NAMES),
-        action_space=draw(st.sampled_from(["continuous", "discrete", "hybrid"])),
-        branches=draw(st.lists(st.integers(1, 9), max_size=3).map(tuple)),
+        action_space=space,
+        branches=branches,
         algorithm=draw(st.none() | st.sampled_from(["PPO", "SAC"])),
         memory=draw(st.none() | memory),
         preprocess={s.name: {"layout": "NHWC", "range": [0, 1], "from_bytes": "as they are"} for s in inputs[:1]},
