@@ -12,7 +12,6 @@ from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from signatures.contract import FileEntry
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
+    from signatures.contract import FileEntry
     from signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
@@ -58,6 +58,8 @@ class Artifact:
 
     def write(self, folder: Path) -> dict[str, FileEntry]:
         """Write its files to a folder; what each became, by its path. Raises OSError."""
+        from signatures.contract import FileEntry  # it loads numpy
+
         written = {}
         for relative, data in self.files.items():
             place = folder / relative

@@ -16,6 +16,7 @@ import numpy as np
 from converters.frozen_graph.encode import string_constant
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, NameScope, Node, topological
+from converters.graph.ops.table import traits
 from converters.graph.passes.normalise import normalise
 from converters.understand.facts import SourceFacts
 from converters.understand.signature import derived_notes
@@ -115,7 +116,7 @@ def redrawn(graph: Graph, contract: Contract) -> Graph:
     count = NameScope(n.name for n in graph.nodes).fresh("draws")
     draws: dict[str, Node] = {}
     for node in (graph[n] for n in sorted(graph.ancestors(drawn))):
-        setting = graph.constant(node.inputs[1]) if node.op in ("Reshape", "ExpandDims") else None
+        setting = graph.constant(node.inputs[1]) if traits(node).moves == "view" and len(node.inputs) > 1 else None
         if setting is None or setting.tolist() not in ([-1, 1], 1):  # a column, of either
             continue
         best, dtype = graph.producer(node.inputs[0]), None

@@ -66,12 +66,17 @@ def signature_of(inputs: Mapping[str, Any], outputs: Mapping[str, Any], key: str
     """What TensorFlow says of a function that it froze: each tensor's name, dtype, and shape or None."""
     inward, outward = (
         {
-            k: Tensor(name, np.dtype(kind), TensorShape(None if shape is None else tuple(shape)))
+            k: Tensor(name, _numbers(kind), TensorShape(None if shape is None else tuple(shape)))
             for k, (name, kind, shape) in side.items()
         }
         for side in (inputs, outputs)
     )
     return ModelSignature(inward, outward, key)
+
+
+def _numbers(kind: str) -> np.dtype | None:
+    """The dtype that TensorFlow calls so; None for texts and others that are no numbers."""
+    return np.dtype(kind) if kind.startswith(("float", "int", "uint", "bool")) else None
 
 
 def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Role]]:

@@ -168,7 +168,7 @@ class Trial:
             with pytest.MonkeyPatch.context() as patch:
                 for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
                     patch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(self.pool))
-                patch.setattr(site, "_vendor", lambda: ({}, [], []))
+                patch.setattr(site, "_vendor", lambda *_: ({}, [], []))
                 for command in _commands(folder, file, self.home, out):
                     self._ran(*command)
             with contextlib.suppress(ExportModelError):

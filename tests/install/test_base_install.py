@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -30,6 +31,8 @@ DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl", ".typed"}
 DEMO = "exporter/demo/3DBall.bytes"
 #: What the packages of a base install may take together, in 10^6 bytes.
 LARGEST = 150
+#: Needs Node alone, which is beside the environment or not.
+NODES = ["js"] if shutil.which("node") else []
 #: Python's own, in every environment that has pip.
 NOT_OURS = {"pip", "setuptools"}
 
@@ -180,7 +183,7 @@ def test_the_runtimes_are_listed_with_what_installs_them(installed: Installed) -
     done = installed.run("export-model", "runtimes", "--json")
     assert done.returncode == 0, done.stderr
     found = {r["name"]: r for r in json.loads(done.stdout)["runtimes"]}
-    assert [name for name, r in found.items() if r["installed"]] == ["numpy"]
+    assert [name for name, r in found.items() if r["installed"]] == ["numpy", *NODES]
     assert "export-model[tensorflow]" in found["tensorflow"]["install"]
     assert "export-model[onnxruntime]" in found["onnxruntime"]["install"]
     assert "export-model runtimes install tfjs" in found["tfjs-cpu"]["install"]

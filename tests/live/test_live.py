@@ -114,7 +114,7 @@ REFUSED = {
     "no function": ("UsageError", "which is no tf.function"),
     "never traced": ("UsageError", "traced for no signatures"),
     "traced twice": ("UsageError", "traced for 2 signatures"),
-    "strings": ("SignatureError", "no policy found"),
+    "strings": ("UnsupportedOpError", "StringLength"),
     "nested": ("SourceError", "TensorFlow cannot save it"),
     "called once": ("UsageError", "takes 2 rows only"),
     "one row": ("UsageError", "takes 1 rows only"),
