@@ -10,6 +10,8 @@ import zipfile
 from functools import cached_property
 from typing import Any
 
+from converters.varints import read_varint
+
 _HEAD = 4096
 
 
@@ -77,32 +79,20 @@ def _is_op_name(data: bytes) -> bool:
     return bool(data) and data[:1].isalpha() | data.startswith(b"_") and all(c < 128 for c in data) and len(data) < 100
 
 
-def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while at < len(data) and shift < 64:
-        byte = data[at]
-        value |= (byte & 0x7F) << shift
-        at += 1
-        if byte < 0x80:
-            return value, at
-        shift += 7
-    return -1, at
-
-
 def _fields(data: memoryview, limit: int = 64) -> list[tuple[int, int, memoryview]]:
     found: list[tuple[int, int, memoryview]] = []
     at = 0
     while at < len(data) and len(found) < limit:
-        tag, at = _varint(data, at)
+        tag, at = read_varint(data, at, len(data))
         number, wire = tag >> 3, tag & 7
         if tag < 0 or number == 0 or wire not in (0, 1, 2, 5):
             return found if at >= len(data) else []
         if wire == 0:
             start = at
-            _, at = _varint(data, at)
+            _, at = read_varint(data, at, len(data))
             found.append((number, wire, data[start:at]))
         else:
-            length, at = _varint(data, at) if wire == 2 else ({1: 8, 5: 4}[wire], at)
+            length, at = read_varint(data, at, len(data)) if wire == 2 else ({1: 8, 5: 4}[wire], at)
             if length < 0:
                 return []
             found.append((number, wire, data[at : at + length]))

@@ -18,6 +18,7 @@ from typing import TypeAlias
 import numpy as np
 
 from converters.pieces import Pieces
+from converters.varints import read_varint, varint
 
 #: Field number → the fields of the message that it holds, or None where it is what is detached.
 Fields: TypeAlias = Mapping[int, "Fields | None"]
@@ -155,22 +156,7 @@ def _delimited(view: memoryview, least: int, most: int | None = None) -> Iterato
 
 
 def _read_varint(view: memoryview, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while at < len(view) and shift < 64:
-        byte = view[at]
-        value |= (byte & 0x7F) << shift
-        at += 1
-        if byte < 0x80:
-            return value, at
-        shift += 7
-    raise _NoMessageError
-
-
-def varint(value: int) -> bytes:
-    """A number as protobuf and TensorFlow's tables write it."""
-    data = bytearray()
-    while value > 0x7F:
-        data.append(value & 0x7F | 0x80)
-        value >>= 7
-    data.append(value)
-    return bytes(data)
+    value, end = read_varint(view, at, len(view))
+    if value < 0:
+        raise _NoMessageError
+    return value, end

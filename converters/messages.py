@@ -12,7 +12,7 @@ from typing import Any
 
 from google.protobuf import descriptor_pool, message_factory
 
-from converters.detached import varint
+from converters.varints import varint
 
 _SCALARS = {
     "string": 9,

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 from converters.checkpoint.crc32c import crc32c, masked
 from converters.checkpoint.snappy import SnappyError, decompress
+from converters.varints import read_varint
 from signatures.errors import DamagedFileError
 
 MAGIC = struct.pack("<Q", 0xDB4775248B80FB57)
@@ -106,16 +107,10 @@ def _handle(data: bytes, at: int, name: str) -> tuple[tuple[int, int], int]:
 
 
 def _varint(data: bytes, at: int, end: int, name: str) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        if at >= end:
-            break
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-    raise _damaged(f"the {name} has a number that is cut off")
+    value, at = read_varint(data, at, end)
+    if value < 0:
+        raise _damaged(f"the {name} has a number that is cut off")
+    return value, at
 
 
 def _shown(key: bytes) -> str:

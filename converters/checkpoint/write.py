@@ -10,8 +10,8 @@ import numpy as np
 from converters import schema
 from converters.checkpoint.crc32c import crc32c, masked
 from converters.checkpoint.table import MAGIC
-from converters.detached import varint
 from converters.pieces import Pieces
+from converters.varints import varint
 
 
 def checkpoint(values: Mapping[str, np.ndarray]) -> dict[str, Pieces]:

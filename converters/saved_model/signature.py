@@ -30,6 +30,14 @@ from signatures.memories import SeparateMemory
 from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
+#: TensorFlow's names of dtypes that numpy knows by the same.
+_NUMBERS = frozenset(
+    (
+        *("float16", "float32", "float64", "bool"),
+        *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+    )
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
@@ -76,7 +84,7 @@ def signature_of(inputs: Mapping[str, Any], outputs: Mapping[str, Any], key: str
 
 def _numbers(kind: str) -> np.dtype | None:
     """The dtype that TensorFlow calls so; None for texts and others that are no numbers."""
-    return np.dtype(kind) if kind.startswith(("float", "int", "uint", "bool")) else None
+    return np.dtype(kind) if kind in _NUMBERS else None
 
 
 def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Role]]:

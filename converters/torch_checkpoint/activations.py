@@ -18,8 +18,8 @@ from converters.graph.nn.activations import (
     hard_sigmoid,
     hard_swish,
     leaky_relu,
+    log_sigmoid,
     mish,
-    scaled,
     selu,
     swish,
 )
@@ -31,10 +31,6 @@ LEAKY_SLOPE = 0.01
 
 def _plain(op: str) -> Activation:
     return lambda b, x: b.add(op, [x])
-
-
-def _log_sigmoid(b: Builder, x: str) -> str:
-    return scaled(b, b.add("Softplus", [scaled(b, x, -1)]), -1)
 
 
 _KNOWN: dict[str, Activation] = {
@@ -57,7 +53,7 @@ _KNOWN: dict[str, Activation] = {
     "hardtanh": partial(clip, low=-1, high=1),
     "hardsigmoid": partial(hard_sigmoid, alpha=1 / 6, beta=0.5),
     "hardswish": hard_swish,
-    "logsigmoid": _log_sigmoid,
+    "logsigmoid": log_sigmoid,
     "identity": lambda b, x: x,
     "none": lambda b, x: x,
 }

@@ -33,6 +33,11 @@ def scaled(b: Builder, x: str, factor: float, shift: float = 0.0) -> str:
     return x if shift == 0 else b.add("Add", [x, b.number(x, shift, "shift")])
 
 
+def log_sigmoid(b: Builder, x: str) -> str:
+    """−softplus(−x)."""
+    return b.add("Neg", [b.add("Softplus", [b.add("Neg", [x])])])
+
+
 # ------------------------------------------------------------------ bent lines
 
 

@@ -68,7 +68,7 @@ _ACTIVATIONS: Mapping[str, Activation] = {
     "hard_tanh": lambda b, x: nn.clip(b, x, -1, 1),
     "softmax": _softmax("Softmax"),
     "log_softmax": _softmax("LogSoftmax"),
-    "log_sigmoid": lambda b, x: b.add("Neg", [b.add("Softplus", [b.add("Neg", [x])])]),
+    "log_sigmoid": nn.log_sigmoid,
     "squareplus": _squareplus,
     "tanh_shrink": lambda b, x: b.add("Sub", [x, b.add("Tanh", [x])]),
     "hard_shrink": lambda b, x: _outside(b, x, lambda inner: inner),
