@@ -63,15 +63,15 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
         say(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
         say(f"next: host it anywhere, or: python -m http.server --directory {out}")
         return
-    from exporter.serve.server import listening, until_interrupted
+    from exporter.serve.server import interrupts, listening
 
-    with listening(site, host, port) as server, until_interrupted():
+    with listening(site, host, port) as server, interrupts() as told:
         say(f"{server.url}  (Ctrl-C ends)")
         if opens:
             import webbrowser
 
             webbrowser.open(server.url)
-        server.serve_forever()
+        server.answer_until(told)
     say("ended")
 
 

@@ -13,7 +13,7 @@ import socket
 import socketserver
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -63,6 +63,8 @@ MOST_CONNECTIONS, SILENCE, PATIENCE = 32, 10.0, 30.0
 class SiteServer(ThreadingHTTPServer):
     """Listens from the moment it is made; ``url`` is where the page is."""
 
+    timeout = 0.5  # seconds that it waits for somebody to ask
+
     def __init__(self, site: Mapping[str, bytes], host: str, port: int) -> None:
         self.site = site
         self.host = host
@@ -99,6 +101,12 @@ class SiteServer(ThreadingHTTPServer):
             self.asking.pop(request, None)
             self._free.release()
 
+    def answer_until(self, told: Sequence[int]) -> None:
+        """Answer until something is told, which is looked at twice a second."""
+        while not told:
+            self.handle_request()
+            self.service_actions()
+
     def service_actions(self) -> None:
         """Twice a second: end the connections whose request is never said to its end."""
         for connection, since in list(self.asking.items()):
@@ -122,15 +130,17 @@ class SiteServer(ThreadingHTTPServer):
 
 
 @contextmanager
-def until_interrupted() -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the block, and are no errors, whatever was inherited: a job in the background ignores
-    SIGINT unless it says otherwise.
+def interrupts() -> Iterator[list[int]]:
+    """What Ctrl-C and SIGTERM have told so far, which then are no errors; whatever was inherited: a job in the
+    background ignores SIGINT unless it says otherwise.
+
+    A list, not an exception: Python loses one that is raised in a destructor, and the server would go on for ever.
     """
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    told: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda number, frame: told.append(number)) for number in numbers}
     try:
-        yield
-    except KeyboardInterrupt:
-        pass
+        yield told
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

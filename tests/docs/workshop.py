@@ -178,6 +178,7 @@ class Workshop:
                 process.wait(60)
             finally:
                 process.kill()
+                process.wait()
 
 
 HOW = {

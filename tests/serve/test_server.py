@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import exporter.serve.server as server_module
-from exporter.serve.server import CONTENT_POLICY, HEADERS, SiteServer, listening
+from exporter.serve.server import CONTENT_POLICY, HEADERS, SiteServer, interrupts, listening
 from exporter.serve.site import PAGE
 from signatures.errors import UsageError
 from tests.commands import ROOT, export_model, is_refused
@@ -207,3 +207,15 @@ def test_an_address_of_version_6_is_listened_on() -> None:
     with listening({"index.html": b"here"}, "::1", 0) as server:
         assert server.url.startswith("http://[::1]:")
         assert server.answers_to(server.url.removeprefix("http://").removesuffix("/"))
+
+
+def test_an_interrupt_in_a_destructor_is_not_lost() -> None:
+    """Python prints and drops what is raised there: a server that was ended by an exception went on for ever."""
+
+    class Collected:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    with interrupts() as told:
+        Collected()
+    assert told == [signal.SIGINT]
