@@ -8,6 +8,7 @@ that the list of formats (converters/formats.py) costs nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from signatures.records import dataclass
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.inner import InnerTensors, Loaded
     from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
@@ -135,8 +137,9 @@ class Format:
       compute, no file from elsewhere.
     - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
-      once; ``dtypes`` are the only ones that it has (empty: all); ``answers`` are the outputs of a policy that an
-      artefact answers (None: all).
+      once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
+      source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
+      ``answers`` are the outputs of a policy that an artefact answers (None: all).
     """
 
     key: str
@@ -157,6 +160,8 @@ class Format:
     runtimes: tuple[str, ...] = ()
     signatures: bool = False
     predicts: bool = False
+    inner: Callable[[Loaded], AbstractContextManager[InnerTensors]] | None = None
+    origins: Callable[[Path], Mapping[str, str]] | None = None
     snippets: tuple[Code, ...] = ()
     dtypes: frozenset[str] = frozenset()
     answers: Callable[[PolicySignature], list[str]] | None = None

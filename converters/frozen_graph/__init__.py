@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from converters.format import Format, Ports, WriteOptions
 
 if TYPE_CHECKING:
     from converters.fetch import Fetched
+    from converters.inner import InnerTensors, Loaded
     from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
@@ -39,6 +41,12 @@ def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     return vetted(path, wanted, folder)
 
 
+def _inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
+    from converters.frozen_graph.inner import inner
+
+    return inner(loaded)
+
+
 FORMATS = (
     Format(
         key="bytes",
@@ -50,6 +58,7 @@ FORMATS = (
         default=True,
         ports=_ports,
         vetted=_vetted,
+        inner=_inner,
         runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
     ),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from converters.format import Format, Ports, WriteOptions
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.inner import InnerTensors, Loaded
     from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
@@ -45,6 +47,18 @@ def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     return vetted(path, wanted, folder)
 
 
+def _inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
+    from converters.onnx.inner import inner
+
+    return inner(loaded)
+
+
+def _origins(path: Path) -> Mapping[str, str]:
+    from converters.onnx.inner import origins
+
+    return origins(path)
+
+
 FORMATS = (
     Format(
         key="onnx",
@@ -57,6 +71,8 @@ FORMATS = (
         default=True,
         ports=_ports,
         vetted=_vetted,
+        inner=_inner,
+        origins=_origins,
         runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium"),
     ),
 )

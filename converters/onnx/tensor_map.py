@@ -13,25 +13,10 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
-import numpy as np
-
+from converters.inner import View
 from signatures.records import dataclass
 
 TENSORS_KEY = "export_model_tensors"
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A tensor as a format has it: its name there, and the axes it was transposed by (None: as it is)."""
-
-    name: str
-    axes: tuple[int, ...] | None = None
-
-    def restored(self, array: np.ndarray) -> np.ndarray:
-        """The tensor as the graph has it."""
-        if self.axes is None or array.ndim != len(self.axes):
-            return array
-        return array.transpose(np.argsort(self.axes))
 
 
 @dataclass(frozen=True)

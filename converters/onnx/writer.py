@@ -21,10 +21,11 @@ from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import TensorType
+from converters.inner import View
 from converters.onnx import messages
 from converters.onnx.files import files_of
 from converters.onnx.shorten import shortened
-from converters.onnx.tensor_map import TENSORS_KEY, TensorMap, View
+from converters.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.pieces import Pieces, equal
 from converters.policy import Policy
 from signatures.errors import GraphError, UsageError

@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, BinaryIO, cast
@@ -256,3 +256,13 @@ class LoadedModel:
     def unload(self) -> None:
         """Free it."""
         self._process.request({"cmd": "unload", "id": self._identity})
+
+
+@contextlib.contextmanager
+def unloading(model: LoadedModel) -> Iterator[None]:
+    """A model that is freed afterwards."""
+    try:
+        yield
+    finally:
+        with contextlib.suppress(RunFailedError):  # a runtime that has died has freed it already
+            model.unload()

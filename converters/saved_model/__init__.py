@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from converters.format import Format, Ports, WriteOptions
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.inner import InnerTensors, Loaded
     from converters.pieces import Pieces
     from converters.policy import Policy
     from converters.source import ReadOptions, SourceModel
@@ -47,6 +49,12 @@ def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     return vetted(path, wanted, folder)
 
 
+def _inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
+    from converters.saved_model.inner import inner
+
+    return inner(loaded)
+
+
 FORMATS = (
     Format(
         key="saved_model",
@@ -59,6 +67,7 @@ FORMATS = (
         default=True,
         ports=_ports,
         vetted=_vetted,
+        inner=_inner,
         runtimes=("tensorflow",),
         signatures=True,
     ),

@@ -15,16 +15,18 @@ from pathlib import Path
 import numpy as np
 
 from converters.bundle.embed import runnable
+from converters.formats import WRITTEN
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node, split_ref
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.ops.table import traits
 from converters.graph.run import run_graph
+from converters.inner import InnerTensors
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError
 from exporter.verify.difference import Difference, compare
 from exporter.verify.findings import Bisection
-from exporter.verify.inner_tensors import InnerTensors, inner_tensors, onnx_sources, outputs_read, saved_graph
+from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError
@@ -142,10 +144,11 @@ class Bisector:
         return self._opened[1]
 
     def _source(self, node: Node) -> str | tuple[str, ...] | None:
-        """The source's tensor: what the graph knows of it, else what the bundle's .onnx does."""
+        """The source's tensor: what the graph knows of it, else what an artefact notes."""
         if self._sources is None:
-            path = self.tested.artefacts.get("onnx")
-            self._sources = {} if path is None else dict(_noted(path))
+            self._sources = {}
+            for key, path in self.tested.artefacts.items():
+                self._sources.update(_noted(key, path))
         if node.origin is None or node.origin == f"{node.name}:0":
             return self._sources.get(node.name, node.origin)
         return node.origin
@@ -269,8 +272,9 @@ def _chunks(tensors: Sequence[str], values: Mapping[str, np.ndarray]) -> Iterato
         yield chunk
 
 
-def _noted(path: Path) -> dict[str, str]:
+def _noted(key: str, path: Path) -> Mapping[str, str]:
+    origins = WRITTEN[key].origins
     try:
-        return dict(onnx_sources(path))
+        return {} if origins is None else origins(path)
     except (ValueError, OSError):
         return {}

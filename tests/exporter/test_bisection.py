@@ -16,7 +16,8 @@ from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from converters.onnx.tensor_map import TensorMap, View, loads
+from converters.inner import InnerTensors, View
+from converters.onnx.tensor_map import TensorMap, loads
 from converters.policy import Policy
 from converters.runtimes.process import RunFailedError
 from exporter.export.pipeline import ExportOptions, export
@@ -24,7 +25,6 @@ from exporter.verify import bisection as bisect
 from exporter.verify.bisection import _Search
 from exporter.verify.difference import compare
 from exporter.verify.findings import Bisection, Numbers
-from exporter.verify.inner_tensors import InnerTensors
 from exporter.verify.participants import Feeds
 from exporter.verify.tolerances import Tolerance
 from fixtures import path as fixture

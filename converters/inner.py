@@ -1,0 +1,75 @@
+"""What a format, loaded in a runtime, has of the graph's tensors, and how to ask for them.
+
+A format says it by ``Format.inner``; one that says nothing hides them. Where nodes are called as the graph calls them
+and any can be fetched, ``own_names`` is enough.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from converters.graph.nodes import split_ref
+from signatures.records import dataclass
+
+if TYPE_CHECKING:
+    from converters.runtimes.pool import RuntimePool
+
+Feeds = Mapping[str, np.ndarray]
+Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A tensor as a format has it: its name there, and the axes it was transposed by (None: as it is)."""
+
+    name: str
+    axes: tuple[int, ...] | None = None
+
+    def restored(self, array: np.ndarray) -> np.ndarray:
+        """The tensor as the graph has it."""
+        if self.axes is None or array.ndim != len(self.axes):
+            return array
+        return array.transpose(np.argsort(self.axes))
+
+
+@dataclass(frozen=True)
+class InnerTensors:
+    """``view`` says how the format has a tensor of the graph (None: not at all), ``run`` fetches what it calls so."""
+
+    view: Callable[[str], View | None]
+    run: Run
+    #: Another tool may have made it: what has a tensor's name may be another tensor.
+    foreign: bool = False
+
+    def fetch(self, feeds: Feeds, tensors: Sequence[str]) -> dict[str, np.ndarray]:
+        """Tensors of the graph by name, its own axes; raises RunFailedError."""
+        views = {tensor: view for tensor in tensors if (view := self.view(tensor)) is not None}
+        values = self.run(feeds, list(dict.fromkeys(v.name for v in views.values()))) if views else {}
+        return {tensor: view.restored(values[view.name]) for tensor, view in views.items()}
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """An artefact in a runtime of a pool, ``run`` as it is loaded; ``signature`` is the one called, "" for the only."""
+
+    path: Path
+    runtime: str
+    run: Run
+    pool: RuntimePool
+    signature: str = ""
+
+
+def hidden(loaded: Loaded) -> contextlib.AbstractContextManager[InnerTensors]:
+    """No tensor can be had."""
+    return contextlib.nullcontext(InnerTensors(lambda tensor: None, loaded.run))
+
+
+def own_names(nodes: Iterable[str]) -> Callable[[str], View | None]:
+    """A view for a format that has ``nodes``, called as in the graph."""
+    known = frozenset(nodes)
+    return lambda tensor: View(tensor) if split_ref(tensor)[0] in known else None

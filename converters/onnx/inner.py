@@ -1,0 +1,64 @@
+"""The inner tensors of an ONNX model, which gives its outputs only: a copy with further outputs is loaded beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from converters.detached import Detached
+from converters.folders import scratch_folder
+from converters.inner import Feeds, InnerTensors, Loaded, View
+from converters.onnx.files import files_of
+from converters.onnx.proto import array_of, decoded, load_external
+from converters.onnx.tensor_map import TENSORS_KEY, loads
+from converters.runtimes.process import unloading
+
+
+@contextmanager
+def inner(loaded: Loaded) -> Iterator[InnerTensors]:
+    """Those of a model, in the same runtime; its values are found by the map that the writer left in it."""
+    import onnx
+
+    detached = Detached()
+    model = decoded(loaded.path.read_bytes(), detached)
+    load_external([model.graph], loaded.path.parent, detached)
+    graph = model.graph
+    names = loads({p.key: p.value for p in model.metadata_props}.get(TENSORS_KEY, ""))
+    constants = {t.name for t in graph.initializer}
+    made = {name for node in graph.node for name in node.output}
+    fed = frozenset(v.name for v in graph.input) - constants
+
+    def view(tensor: str) -> View | None:
+        found = names.view(tensor)
+        return found if found is not None and found.name in made | constants | fed else None
+
+    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        values = {t.name: array_of(t, detached) for t in graph.initializer if t.name in fetch}
+        values.update({name: feeds[name] for name in fetch if name in fed})
+        wanted = [name for name in fetch if name in made]
+        if wanted:
+            open_model = onnx.ModelProto()
+            open_model.CopyFrom(model)
+            known = {o.name for o in graph.output}
+            open_model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in wanted if n not in known)
+            for name, data in files_of(open_model, detached, file.name).items():
+                data.write(file.with_name(name))
+            opened = loaded.pool.process(loaded.runtime).load(str(file), kind="graph")
+            with unloading(opened):
+                values.update(opened.run({n: a for n, a in feeds.items() if n in fed}, wanted))
+        return values
+
+    with scratch_folder() as folder:
+        file = folder / loaded.path.name
+        yield InnerTensors(view, run)
+
+
+def origins(path: Path) -> Mapping[str, str]:
+    """Tensor of the graph → tensor of the source, where they are called differently, as our .onnx notes it."""
+    import onnx
+
+    model = onnx.ModelProto.FromString(path.read_bytes())
+    return loads(next((p.value for p in model.metadata_props if p.key == TENSORS_KEY), "")).sources

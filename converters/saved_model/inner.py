@@ -1,0 +1,36 @@
+"""The inner tensors of a SavedModel: a signature gives its outputs only, so its graph is run in a session."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from converters.frozen_graph.subgraph import subgraph
+from converters.graph.nodes import normal_ref
+from converters.inner import Feeds, InnerTensors, Loaded, own_names
+from converters.runtimes.process import unloading
+from converters.saved_model.reader import read_saved_model
+from converters.saved_model.source import FILE, frozen_model, values_beside
+from converters.source import OriginalRun
+
+
+@contextmanager
+def inner(loaded: Loaded) -> Iterator[InnerTensors]:
+    """Those of the graph behind a signature, fed through the signature's own names."""
+    saved = read_saved_model((loaded.path / FILE).read_bytes(), loaded.signature or "serving_default")
+    fed = {name: normal_ref(tensor.name) for name, tensor in saved.signature.inputs.items()}
+    outputs = [tensor.name for tensor in saved.signature.outputs.values()]
+    values = values_beside(loaded.path)
+    definition = saved.graph_def if values is None else frozen_model(saved, values).definition
+    part = subgraph(definition, outputs, fed.values())
+    inside = OriginalRun("tensorflow", loaded.path, definition=part, detached=saved.detached)
+    with inside.loadable() as (path, options):
+        model = loaded.pool.process("tensorflow").load(path, **options)
+
+    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        return model.run({fed[n]: a for n, a in feeds.items() if n in fed}, fetch)
+
+    with unloading(model):
+        yield InnerTensors(own_names(n.name for n in definition.node), run)
