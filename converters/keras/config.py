@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from converters.fetch import read_bytes
+from converters.zips import ZIP_ERRORS, entry_of, opened
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Bytes of a configuration; Keras' largest models have one of 2 MB.
@@ -46,22 +48,9 @@ _VALUES = frozenset(("__keras_tensor__", "__tensor__", "__numpy__", "__tuple__",
 def config_of(path: Path, name: str = "config.json") -> Any:
     """The configuration in a ``.keras`` file (a zip), or another part of it in JSON. Raises DamagedFileError."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            entry = archive.getinfo(name)
-            with archive.open(entry) as file:
-                data = file.read(MAX_CONFIG + 1)
-        if len(data) > MAX_CONFIG:
-            raise DamagedFileError(f"its configuration is larger than {MAX_CONFIG >> 20} MiB")
-        return json.loads(data)
-    except (
-        zipfile.BadZipFile,
-        KeyError,
-        ValueError,
-        RecursionError,
-        NotImplementedError,
-        RuntimeError,
-        EOFError,
-    ) as error:
+        with opened(read_bytes(path)) as archive:
+            return json.loads(entry_of(archive, name, MAX_CONFIG))
+    except (*ZIP_ERRORS, RecursionError) as error:
         raise DamagedFileError(
             "its configuration cannot be read",
             why=f"{type(error).__name__}: {error}"[:200],
@@ -70,11 +59,12 @@ def config_of(path: Path, name: str = "config.json") -> Any:
 
 
 def config_inside(path: str) -> Any:
-    """The configuration of a ``.keras`` or ``.h5`` file, in a child that has h5py. Raises DamagedFileError.
+    """The configuration that Keras would take from a file, in a child that has h5py. Raises DamagedFileError.
 
+    A file may be a ZIP archive and HDF5 at once (HDF5 may begin at byte 512): which it is for Keras, its name says.
     Weights that are links to other files are refused.
     """
-    if zipfile.is_zipfile(path):
+    if path.endswith(".keras") and zipfile.is_zipfile(path):
         return config_of(Path(path))
     import h5py
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 from converters.keras.config import MAX_CONFIG
 from converters.runtimes.child import claim_stdout, serve
 from converters.runtimes.wire import Tensors
+from converters.zips import ZIP_ERRORS, entry_of, opened
 from signatures.errors import DamagedFileError, ExportModelError
 
 WEIGHTS = "model.weights.h5"
@@ -34,10 +34,8 @@ def _opened(path: str) -> tuple[io.BytesIO, int]:
     data = Path(path).read_bytes()
     if not data.startswith(b"PK"):
         return io.BytesIO(data), len(data)
-    with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(WEIGHTS) as file:
-        content = file.read(_MAX_RATIO * len(data) + _FREE + 1)
-    if len(content) > _MAX_RATIO * len(data) + _FREE:
-        raise DamagedFileError("its weights are packed to far less than they are", fix="save the model again")
+    with opened(data) as archive:
+        content = entry_of(archive, WEIGHTS, _MAX_RATIO * len(data) + _FREE)
     return io.BytesIO(content), len(content)
 
 
@@ -153,7 +151,7 @@ def main() -> None:
     out = claim_stdout()
     import h5py
 
-    faults = (ExportModelError, AttributeError, RuntimeError, RecursionError, zipfile.BadZipFile, EOFError)
+    faults = (ExportModelError, AttributeError, RecursionError, *ZIP_ERRORS)
     serve("h5py", h5py.__version__, lambda header: _Weights(header["path"]), faults, out)
 
 

@@ -74,7 +74,8 @@ def _stored(given: Fetched) -> tuple[Any, Weights, str]:
         config = config_of(path)
         refuse_code(config)
         stored = stored_in(path)
-        version = str((config_of(path, "metadata.json") or {}).get("keras_version", ""))
+        metadata = config_of(path, "metadata.json")
+        version = str(metadata.get("keras_version", "")) if isinstance(metadata, dict) else ""
         return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version
     stored = stored_in(path)
     if stored.config is None:

@@ -7,15 +7,14 @@ disk; what its two entries may unfold to is bounded by the file.
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from typing import Any
 
 from converters.fetch import Fetched
 from converters.source import ReadOptions, SourceModel
 from converters.stable_baselines3.policy import to_graph
-from converters.torch_checkpoint.archive import ZIP_ERRORS, Archive
+from converters.torch_checkpoint.archive import Archive
+from converters.zips import ZIP_ERRORS, entry_of, opened
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 _DATA, _POLICY = "data", "policy.pth"
@@ -53,18 +52,8 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
 def _entries(data: bytes) -> list[bytes]:
     """``data`` and ``policy.pth`` of an archive. Raises DamagedFileError."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            found = []
-            for name in (_DATA, _POLICY):
-                entry = archive.getinfo(name)
-                if entry.file_size > min(_MOST * len(data), len(data) + _MOST_ADDED):
-                    raise DamagedFileError(
-                        f"its entry {name!r} unfolds to {entry.file_size} bytes",
-                        why=f"that is more than {_MOST} times the file, or {_MOST_ADDED >> 20} MiB more",
-                        fix="save the model again: model.save",
-                    )
-                with archive.open(entry) as stream:
-                    found.append(stream.read(entry.file_size))
-            return found
+        with opened(data) as archive:
+            most = min(_MOST * len(data), len(data) + _MOST_ADDED)
+            return [entry_of(archive, name, most) for name in (_DATA, _POLICY)]
     except ZIP_ERRORS as error:
         raise DamagedFileError(f"its archive cannot be read: {error}", why="it is damaged", fix=_COPY_AGAIN) from error

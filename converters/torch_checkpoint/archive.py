@@ -18,25 +18,14 @@ from typing import Any, Literal
 import numpy as np
 
 from converters.torch_checkpoint.unpickle import StorageType, Tensor, unpickle
+from converters.zips import ZIP_ERRORS, opened
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001
-#: What zipfile raises for a damaged or encrypted archive.
-ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    KeyError,
-    ValueError,
-    OSError,
-    EOFError,
-    NotImplementedError,
-    RuntimeError,
-    struct.error,
-    zlib.error,
-)
 #: Bytes of a local file header before the name, and bits of its flags (APPNOTE.TXT 4.3.7, 4.4.4).
-_LOCAL_HEADER, _ENCRYPTED, _UTF_8 = 30, 1 << 0, 1 << 11
+_LOCAL_HEADER, _UTF_8 = 30, 1 << 11
 _COPY_AGAIN = "copy or download it again"
 _FOREIGN = "give a checkpoint as its trainer wrote it"
 
@@ -117,7 +106,7 @@ class Archive:
 
     def _zip(self) -> Any:
         try:
-            with zipfile.ZipFile(io.BytesIO(self._data)) as archive:
+            with opened(self._data) as archive:
                 entries = {e.filename: e for e in archive.infolist()}
                 names = [n for n in entries if n == "data.pkl" or n.endswith("/data.pkl")]
                 if len(names) != 1:
@@ -149,8 +138,6 @@ class Archive:
         content = view[start : start + entry.file_size]
         if mark != b"PK\x03\x04" or called.decode("utf-8" if flags & _UTF_8 else "cp437") != entry.orig_filename:
             raise zipfile.BadZipFile(f"no entry {entry.filename!r} at its place")
-        if entry.flag_bits & _ENCRYPTED:
-            raise RuntimeError(f"{entry.filename!r} is encrypted")
         if len(content) != entry.file_size or zlib.crc32(content) != entry.CRC:
             raise zipfile.BadZipFile(f"bad CRC-32 for {entry.filename!r}")
         return content

@@ -7,18 +7,15 @@ are then zero, masks allow everything. Arrays under the names of outputs are the
 
 from __future__ import annotations
 
-import math
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
-from signatures.errors import UsageError
+from converters.fetch import read_bytes
+from converters.zips import ZIP_ERRORS, entry_of, opened
+from exporter.verify.npy import read_array
+from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import Case
@@ -28,11 +25,6 @@ from signatures.spec import PolicySignature, TensorSpec
 _ROWS = 64
 #: A recording may unpack to this many bytes, and so many times its own.
 MAX_UNPACKED_FREE, MAX_UNPACKED_FACTOR = 1 << 26, 20
-#: What zipfile, and numpy where it reads a header, raise for a damaged archive.
-_BROKEN = (
-    *(OSError, ValueError, TypeError, EOFError, MemoryError, OverflowError, NotImplementedError, RuntimeError),
-    *(SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error),
-)
 _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
 
 
@@ -87,41 +79,22 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        _check_sizes(path)
-        with path.open("rb") as file:  # numpy leaves a file open that it opened itself and cannot read
-            archive = np.load(file, allow_pickle=False)
-            if isinstance(archive, np.ndarray):
-                raise UsageError("--golden: is one array, not an archive", where=str(path), fix="numpy.savez(FILE, …)")
-            with archive:
-                return {name: archive[name] for name in archive.files}
-    except _BROKEN as error:
+        data = read_bytes(path)
+        with opened(data) as archive:
+            names = archive.namelist()
+            odd = next((name for name in names if not name.endswith(".npy")), None)
+            if odd is not None:
+                raise ValueError(f"{odd[:80]!r} is no array")
+            whole = sum(entry.file_size for entry in archive.infolist())
+            if whole > MAX_UNPACKED_FREE + MAX_UNPACKED_FACTOR * len(data):
+                raise ValueError(f"its {len(data)} bytes unpack to {whole}")
+            return {name.removesuffix(".npy"): read_array(entry_of(archive, name, whole)) for name in names}
+    except SourceError as error:
+        raise UsageError(f"--golden: {error.what}", where=str(path), why=error.why, fix=error.fix) from error
+    except (*ZIP_ERRORS, TypeError, RecursionError) as error:
         raise UsageError(
             "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"
         ) from error
-
-
-def _check_sizes(path: Path) -> None:
-    """Raise ValueError where an archive's arrays say to be larger than any recording, before one is read."""
-    if not zipfile.is_zipfile(path):
-        return
-    with zipfile.ZipFile(path) as archive:
-        whole = sum(entry.file_size for entry in archive.infolist())
-        for entry in archive.infolist():
-            if not entry.filename.endswith(".npy"):
-                raise ValueError(f"{entry.filename[:80]!r} is no array")
-            with archive.open(entry) as file:
-                shape, dtype = _header(file)
-            if math.prod(shape) * dtype.itemsize > entry.file_size:
-                raise ValueError(f"{entry.filename} says to be {list(shape)[:8]} and has {entry.file_size} bytes")
-    if whole > MAX_UNPACKED_FREE + MAX_UNPACKED_FACTOR * path.stat().st_size:
-        raise ValueError(f"its {path.stat().st_size} bytes unpack to {whole}")
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    return shape, dtype
 
 
 def _by_name(specs: tuple[TensorSpec, ...]) -> dict[str, TensorSpec]:
@@ -139,6 +112,7 @@ def _fitting(path: Path, spec: TensorSpec, array: np.ndarray) -> np.ndarray:
         raise UsageError(
             f"--golden: {spec.name!r} is {array.dtype} {list(array.shape)}, and {spec.dtype} {wanted} is wanted",
             where=str(path),
+            fix="record it as the policy takes and gives it, a row for each step",
         )
     return np.ascontiguousarray(array.astype(spec.dtype))
 

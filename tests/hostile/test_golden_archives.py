@@ -32,6 +32,13 @@ ENTRIES = {
     "a header of numbers that overflow": header((1 << 62, 1 << 62)),
     "a pickle": header((1,), "|O") + b"cos\nsystem\n(S'touch marker'\ntR.",
     "a header that does not end": header((1,)).replace(b"}", b"("),
+    "a header that Python warns of": header((1, 3)).replace(b"(1", b"1if") + bytes(12),
+    "a header of calls": header((1, 3)).replace(b"(1, 3)", b"x(1,3)") + bytes(12),
+    "a header of brackets": b"\x93NUMPY\x02\0" + struct.pack("<I", 9_000) + b"(" * 9_000,
+    "a header without an end": b"\x93NUMPY\x02\0" + struct.pack("<I", 1 << 31) + b"{",
+    "a header of version 1 that is cut": b"\x93NUMPY\x01\0\x01",
+    "negative numbers": header((-1, 3)) + bytes(12),
+    "numbers that are a record": header((1, 3), "f4,f4") + bytes(24),
     "no header": b"state",
     "nothing": b"",
 }
