@@ -13,7 +13,7 @@ _GENERATIONS = (
     (Generation("tfsharp-0.4"), "ML-Agents 0.4 (plugin of TensorFlow 1.7)"),
     (Generation("tfsharp-0.3"), "ML-Agents 0.3 (plugin of TensorFlow 1.4)"),
     (
-        Generation("tfsharp-0.2", vector="state", visual="observation_", memory_constant=False),
+        Generation("tfsharp-0.2", vector="state", visual="observation_", previous=False, memory_constant=False),
         "ML-Agents 0.1 and 0.2 (plugin of TensorFlow 1.1 or 1.2; the file was run in 1.4)",
     ),
 )

@@ -248,6 +248,9 @@ class Pair:
             turn = {("NHWC", "NCHW"): (0, 3, 1, 2), ("NCHW", "NHWC"): (0, 2, 3, 1)}.get((done["layout"], given))
             value = value.transpose(turn) if turn is not None else value
             value = value / np.float32(done["range"][1])
+        if spec.role is Role.MEMORY_IN and self.keeps_action:
+            last = next(own[s.name] for s in self.policy.signature.inputs if s.role is Role.PREV_ACTION)
+            value = np.concatenate([value.reshape(len(value), -1), last.reshape(len(value), -1)], 1)
         return value.astype(spec.dtype).reshape([len(value), *(d or -1 for d in spec.shape[1:])])
 
     def _compared(
@@ -263,6 +266,10 @@ class Pair:
                 continue
             name = self._own_name(spec)
             want, got = expected[name], actual[spec.name]
+            if spec.role is Role.MEMORY_OUT and self.keeps_action:
+                if got[:, -1:].tolist() != actual["action"].tolist():
+                    return f"{spec.name} does not keep the action"
+                want = np.concatenate([want.reshape(len(want), -1), actual["action"]], 1)
             if [d for d in spec.shape if d is not None] != list(got.shape[1:]):
                 return f"{spec.name} has the shape {got.shape}, not {spec.shape}"
             if got.size != want.size or not np.allclose(
@@ -277,6 +284,12 @@ class Pair:
             if actual[name].tolist() != value.tolist():
                 return f"constant {name} is {actual[name]}"
         return self._scores_compared(expected, actual, scores)
+
+    @property
+    def keeps_action(self) -> bool:
+        """Whether the last action comes back with the memory, as ML-Agents 0.2 does not feed it."""
+        roles = [{s.role for s in p.signature.inputs} for p in (self.policy, self.dressed)]
+        return Role.PREV_ACTION in roles[0] - roles[1]
 
     def _own_name(self, spec: TensorSpec) -> str:
         names = {s.name for s in self.policy.signature.outputs}

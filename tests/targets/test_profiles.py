@@ -13,6 +13,8 @@ import pytest
 from converters.barracuda.format import parse
 from converters.barracuda.writer import CONTRACT_KEY
 from converters.graph.run import run_graph
+from converters.graph.shapes import infer_types
+from converters.graph.types import BATCH
 from converters.policy import Policy
 from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES, profile
@@ -21,7 +23,7 @@ from exporter.verify.checks.consumer import consumers
 from signatures.errors import ProfileError, UsageError
 from signatures.roles import Role
 from tests import commands, known
-from tests.handmade import constant, dense, graph_bytes, node, placeholder, sampled_policy
+from tests.handmade import NodeDef, constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, Plain, compiled, runner_of
 
 pytest.importorskip("onnxruntime")
@@ -154,6 +156,57 @@ def test_a_branch_of_one_action_is_held_beside_others(wanted: Profile, tmp_path:
     pair = Pair.of(policy, wanted)
     assert pair.dressed.signature.branches == (4, 1)
     assert pair.difference(3, 0) is None
+
+
+def drawing(path: Path, *inputs: NodeDef, scores: Sequence[NodeDef], given: Sequence[NodeDef] = ()) -> Policy:
+    """A policy that draws from the node ``scores``."""
+    drawn = node("action", "Multinomial", "scores", "one", output_dtype=np.int64, seed=1, seed2=2)
+    before = [placeholder("vector_observation"), *inputs, constant("one", 1)]
+    path.write_bytes(graph_bytes([*before, *dense("logits", "vector_observation", 3, 4), *scores, drawn, *given]))
+    (policy,) = compiled(path)
+    return policy
+
+
+@pytest.mark.parametrize("wanted", ["tfsharp-0.4", "tfsharp-0.2"])
+def test_masks_that_a_generation_does_not_feed_are_a_row_for_each_agent(wanted: str, tmp_path: Path) -> None:
+    """TensorFlow 1.x does not run a Select, or a Concat, of which one operand has a single row for all agents."""
+    low = [
+        constant("far", np.full((1, 4), -1e8, np.float32)),
+        constant("none", np.zeros((1, 4), np.float32)),
+        constant("axis", 1),
+        node("barred", "Equal", "action_masks", "none"),
+        node("zeros", "Mul", "logits", "none"),
+        node("lowest", "Add", "zeros", "far"),
+        node("chosen", "Select", "barred", "lowest", "logits"),
+        node("joined", "ConcatV2", "chosen", "action_masks", "axis"),
+        *dense("scores", "joined", 8, 4),
+    ]
+    policy = drawing(tmp_path / "masked.bytes", placeholder("action_masks", (None, 4)), scores=low)
+    pair = Pair.of(policy, profile(wanted))
+    assert pair.difference(3, 0) is None
+    types = infer_types(pair.dressed.graph)
+    strict = [n for n in pair.dressed.graph.nodes if n.op in ("Select", "ConcatV2")]
+    assert strict and {types[r].shape[:1] for n in strict for r in n.inputs if types[r].shape} == {(BATCH,)}
+
+
+def test_the_last_action_goes_with_the_memory_where_nothing_feeds_it(tmp_path: Path) -> None:
+    """CoreBrainInternal.cs of 0.1 and 0.2 has no prev_action: TensorFlow would end with an unfed placeholder."""
+    inputs = placeholder("prev_action", (None,), np.int32), placeholder("recurrent_in", (None, 4))
+    scores = [
+        constant("depth", 4),
+        constant("on", 1.0),
+        constant("off", 0.0),
+        node("last", "OneHot", "prev_action", "depth", "on", "off", axis=-1),
+        node("kept", "Add", "logits", "recurrent_in"),
+        node("scores", "Add", "kept", "last"),
+    ]
+    policy = drawing(tmp_path / "last.bytes", *inputs, scores=scores, given=[node("recurrent_out", "Tanh", "scores")])
+    pair = Pair.of(policy, profile("tfsharp-0.2"))
+    assert {s.name: s.shape for s in pair.dressed.signature.inputs} == {"state": (None, 3), "recurrent_in": (None, 5)}
+    assert any("the Memory Size of the brain is 5" in note for note in pair.dressed.signature.notes)
+    assert pair.difference(3, 0) is None
+    fed = Pair.of(policy, profile("tfsharp-0.3")).dressed.signature
+    assert fed.has_input("prev_action") and fed.memory is not None and fed.memory.size == 4
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
 """ML-Agents 0.1 to 0.6 in TensorFlowSharp: a frozen graph whose nodes are looked up by their trainer's names.
 
 What CoreBrainInternal.cs (0.1 to 0.5) and TFSharpInferenceEngine.cs (0.6) feed and fetch: images NHWC, ``prev_action``
-int32 [B] up to 0.4 and [B, branches] from 0.5 on, ``action_masks`` from 0.5 on, memory [B, M]. Up to 0.5 a discrete
-``action`` is int64, drawn in the graph; from 0.6 on it is log-probabilities that the C# side draws from. Noise is drawn
-in the graph, as the trainers of 0.3 on did it: the *Graph Placeholders* of the Inspector stay empty.
+int32 [B] in 0.3 and 0.4, [B, branches] from 0.5 on (0.1 and 0.2 do not feed it: there it goes with the memory),
+``action_masks`` from 0.5 on, memory [B, M]. Up to 0.5 a discrete ``action`` is int64, drawn in the graph; from 0.6 on
+it is log-probabilities that the C# side draws from. Noise is drawn in the graph, as the trainers of 0.3 on did it: the
+*Graph Placeholders* of the Inspector stay empty.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from converters.graph.nodes import Node, TensorShape
-from converters.graph.types import FLOAT32, INT32
+from converters.graph.types import BATCH, FLOAT32, INT32
 from converters.policy import Policy
 from converters.targets.mlagents import feeding
 from converters.targets.mlagents.acting import Heads, branches, continuous_rows, heads, log_probabilities, samples
@@ -30,6 +31,8 @@ class Generation:
     visual: str = "visual_observation_"
     masks: bool = False
     branches: bool = False
+    #: prev_action is fed
+    previous: bool = True
     #: memory_size is read before the first step; sequence_length is fed whether the graph has it or not
     memory_constant: bool = True
     #: the four constants of 0.6, and log-probabilities as the action
@@ -42,8 +45,8 @@ def dress(policy: Policy, generation: Generation) -> Policy:
     feeding.refuse_parameters(dressing)
     images = _take_observations(dressing, generation)
     masks = _take_masks(dressing, generation)
-    _take_previous_action(dressing, generation)
-    size = _take_memory(dressing)
+    carried = _take_previous_action(dressing, generation)
+    size = _take_memory(dressing, carried)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
     found = heads(dressing)
     if found.continuous is not None and found.discrete is not None:
@@ -57,8 +60,11 @@ def dress(policy: Policy, generation: Generation) -> Policy:
     if size:
         own = policy.signature.memory
         assert own is not None and own.output is not None
-        dressing.give("recurrent_out", row(dressing.builder, dressing.own(own.output), size), Role.MEMORY_OUT)
-        memory = Memory(size, "recurrent_in", "recurrent_out", own.layout)
+        given = row(dressing.builder, dressing.own(own.output), own.size)
+        if carried is not None:
+            given = dressing.builder.concat([given, dressing.builder.cast(dressing.fetches["action"], FLOAT32)], 1)
+        dressing.give("recurrent_out", given, Role.MEMORY_OUT)
+        memory = Memory(size, "recurrent_in", "recurrent_out", own.layout if carried is None else ())
     return dressing.finished(memory, images, _beside(generation, found, width, size))
 
 
@@ -90,29 +96,55 @@ def _take_masks(dressing: Dressing, generation: Generation) -> str | None:
     spec = next((s for s in dressing.policy.signature.inputs if s.role is Role.MASKS), None)
     if spec is None or generation.masks:
         return feeding.take_masks(dressing)
-    dressing.give_in(spec, dressing.builder.floats(np.ones((1, int(spec.shape[-1] or 1))), "all_allowed"))
+    # a row for each agent: TensorFlow 1.x' Select, and Concat, take one for all as an error
+    width, builder = int(spec.shape[-1] or 1), dressing.builder
+    dressing.give_in(spec, builder.broadcast(builder.floats(np.ones((1, width)), "all_allowed"), (BATCH, width)))
     dressing.notes.append(f"{generation.name} knows no masks: every action is allowed")
     return None
 
 
-def _take_previous_action(dressing: Dressing, generation: Generation) -> None:
-    for spec in dressing.policy.signature.inputs:
-        if spec.role is not Role.PREV_ACTION:
-            continue
-        width = spec.shape[1] if len(spec.shape) > 1 else 1
-        shape: tuple[int | None, ...] = (None, width) if generation.branches else (None,)
-        dressing.give_in(spec, dressing.take("prev_action", spec, shape, INT32))
+def _take_previous_action(dressing: Dressing, generation: Generation) -> TensorSpec | None:
+    """Take ``prev_action``; returned where it is not fed and has to be kept with the memory."""
+    spec = next((s for s in dressing.policy.signature.inputs if s.role is Role.PREV_ACTION), None)
+    if spec is None:
+        return None
+    if not generation.previous:
+        return spec
+    shape: tuple[int | None, ...] = (None, _columns(spec)) if generation.branches else (None,)
+    dressing.give_in(spec, dressing.take("prev_action", spec, shape, INT32))
+    return None
 
 
-def _take_memory(dressing: Dressing) -> int:
+def _columns(previous: TensorSpec) -> int:
+    return int(previous.shape[1] or 1) if len(previous.shape) > 1 else 1
+
+
+def _take_memory(dressing: Dressing, carried: TensorSpec | None) -> int:
+    """Take ``recurrent_in``: the policy's memory, and behind it the last action where that is ``carried``."""
     memory = dressing.policy.signature.memory
     if memory is None or memory.input is None:
+        if carried is not None:
+            dressing.refuse(
+                f"nothing feeds its input {carried.name}",
+                why="ML-Agents 0.1 and 0.2 do not feed the last action, and the policy has no memory to keep it in",
+                fix="use a project of 0.3 or later (--for tfsharp-0.3)",
+            )
         return 0
     if memory.output is None:
         feeding.refuse_lost_memory(dressing, memory.input)
     spec = dressing.policy.signature.input(memory.input)
-    dressing.give_in(spec, dressing.take("recurrent_in", spec, (None, memory.size)))
-    return memory.size
+    if carried is None:
+        dressing.give_in(spec, dressing.take("recurrent_in", spec, (None, memory.size)))
+        return memory.size
+    size, builder = memory.size + _columns(carried), dressing.builder
+    taken = dressing.take("recurrent_in", spec, (None, size))
+    dressing.give_in(spec, builder.slice(taken, 1, 0, memory.size))
+    dressing.give_in(carried, builder.slice(taken, 1, memory.size, size))
+    dressing.notes.append(
+        f"{dressing.profile} does not feed the last action: it is kept as the last number of the memory, "
+        f"so that the Memory Size of the brain is {size}"
+    )
+    return size
 
 
 def _give_action(dressing: Dressing, generation: Generation, found: Heads, masks: str | None) -> int:

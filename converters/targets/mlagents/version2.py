@@ -51,7 +51,7 @@ def _take_observations(dressing: Dressing) -> dict[str, object]:
     if entities:
         dressing.refuse(
             f"its observation {entities[0]} is a list of entities",
-            why="ML-Agents 1.x has no sensor of variable length",
+            why="ML-Agents before 1.8 has no sensor of variable length, and no Barracuda of 1.x was seen to read one",
             fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
         )
     images: dict[str, object] = {}
