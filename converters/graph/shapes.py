@@ -11,7 +11,7 @@ from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.base import MISFIT, OpDef, misfit
 from converters.graph.ops.table import CONTROL_FLOW, op_of
-from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, broadcast, of_array, product
+from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, of_array
 from signatures.errors import ExportModelError, GraphError
 
 Types = dict[str, TensorType]
@@ -190,26 +190,53 @@ def _symbolic(
             )
             for v in (np.asarray(o, dtype=object) for o in outputs)
         ]
-    if node.op == "Mul" or node.op == "Maximum":  # not a list: the op table alone has those
-        shape = broadcast(args[0].shape, args[1].shape, symbols)
-        a, b = np.broadcast_arrays(values[0].astype(object), values[1].astype(object))
-        cells = np.empty(a.shape, object)
-        for index in np.ndindex(a.shape):
-            pair = (a.item(*index), b.item(*index))
-            if node.op == "Mul":
-                cells[index] = product(pair, symbols)
-            elif isinstance(pair[0], int) and isinstance(pair[1], int):
-                cells[index] = max(pair)
-            elif pair[0] == pair[1] or 1 in pair:  # a length is 1 or more
-                cells[index] = next((p for p in pair if p != 1), 1)
-            else:
-                return results
-        return [TensorType(args[0].dtype, shape, _plain(cells, args[0].dtype))]
-    if node.op == "Prod" and results[0].shape in ((), (1,)):
-        total = np.empty(() if results[0].shape == () else (1,), object)
-        total[...] = product(values[0].reshape(-1).tolist(), symbols)
-        return [TensorType(args[0].dtype, results[0].shape, _plain(total, args[0].dtype))]
-    return results
+    kind = results[0]
+    if len(results) > 1 or kind.shape is None or not all(isinstance(d, int) for d in kind.shape):
+        return results  # how much it makes depends on the symbols
+    found = _probed(op, node, values) if _elements(kind) <= _SMALL else None
+    if found is None:
+        return results
+    for cell in np.ndindex(found.shape):
+        if found[cell] is None and op.name not in ("Mul", "Prod"):  # not a list: the op table alone has those
+            return results
+        if found[cell] is None:
+            found[cell] = symbols.fresh()  # a length, whatever it is
+    return [TensorType(kind.dtype, tuple(int(d) for d in found.shape), _plain(found, kind.dtype))]
+
+
+#: Lengths that symbols are tried with: what is the same for all of them is a number, what is always one of them is that
+#: symbol. They are below and above every constant that a shape is compared with.
+_PROBES = (1, 2, 3, 5, 7, 11, (1 << 29) + 11)
+
+
+def _probed(op: OpDef, node: Node, values: Sequence[np.ndarray]) -> np.ndarray | None:
+    """Arithmetic on lengths, cell by cell: a number, a symbol, or None where it is neither; None for no array at all.
+
+    A shape is computed by small steps (products, quotients, maxima with 0, broadcasting), each of which is looked at.
+    """
+    names = sorted({c for v in values if v.dtype == object for c in v.reshape(-1).tolist() if isinstance(c, str)})
+    tried: list[tuple[dict[str, int], np.ndarray]] = []
+    for number, probe in enumerate(_PROBES):
+        # each symbol goes through the lengths in an order of its own
+        lengths = {n: probe if not i else _PROBES[(number * (i + 1) + i) % len(_PROBES)] for i, n in enumerate(names)}
+        arrays = [
+            np.array([lengths.get(c, c) for c in v.reshape(-1).tolist()], np.int64).reshape(v.shape)
+            if v.dtype == object
+            else v
+            for v in values
+        ]
+        tried.append((lengths, np.asarray(run_kernel(op, node, arrays)[0])))
+    shape = tried[0][1].shape
+    if any(result.shape != shape for _, result in tried):
+        return None
+    found = np.empty(shape, object)
+    for cell in np.ndindex(shape):
+        results = [(lengths, result.item(*cell)) for lengths, result in tried]
+        if all(r == results[0][1] for _, r in results):
+            found[cell] = results[0][1]
+        else:
+            found[cell] = next((n for n in names if all(r == lengths[n] for lengths, r in results)), None)
+    return found
 
 
 def _plain(cells: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -49,8 +49,8 @@ def compare(
 ) -> Difference:
     """Compare by |a − b| ≤ atol + rtol·|b|, element by element.
 
-    ``free`` marks integer elements where another answer is right too (a tie). ``narrowed`` allows int32 for int64.
-    ``most`` are bounds per column that go before larger ones.
+    ``free`` marks elements where another answer is right too (a tie, a reference without one). ``narrowed`` allows
+    int32 for int64. ``most`` are bounds per column that go before larger ones.
     ``rounding`` is an absolute difference per element that float32 itself explains; where it is larger than the
     tolerance it takes its place. A NaN or infinity must stand at the same place on both sides.
     """
@@ -64,7 +64,7 @@ def compare(
     a, b = candidate.astype(np.float64), reference.astype(np.float64)
     odd = ~np.isfinite(a) | ~np.isfinite(b)
     if odd.any():
-        same = (np.isnan(a) & np.isnan(b)) | (a == b)
+        same = (np.isnan(a) & np.isnan(b)) | (a == b) | (False if free is None else free)
         if not same[odd].all():
             return replace(wrong("NaN or infinity on one side only"), worst=int((odd & ~same).argmax()))
         a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)

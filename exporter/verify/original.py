@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.passes.noise import laid_out
 from converters.runtimes.process import LoadedModel, RunFailedError
 from signatures.memories import divided, joined
 from signatures.roles import Role
@@ -135,7 +136,9 @@ class Original:
             shape = [batch if d is None else d for d in dims]
             if zero_noise or (tensor not in placed and not self.source.noise_kept):
                 placed[tensor] = np.zeros(shape, np.float32)
-            elif tensor not in placed:
+            elif tensor in placed:
+                placed[tensor] = laid_out(placed[tensor], dims)
+            else:
                 placed[tensor] = self.draws.standard_normal(shape, np.float32)
         return placed
 

@@ -107,7 +107,7 @@ class Trial:
             self._settled({name: expected[name]})[name],
             self._settled({name: got})[name],
             self.tolerance(name, participant),
-            free=self._ties(name, expected, participant, rounding or {}),
+            free=self._undecided(name, expected, participant, rounding or {}),
             narrowed=narrows(participant.format),
             rounding=None if rounding is None or got.dtype.kind != "f" else rounding.get(name),
             most=self._most(name, participant),
@@ -203,10 +203,16 @@ class Trial:
             for n, a in values.items()
         }
 
-    def _ties(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
-        """Where an argmax is not decided, because the scores of the reference are too close."""
+    def _undecided(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
+        """Where an argmax is not decided, because the scores of the reference are too close; and where no noise times a
+        deviation that overflows is NaN in a source that is fed zeros: the policy gives its mean there.
+        """
         spec = self.signature.output(name)
-        if spec.role is not Role.DETERMINISTIC or not self.signature.branches or expected[name].dtype.kind == "f":
+        if spec.role is not Role.DETERMINISTIC:
+            return None
+        if expected[name].dtype.kind == "f" and self.signature.noise:
+            return np.isnan(expected[name])
+        if not self.signature.branches or expected[name].dtype.kind == "f":
             return None
         scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
         if scores is None or scores not in expected or expected[scores].shape[-1] != sum(self.signature.branches):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from converters.graph.options import CompileOptions
+from converters.graph.run import run_graph
 from exporter.export.pipeline import ExportResult
 from exporter.reports.summary import (
     comparison_table,
@@ -28,7 +29,7 @@ from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.errors import SignatureError
+from signatures.errors import SignatureError, UnsupportedOpError
 from signatures.roles import Role
 from signatures.sampling import Case
 from signatures.spec import PolicySignature, SourceMap, TensorSpec
@@ -379,6 +380,71 @@ def test_a_parameter_that_is_longer_than_the_batch_does_not_change_it(exporting:
     result = exporting(tmp_path / "table.bytes")
     assert [s.shape for s in result.policy.signature.inputs] == [(None, 3), (None, 2), (9, 2)]
     assert result.passed is True
+
+
+@pytest.mark.parametrize(
+    ("layout", "turns"),
+    [((2, None), (1, 0)), ((1, None, 2), ()), ((2, 1, None), (2, 1, 0))],
+    ids=["[n, B]", "[1, B, n]", "[n, 1, B]"],
+)
+def test_noise_whose_rows_are_not_its_first_axis(
+    layout: tuple[int | None, ...], turns: tuple[int, ...], exporting: Exporting, tmp_path: Path
+) -> None:
+    """TensorFlow Probability draws so. It is one row of the input for each agent, and its deviation may overflow."""
+    nodes = [
+        placeholder("vector_observation"),
+        *dense("mu", "vector_observation", 3, 2),
+        *dense("log_sigma", "vector_observation", 3, 2),
+        node("sigma", "Exp", "log_sigma"),
+        node("all", "Shape", "mu", out_type=np.int32),
+        *(constant("zero", [0]), constant("one", [1]), constant("axis", 0)),
+        node("rows", "StridedSlice", "all", "zero", "one", "one", Index=np.int32),
+        # a quotient of lengths, as TFP computes how many are drawn
+        node("times", "FloorDiv", "rows", "rows"),
+        *(constant(f"d{i}", [d or 0]) for i, d in enumerate(layout)),
+        *(node(f"e{i}", "Mul", f"d{i}", "times") for i in range(len(layout))),
+        node(
+            "shape",
+            "ConcatV2",
+            *("rows" if d is None else f"e{i}" for i, d in enumerate(layout)),
+            "axis",
+            N=len(layout),
+        ),
+        node("noise", "RandomStandardNormal", "shape", dtype=np.float32, seed=1, seed2=2),
+        *((constant("order", turns), node("turned", "Transpose", "noise", "order")) if turns else ()),
+        node("flat", "Reshape", "turned" if turns else "noise", "all"),
+        node("spread", "Mul", "sigma", "flat"),
+        node("action", "Add", "mu", "spread"),
+    ]
+    (tmp_path / "turned.bytes").write_bytes(graph_bytes(nodes))
+    result = exporting(tmp_path / "turned.bytes")
+    assert result.policy.signature.input("epsilon").shape == (None, 2)
+    assert result.passed is True
+    feeds = {"state": np.zeros((3, 3), np.float32), "epsilon": np.zeros((3, 2), np.float32)}
+    still = run_graph(result.policy.graph, feeds, ["action"])["action"]
+    feeds["epsilon"][1] = 1  # an agent's noise is its own
+    assert (run_graph(result.policy.graph, feeds, ["action"])["action"] != still).any(axis=1).tolist() == [
+        False,
+        True,
+        False,
+    ]
+
+
+def test_noise_of_which_nobody_knows_how_much_an_agent_has_is_refused(exporting: Exporting, tmp_path: Path) -> None:
+    nodes = [
+        placeholder("vector_observation"),
+        *dense("mu", "vector_observation", 3, 2),
+        *(node("all", "Shape", "mu", out_type=np.int32), constant("axis", [0])),
+        node("count", "Prod", "all", "axis", keep_dims=True),
+        node("noise", "RandomStandardNormal", "count", dtype=np.float32),
+        node("rows", "Reshape", "noise", "all"),
+        node("action", "Add", "mu", "rows"),
+    ]
+    (tmp_path / "flat.bytes").write_bytes(graph_bytes(nodes))
+    with pytest.raises(UnsupportedOpError, match="how many numbers 'noise'"):
+        exporting(tmp_path / "flat.bytes")
+    named = CompileOptions(outputs={"mu": Role.ACTION})
+    assert exporting(tmp_path / "flat.bytes", compile=named).passed is True
 
 
 # ------------------------------------------------------------------ where it goes

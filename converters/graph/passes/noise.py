@@ -6,7 +6,8 @@ repeated in any runtime by feeding the same draws.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,10 @@ import numpy as np
 from converters.graph.compilation import Compilation
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.table import traits
+from converters.graph.ops.table import is_fed, op_of, traits
 from converters.graph.options import NoiseMode
 from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, static_shape
+from converters.graph.types import BATCH, FLOAT32, INT32, Dim, static_shape
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
 
@@ -42,10 +43,13 @@ def settle_noise(c: Compilation) -> Compilation:
     if not drawn and not taken:
         return c
     types = infer_types(c.graph)
+    for name in drawn:
+        _check_rows(c.graph[name], types[name].shape or ())
     draws, fed = ({n: static_shape(types[n].shape) or () for n in names} for names in (drawn, taken))
     graph = lift_noise(c.graph, "zero" if c.options.deterministic else c.options.noise, fed)
+    turned = {n.name: n.attrs["shape"].dims for n in graph.nodes if is_fed(n) and n.name not in c.graph}
     noise = {tensor_of(c.graph[name]): dims for name, dims in (draws | fed).items()}
-    return replace(c, graph=graph, draws=draws, fed=fed, noise=noise)
+    return replace(c, graph=graph, draws={**draws, **turned}, fed=fed, noise=noise)
 
 
 def tensor_of(node: Node) -> str:
@@ -78,7 +82,8 @@ def settle_single_draws(c: Compilation) -> Compilation:
 def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> Graph:
     """Placeholders (``lift``) or zeros (``zero``) in place of the samplers, under their names; ``keep`` leaves them.
 
-    ``inputs`` are placeholders that take noise already (0.1-0.2, 0.6-0.14): ``zero`` removes them too.
+    ``inputs`` are placeholders that take noise already (0.1-0.2, 0.6-0.14): ``zero`` removes them too. Draws whose axis
+    of agents is not the first become an input [B, n] that is turned (``laid_out``).
     """
     fed = frozenset(inputs) if mode == "zero" else frozenset()
     if mode == "keep" or not (samplers(graph) or any(n.name in fed for n in graph.nodes)):
@@ -99,14 +104,54 @@ def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> G
             )
         dims = static_shape(shape)
         assert dims is not None
-        if mode == "lift":
-            attrs = {"dtype": FLOAT32, "shape": TensorShape(dims)}
-            editor.nodes.append(Node(node.name, "Placeholder", attrs=attrs, origin=node.origin))
-        else:
+        if mode == "zero":
             # One row of zeros broadcasts over the batch.
             zeros = np.zeros([1 if d is None else d for d in dims], np.float32)
             editor.nodes.append(Node(node.name, "Const", value=zeros, origin=node.origin))
+        elif _leads(dims):
+            attrs = {"dtype": FLOAT32, "shape": TensorShape(dims)}
+            editor.nodes.append(Node(node.name, "Placeholder", attrs=attrs, origin=node.origin))
+        else:
+            _turned(editor, node, dims)
     return editor.graph()
+
+
+def _check_rows(node: Node, shape: Sequence[Dim]) -> None:
+    """Raise UnsupportedOpError unless a draw has a number of elements for each agent."""
+    free = [d for d in shape if isinstance(d, str)]
+    if free and free != [BATCH]:
+        raise UnsupportedOpError(
+            f"how many numbers {node.name!r} ({node.op}) draws for each agent is not known",
+            issues=[(node.name, node.op)],
+            why=f"its shape is [{', '.join('?' if isinstance(d, str) else str(d) for d in shape)}]",
+            fix="name a tensor before the draw, such as the mean: --output NODE=action",
+        )
+
+
+def _leads(dims: Sequence[int | None]) -> bool:
+    """Whether the axis of agents is the first, or there is none."""
+    return None not in dims or dims[0] is None
+
+
+def laid_out(rows: np.ndarray, dims: Sequence[int | None]) -> np.ndarray:
+    """Noise [B, n] in the layout ``dims`` of a sampler, where its axis of agents (None) is not the first."""
+    if _leads(dims):
+        return rows
+    axis = list(dims).index(None)
+    return np.moveaxis(rows.reshape(len(rows), *(d for d in dims if d is not None)), 0, axis)
+
+
+def _turned(editor: Editor, node: Node, dims: Sequence[int | None]) -> None:
+    """An input [B, n] under a name of its own, and what the sampler drew of it, under the sampler's."""
+    axis, others = list(dims).index(None), [d for d in dims if d is not None]
+    attrs = {"dtype": FLOAT32, "shape": TensorShape((None, math.prod(others)))}
+    rows = editor.add_name(f"{node.name}/rows")
+    editor.nodes.append(Node(rows, "Placeholder", attrs=attrs, origin=node.origin))
+    if len(others) > 1:
+        shape = editor.const(np.array([-1, *others], INT32), f"{node.name}/shape")
+        rows = editor.add("Reshape", [rows, shape], f"{node.name}/split")
+    order = editor.const(np.array([*range(1, axis + 1), 0, *range(axis + 1, len(dims))], INT32), f"{node.name}/order")
+    editor.nodes.append(Node(node.name, "Transpose", (rows, order), attrs={}))
 
 
 def without_noise(
@@ -115,7 +160,7 @@ def without_noise(
     """``reference`` computed at zero noise beside the graph it stands in.
 
     ``noise`` maps the names of noise nodes (inputs or samplers) to their shapes. Nodes between them and ``reference``
-    are copied under ``prefix``. A product with an all-zero constant is taken to be zero: true for every finite factor,
+    are copied under ``prefix``. A product with zeros is taken to be zero: true for every finite factor,
     and where a standard deviation overflows, the mean is what a policy without chance should give.
     """
     wanted = graph.ancestors([reference]) & graph.descendants(noise)
@@ -148,7 +193,17 @@ def without_noise(
         name = editor.add_name(f"{prefix}/{node.name}")
         editor.nodes.append(Node(name, node.op, tuple(inputs), node.attrs, node.value))
         copies[node.name] = name
+        made_of = inputs if node.op == "Add" else op_of(node).moved(inputs) if traits(node).moves else ()
+        if made_of and all(i in zeros or _is_zero(graph, i) for i in made_of):
+            zeros.add(name)
     return editor.graph(), _moved(reference, copies)
+
+
+def _is_zero(graph: Graph, reference: str) -> bool:
+    """Whether a tensor is zeros, of however many rows."""
+    node = graph.get(reference)
+    value = None if node is None else graph.constant(node.inputs[1] if node.op == "Fill" else reference)
+    return value is not None and not value.any()
 
 
 def _moved(reference: str, copies: Mapping[str, str]) -> str:
