@@ -63,7 +63,7 @@ check: lint types
 	$(PYTEST) -n 2 --dist worksteal -q -m "not (runtimes or slow or corpus or legacy or browser or peers)"
 
 test: install browser lint types
-	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90
+	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90 --durations=25
 
 docs: install
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs

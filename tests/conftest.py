@@ -6,15 +6,18 @@ Every policy.json and parity.json that a test in this process writes is held aga
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
 
+from converters.formats import DEFAULTS, WRITTEN
+from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 
@@ -23,6 +26,10 @@ os.environ.pop("COLUMNS", None)
 
 #: What the tests that compare all formats run them in.
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
+#: Those of them that cost little: half of a verification's time is Node's.
+QUICK = ("tensorflow", "onnxruntime")
+#: Set, every policy of a sweep is run in all of NEEDED, as one with ops of its own always is.
+FULL = "EXPORT_MODEL_TEST_FULL"
 
 #: No time limit per example: on a busy machine it says nothing of the code. Each test has pytest's own.
 settings.register_profile("busy", deadline=None)
@@ -71,6 +78,51 @@ def pool(processes: RuntimePool) -> RuntimePool:
     if missing:
         pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
     return processes
+
+
+Chosen = Callable[[Sequence[Policy]], tuple[str, ...]]
+
+
+@pytest.fixture(scope="session")
+def runtimes_for(tmp_path_factory: pytest.TempPathFactory) -> Chosen:
+    """What to run policies in: NEEDED where their ops and contract are met for the first time, else QUICK.
+
+    Hundreds of public and genuine files are some dozen networks with other weights, and other weights reach no other
+    line of a writer or a runtime's kernel. Of all workers one is the first: it makes the file of that name.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    met = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "structures"
+    met.mkdir(exist_ok=True)
+
+    def chosen(policies: Sequence[Policy]) -> tuple[str, ...]:
+        if os.environ.get(FULL):
+            return NEEDED
+        name = hashlib.sha256(repr([structure(p) for p in policies]).encode()).hexdigest()
+        try:
+            (met / name).touch(exist_ok=False)
+        except FileExistsError:
+            return QUICK
+        return NEEDED
+
+    return chosen
+
+
+def formats_in(runtimes: Sequence[str]) -> set[str]:
+    """The default formats that are run in one of these."""
+    return {f for f in DEFAULTS if set(WRITTEN[f].runtimes) & set(runtimes)}
+
+
+def structure(policy: Policy) -> tuple[object, ...]:
+    """The ops of a policy with their attributes, and its contract's roles, dtypes and ranks; no size and no weight."""
+    left_out = ("shape", "seed", "seed2")
+    ops = {
+        (n.op, *sorted((key, str(value)) for key, value in n.attrs.items() if key not in left_out))
+        for n in policy.graph.nodes
+        if n.op != "Const"
+    }
+    signature = policy.signature
+    specs = sorted((str(s.role), str(s.dtype), len(s.shape)) for s in (*signature.inputs, *signature.outputs))
+    return sorted(map(repr, ops)), specs, len(signature.branches)
 
 
 @pytest.fixture

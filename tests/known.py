@@ -40,6 +40,14 @@ def policies(path: Path) -> tuple[Policy, ...] | ExportModelError:
         return error
 
 
+def policies_of(path: Path) -> tuple[Policy, ...]:
+    """The same, of a file that is a policy: the reader's error is raised."""
+    found = policies(path)
+    if isinstance(found, ExportModelError):
+        raise found
+    return found
+
+
 def policies_or_skip(path: Path) -> tuple[Policy, ...]:
     """The same; what is no policy, or is damaged, is skipped: other tests say which files are."""
     found = policies(path)

@@ -1,4 +1,4 @@
-"""``.nn`` files through the whole pipeline: four formats, compared in the real runtimes."""
+"""``.nn`` files through the whole pipeline: four formats, compared in the real runtimes (``runtimes_for``)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from exporter.reports.summary import failure_lines
 from exporter.verify.options import VerifyOptions
+from tests import known
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import BROKEN, genuine_files, params, public_files
 from tests.barracuda.test_layers import expected_of, feeds_of, policy_of
-from tests.conftest import NEEDED
+from tests.conftest import Chosen, formats_in
 from tests.corpus.false_alarms import seed_of
 
 pytestmark = pytest.mark.slow
@@ -31,15 +32,17 @@ SOURCES = [
 
 @pytest.mark.corpus
 @pytest.mark.parametrize("path", params(SOURCES, lambda p: f"{p.parent.name}-{p.name}"[:90]))
-def test_a_nn_exports_to_four_formats_that_agree(path: Path, shared: Path, tmp_path: Path, pool: RuntimePool) -> None:
+def test_a_nn_exports_to_four_formats_that_agree(
+    path: Path, shared: Path, tmp_path: Path, pool: RuntimePool, runtimes_for: Chosen
+) -> None:
+    runtimes = runtimes_for(known.policies_of(path))
     (result,) = export(
-        [path], ExportOptions(tmp_path, verify=NEEDED, parity=VerifyOptions(seed=seed_of(path))), pool=pool
+        [path], ExportOptions(tmp_path, verify=runtimes, parity=VerifyOptions(seed=seed_of(path))), pool=pool
     )
     assert result.report is not None
     assert result.report.passed is True, "\n".join(failure_lines(result.report))
-    ran = {c.runtime for c in result.report.comparisons}
-    assert ran == {"numpy", *NEEDED}
-    assert {c.format for c in result.report.comparisons} >= {"bytes", "saved_model", "tfjs", "onnx"}
+    assert {c.runtime for c in result.report.comparisons} == {"numpy", *runtimes}
+    assert {c.format for c in result.report.comparisons} >= formats_in(runtimes)
     assert not result.report.reference.startswith("source/")
 
 

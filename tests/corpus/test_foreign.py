@@ -22,7 +22,7 @@ from converters.source import ReadOptions
 from exporter.export.sources import read_source
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Role
-from tests.conftest import NEEDED
+from tests.conftest import Chosen
 from tests.corpus.conftest import SHARED
 
 pytestmark = [pytest.mark.corpus, pytest.mark.slow]
@@ -104,7 +104,9 @@ def compared(policy: Policy, answers: Arrays, expected: Arrays, where: str) -> i
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda p: p.name)
-def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path: Path, pool: RuntimePool) -> None:
+def test_the_trainers_own_numbers_come_out_of_every_format(
+    file: Path, tmp_path: Path, pool: RuntimePool, runtimes_for: Chosen
+) -> None:
     about: dict[str, Any] = json.loads(file.with_suffix(".json").read_text())
     with np.load(file.with_suffix(".npz")) as archive:
         outputs = OUTPUTS.get(file.name) or about.get("onnx_outputs") or about["outputs"]
@@ -115,13 +117,13 @@ def test_the_trainers_own_numbers_come_out_of_every_format(file: Path, tmp_path:
     assert any(s.role in OBSERVATIONS for s in signature.inputs)
     if file.suffix != ".pt":
         nothing_is_lost(policy, about)
-    models = {}
+    models, chosen = {}, ("numpy", *runtimes_for([policy]))
     for target in WRITTEN:
         if not WRITTEN[target].default:
             continue
         artifact = WRITTEN[target].artifact(policy, WriteOptions("{}"))
         artifact.write(tmp_path)
-        for runtime in (r for r in WRITTEN[target].runtimes if r in ("numpy", *NEEDED)):
+        for runtime in (r for r in WRITTEN[target].runtimes if r in chosen):
             kind = {"kind": "saved_model"} if target == "saved_model" else {"kind": "graph"}
             models[f"{target} in {runtime}"] = pool.process(runtime).load(str(tmp_path / artifact.main), **kind)
     names = [s.name for s in signature.outputs]

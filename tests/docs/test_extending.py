@@ -12,6 +12,7 @@ import pytest
 
 from tests.commands import ROOT
 from tests.docs.blocks import Block, blocks
+from tests.docs.workshop import NARROW
 
 PAGE = ROOT / "docs" / "extending.md"
 PARTS = ("exporter", "converters", "signatures", "fixtures", "tests")
@@ -40,7 +41,8 @@ def insert(block: Block, folder: Path) -> None:
 
 def run(command: list[str], block: Block, folder: Path) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(folder), "PYTHONSAFEPATH": "1"}
+    modules = f"{folder / NARROW.relative_to(ROOT)}{os.pathsep}{folder}"
+    environment = {**os.environ, "PATH": path, "PYTHONPATH": modules, "PYTHONSAFEPATH": "1"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 0, f"{block.where}:\n{done.stdout[-4000:]}\n{done.stderr[-2000:]}"
     if "pytest" in block.text:

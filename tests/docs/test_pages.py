@@ -1,13 +1,19 @@
-"""Every command and program of README.md and docs/ runs as it stands there."""
+"""Every command and program of README.md and docs/ runs as it stands there.
+
+On a page of EVERY ``auto`` stands for all runtimes that are installed, on the others for onnxruntime, which starts in a
+tenth of the time; with EXPORT_MODEL_TEST_FULL=1 for all of them everywhere.
+"""
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.commands import ROOT
+from tests.conftest import FULL
 from tests.docs.blocks import Block, blocks, blocks_of, name_of, pages
 from tests.docs.workshop import HOW, Workshop, furnish
 
@@ -17,6 +23,8 @@ ELSEWHERE = {
     "docs/acting.md": "tests/acting/test_docs.py",
     "docs/extending.md": "tests/docs/test_extending.py",
 }
+#: Pages that run with all runtimes: the first one, and those whose comparisons need TensorFlow.js.
+EVERY = {"README.md", "docs/ci.md", "docs/tasks/tensorflowjs-converter.md"}
 #: Languages that stand for something to run; the rest is looked at.
 RUN = {"sh", "python", "js"}
 
@@ -47,6 +55,7 @@ def workshop(furnished: Path, tmp_path: Path) -> Workshop:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in HERE if p not in QUICK], ids=name_of)
 def test_the_blocks_of_a_page_run(page: Path, workshop: Workshop) -> None:
+    workshop.narrow = name_of(page) not in EVERY and not os.environ.get(FULL)
     for block in blocks(page):
         if not directive(block):
             workshop.run(block)
@@ -65,6 +74,7 @@ def test_every_block_has_a_language_that_is_tested() -> None:
 
 
 def test_pages_with_tests_of_their_own_have_them() -> None:
+    assert set(map(name_of, HERE)) >= EVERY
     for page, test in ELSEWHERE.items():
         assert (ROOT / page).is_file()
         assert Path(page).name in (ROOT / test).read_text(encoding="utf-8")

@@ -23,6 +23,8 @@ from tests.commands import ROOT
 from tests.docs.blocks import Block
 
 TRAINED = ROOT / "fixtures/trained/3DBall"
+#: First on PYTHONPATH, a module there makes ``auto`` stand for onnxruntime.
+NARROW = ROOT / "tests/docs/narrow"
 MODULES = ROOT / "converters/runtimes/javascript/js/node_modules"
 
 
@@ -66,6 +68,7 @@ class Workshop:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.narrow = False
         self._programs = 0
         self._last = ""
 
@@ -122,7 +125,7 @@ class Workshop:
         return {
             **os.environ,
             "PATH": f"{own}{os.pathsep}{os.environ['PATH']}",
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": os.pathsep.join(map(str, (NARROW, ROOT) if self.narrow else (ROOT,))),
             "GITHUB_STEP_SUMMARY": str(self.folder / "summary.md"),
             "TF_CPP_MIN_LOG_LEVEL": "3",
             "CUDA_VISIBLE_DEVICES": "-1",

@@ -12,7 +12,8 @@ from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import Tolerance
-from tests.conftest import NEEDED
+from tests import known
+from tests.conftest import NEEDED, Chosen, formats_in
 from tests.corpus.conftest import SHARED
 from tests.corpus.false_alarms import seed_of
 from tests.onnx_reader.models import Bench
@@ -41,17 +42,18 @@ def test_nothing_has_fallen_out() -> None:
     "source",
     [pytest.param(p, id=f"{p.parent.name}-{p.stem}"[:90]) for p in (*CORPUS, *GENUINE)] or ABSENT,
 )
-def test_exports_to_four_formats_that_agree(source: Path, bench: Bench, tmp_path: Path) -> None:
+def test_exports_to_four_formats_that_agree(source: Path, bench: Bench, tmp_path: Path, runtimes_for: Chosen) -> None:
     for runtime in NEEDED:
         bench.need(runtime)
-    options = ExportOptions(tmp_path, verify=NEEDED, parity=VerifyOptions(seed=seed_of(source)))
+    runtimes = runtimes_for(known.policies_of(source))
+    options = ExportOptions(tmp_path, verify=runtimes, parity=VerifyOptions(seed=seed_of(source)))
     (result,) = export([source], options, pool=bench.pool)
     report = result.report
     assert report is not None
     assert report.passed is True, "\n".join(failure_lines(report))
     assert report.reference == "source/onnxruntime"
-    assert {c.runtime for c in report.comparisons} == {"numpy", *NEEDED}
-    assert {c.format for c in report.comparisons} >= {"bytes", "saved_model", "tfjs", "onnx"}
+    assert {c.runtime for c in report.comparisons} == {"numpy", *runtimes}
+    assert {c.format for c in report.comparisons} >= formats_in(runtimes)
 
 
 def test_what_the_generations_are() -> None:
