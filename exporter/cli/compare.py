@@ -15,6 +15,7 @@ from exporter.cli.options import comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
+    from converters.policy import Policy
     from exporter.verify.options import VerifyOptions
 
 
@@ -57,6 +58,7 @@ def compare_command(
     from exporter.reports.entry import Entry
 
     console.prepare()
+    read: list[Policy] = []
     with ExitStack() as fetched, console.progress() as progress:
         report = compare_artefacts(
             fetched.enter_context(nearby(reference)),
@@ -68,10 +70,13 @@ def compare_command(
             read=ReadOptions(trust_source=trust_source),
             allow_unverified=allow_unverified,
             progress=progress,
+            understood=read.append,
         )
     console.verified(report, ", ".join(map(shown, candidates)))
     console.json({"reports": [report.to_dict()]})
     command = ("compare", *map(shown, (reference, *candidates)), *(word for m in mapped for word in ("--map", m)))
-    console.write_reports(lambda: [Entry(report, steps=options.steps, command=command)])
+    console.write_reports(
+        lambda: [Entry(report, read[0].signature, read[0].graph, steps=options.steps, command=command)]
+    )
     if report.passed is False:
         sys.exit(1)

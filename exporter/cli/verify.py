@@ -62,13 +62,14 @@ def verify_command(
     console.prepare()
     reports = []
     with ExitStack() as fetched, console.progress() as progress:
-        bundles = tuple(
-            found
-            for place in map(fetched.enter_context, map(nearby, bundles))
+        near = [(given, fetched.enter_context(nearby(given))) for given in bundles]
+        places = [
+            (found, None if given == place else given)
+            for given, place in near
             for found in bundles_in(place) or [place]
-        )
+        ]
         source = None if source is None else fetched.enter_context(nearby(source))
-        for number, folder in enumerate(bundles, 1):
+        for number, (folder, _) in enumerate(places, 1):
             report = verify_folder(
                 folder,
                 source=source,
@@ -77,7 +78,7 @@ def verify_command(
                 runtimes=runtimes,
                 options=options,
                 allow_unverified=allow_unverified,
-                progress=counted(progress, number, len(bundles)),
+                progress=counted(progress, number, len(places)),
             )
             reports.append(report)
             progress.clear()
@@ -85,12 +86,14 @@ def verify_command(
         console.whole(reports)
         console.check_rules(reports)
         console.json({"reports": [r.to_dict() for r in reports]})
-        console.write_reports(lambda: _bundle_entries(reports, bundles, options.steps))
+        console.write_reports(lambda: _bundle_entries(reports, places, options.steps))
     if any(r.passed is False for r in reports):
         sys.exit(1)
 
 
-def _bundle_entries(reports: Sequence[ParityReport], bundles: Sequence[Path], steps: int) -> list[Entry]:
+def _bundle_entries(
+    reports: Sequence[ParityReport], places: Sequence[tuple[Path, Path | None]], steps: int
+) -> list[Entry]:
     from exporter.reports.entry import of_bundle
 
-    return [of_bundle(report, folder, steps) for report, folder in zip(reports, bundles, strict=True)]
+    return [of_bundle(report, *place, steps) for report, place in zip(reports, places, strict=True)]

@@ -102,6 +102,7 @@ def compare_artefacts(
     read: ReadOptions | None = None,
     allow_unverified: bool = False,
     progress: Progress = _LOG.info,
+    understood: Callable[[Policy], object] | None = None,
     pool: RuntimePool | None = None,
 ) -> ParityReport:
     """Compare files that any tool made with a reference; every format of a candidate that is a bundle takes part.
@@ -111,6 +112,7 @@ def compare_artefacts(
     - ``understanding``, ``read``: how to read the reference (the flags ``--input``, ``--output``, ``--step``, …).
     - ``allow_unverified``: no error where none of the candidates' runtimes is installed.
     - ``progress``: called with each step; the default logs them.
+    - ``understood``: called with the reference as it was understood, before anything runs.
 
     Raises ExportModelError where a file cannot be read, UsageError where a name of ``names`` is none,
     RuntimeUnavailableError where no runtime could run any::
@@ -121,6 +123,8 @@ def compare_artefacts(
     reference = Path(reference)
     given = [candidates] if isinstance(candidates, Path | str) else candidates
     policy, source = _reference(reference, understanding, read)
+    if understood is not None:
+        understood(policy)
     artefacts = [(path, *found) for path in map(Path, given) for found in ports_of(path)]
     if not artefacts:
         raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.bundle.bundle import Bundle
+from converters.fetch import shown
 from converters.graph.nodes import Graph
 from exporter.export.pipeline import ExportResult
 from exporter.verify.report import ParityReport
@@ -28,7 +29,7 @@ class Entry:
     contract: Contract | None = None
     #: Steps of a rollout, to draw its inputs again.
     steps: int = 4
-    #: The words of the command that makes the same comparison; empty: ``verify`` of the bundle.
+    #: The words of the command that makes the same comparison, where the first was run; empty: nobody can.
     command: tuple[str, ...] = ()
 
     @property
@@ -55,14 +56,20 @@ def of_result(result: ExportResult, steps: int) -> Entry | None:
     if result.report is None:
         return None
     policy = result.policy
-    return Entry(result.report, policy.signature, policy.graph, result.agreed, steps)
+    return Entry(result.report, policy.signature, policy.graph, result.agreed, steps, _verify(result.folder))
 
 
-def of_bundle(report: ParityReport, folder: Path, steps: int) -> Entry:
-    """The entry of a bundle that was verified again (so its files are what policy.json says)."""
+def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int) -> Entry:
+    """The entry of a bundle that was verified again (so its files are what policy.json says); ``place``: the
+    address that it was fetched from.
+    """
     found = Bundle.open(folder)
     try:
         graph = found.graph()
     except (OSError, ExportModelError):  # a report without a picture is better than none where it has gone since
         graph = None
-    return Entry(report, found.signature, graph, found.contract, steps)
+    return Entry(report, found.signature, graph, found.contract, steps, _verify(place or folder))
+
+
+def _verify(place: Path) -> tuple[str, ...]:
+    return "verify", shown(place)

@@ -50,6 +50,8 @@ def page(entries: Sequence[Entry]) -> str:
     alone = len(ordered) == 1
     eyebrow = el("h1" if alone else "p", "export-model · parity report", class_="eyebrow")
     title = f"{ordered[0].name}: parity report" if alone else f"Parity report on {len(ordered)} policies"
+    bundled = any(e.contract is not None for e in entries)
+    data = " parity.json in the bundle holds the same as data." if bundled else ""
     head = el(
         "head",
         el("meta", charset="utf-8"),
@@ -61,9 +63,8 @@ def page(entries: Sequence[Entry]) -> str:
     body = el(
         "body",
         el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered)),
-        el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)]),
-        sections.words(),
-        el("footer", f"Written by export-model {__version__}. parity.json in the bundle holds the same as data."),
+        el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)], sections.words()),
+        el("footer", f"Written by export-model {__version__}.{data}"),
     )
     return f"<!DOCTYPE html>\n{el('html', head, body, lang='en')}\n"
 

@@ -76,13 +76,12 @@ def facts(entry: Entry) -> Markup:
 def again(entry: Entry) -> Markup | None:
     """The command that makes the same comparison once more."""
     report = entry.report
-    if entry.contract is None and not entry.command:
+    if not entry.command:
         return None
-    command = entry.command or ("verify", f"./{entry.name}")
     ran = [name for name, state in report.runtimes.items() if state["status"] == "ran" and name != "numpy"]
     chosen = ["--runtimes", ",".join(ran)] if ran else ["--allow-unverified"]
     numbers = ["--seed", str(report.seed), "--samples", str(report.samples), "--steps", str(entry.steps)]
-    line = shlex.join(["export-model", *command, *chosen, *numbers])
+    line = shlex.join(["export-model", *entry.command, *chosen, *numbers])
     return el("p", "The same again: ", el("code", line), class_="soft again")
 
 

@@ -107,7 +107,7 @@ def test_a_page_shows_all_that_is_known_of_a_policy(recurrent: tuple[Entry, Path
     assert shortened(made.feeds(str(case.worst_input))["state"]) in parsed.text
     assert [t for t, _ in parsed.elements].index("h1") < [t for t, _ in parsed.elements].index("h2")
     assert parsed.count("h1") == 1
-    assert page([of_bundle(made.report, folder, 3)]).count("<rect") == source.count("<rect")
+    assert page([of_bundle(made.report, folder, None, 3)]).count("<rect") == source.count("<rect")
 
 
 def test_it_can_be_read_without_eyes(recurrent: tuple[Entry, Path]) -> None:
@@ -151,8 +151,11 @@ def test_the_tolerance_is_the_middle_of_its_axis() -> None:
 
 
 def test_a_report_says_the_command_that_makes_it(recurrent: tuple[Entry, Path]) -> None:
-    made, _ = recurrent
-    assert "The same again: export-model verify ./recurrent --runtimes " in Page(page([made])).text
+    made, folder = recurrent
+    assert f"The same again: export-model verify {folder} --runtimes " in Page(page([made])).text
+    fetched = of_bundle(made.report, folder, Path("https://example.org/recurrent"), 3)
+    assert "The same again: export-model verify https://example.org/recurrent --runtimes " in Page(page([fetched])).text
+    assert "The same again" not in Page(page([entry(PASSING)])).text
     other = replace(entry(PASSING), command=("compare", "a b.onnx", "c.onnx"))
     assert "export-model compare 'a b.onnx' c.onnx --runtimes onnxruntime --seed 3" in Page(page([other])).text
 
