@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JS := converters/runtimes/javascript/js
+TESTS_JS := tests/serve/js
 PYTEST := $(BIN)/python -m pytest
 # Where the machine forbids it, each of hundreds of processes would compile all modules anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -24,10 +25,11 @@ help:
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json
+$(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json $(TESTS_JS)/package-lock.json
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev,docs]'
 	cd $(JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
+	cd $(TESTS_JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	@touch $(STAMP)
 
 # Without it the tests in a browser are skipped, so a Debian machine that may install it does.

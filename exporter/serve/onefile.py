@@ -71,22 +71,26 @@ def _hash(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
-def _bundled(site: Mapping[str, bytes]) -> str:
-    """All modules that main.mjs needs, each after what it imports, as functions that give what they export."""
-    done: dict[str, str] = {}
+def modules_of(site: Mapping[str, bytes]) -> list[str]:
+    """All modules that main.mjs needs, each after what it imports."""
+    done: dict[str, None] = {}
 
     def visit(name: str) -> None:
         if name in done:
             return
-        done[name] = ""  # a circle would find this, and its functions are not made yet
-        text = site[name].decode()
-        for _, path in _IMPORT.findall(text):
+        done[name] = None  # a circle would find this, and its functions are not made yet
+        for _, path in _IMPORT.findall(site[name].decode()):
             visit(_beside(name, path))
         del done[name]
-        done[name] = _as_function(name, _without_comments(text))
+        done[name] = None
 
     visit(_MAIN)
-    return "\n".join(done.values())
+    return list(done)
+
+
+def _bundled(site: Mapping[str, bytes]) -> str:
+    """The modules as functions that give what they export."""
+    return "\n".join(_as_function(name, _without_comments(site[name].decode())) for name in modules_of(site))
 
 
 def _as_function(name: str, text: str) -> str:

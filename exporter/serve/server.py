@@ -173,6 +173,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "export-model", ""
     timeout = SILENCE
+    disable_nagle_algorithm = True  # or a body waits until its headers are acknowledged
     server: SiteServer
 
     def handle_one_request(self) -> None:

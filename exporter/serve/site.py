@@ -18,7 +18,7 @@ from converters.runtimes.js import KERNELS
 from converters.tfjs.reader import content_of
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
-from exporter.serve.server import DATA, TYPES
+from exporter.serve.server import DATA, INDEX, TYPES
 from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
@@ -26,7 +26,7 @@ from signatures.records import dataclass
 
 PAGE = Path(__file__).resolve().parent / "page"
 POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
-#: All drawings; a page of one file has one.
+#: All drawings; a page has that of its scene.
 _VIEWS = "views/index.mjs"
 #: The file by which a folder is known as ours.
 SITE = "site.json"
@@ -88,6 +88,7 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     vendor, backends, absent = _vendor("onnx" in said["models"]["model"])
     site.update(vendor)
     site[SITE] = dumps({**said, "backends": [_JS, *backends], "absent": absent})
+    site[INDEX] = _asking_at_once(site)
     return site
 
 
@@ -102,10 +103,6 @@ def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
         content_of(Fetched(folder / "tfjs"))
     for place in said["models"].values():
         site.pop(place.pop("onnx", ""), None)
-    if said["scene"] is not None:
-        site[_VIEWS] = (
-            f'import {{ viewOf as own }} from "./{said["scene"]}.mjs";\nexport const viewOf = own;\n'.encode()
-        )
     absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
     site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
     with naming(folder):
@@ -118,6 +115,8 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
     found = scene_of(policy.name, policy.signature, scene)
     opponent = None if found is None or found.side is None else _opponent(policy, found)
     site = {path.relative_to(PAGE).as_posix(): path.read_bytes() for path in sorted(PAGE.rglob("*")) if _ours(path)}
+    if found is not None:
+        site[_VIEWS] = f'import {{ viewOf as own }} from "./{found.id}.mjs";\nexport const viewOf = own;\n'.encode()
     site["policy.mjs"] = POLICY_MODULE.read_bytes()
     site.update({f"kernels/{path.name}": path.read_bytes() for path in sorted(KERNELS.glob("*.mjs"))})
     site.update(_model(policy, "model"))
@@ -146,6 +145,14 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
         "models": models,
         "model_bytes": size,
     }
+
+
+def _asking_at_once(site: Mapping[str, bytes]) -> bytes:
+    """index.html, which asks for all modules at once: a browser else finds them import by import, round by round."""
+    from exporter.serve.onefile import modules_of
+
+    links = "".join(f'<link rel="modulepreload" href="{name}">\n' for name in modules_of(site))
+    return site[INDEX].replace(b"</head>", f"{links}</head>".encode())
 
 
 def write_site(site: Mapping[str, bytes], place: Path) -> None:

@@ -7,6 +7,7 @@
  * that was asked for.
  */
 
+import { readFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import path from "node:path";
 import process from "node:process";
@@ -84,6 +85,14 @@ try {
         for (let at = 0; at < raw.length; at += 30000) text += String.fromCharCode(...raw.subarray(at, at + 30000));
         return { width: image.width, height: image.height, data: btoa(text) };
       }, png);
+    },
+    viewport: (width, height) => page.setViewportSize({ width, height }),
+    scheme: (colorScheme) => page.emulateMedia({ colorScheme }),
+    /** What axe-core finds: [rule, how bad, the elements] each. */
+    async axe(file) {
+      if (!(await page.evaluate("'axe' in window"))) await page.evaluate(await readFile(file, "utf8"));
+      const { violations } = await page.evaluate(() => globalThis.axe.run(document, { resultTypes: ["violations"] }));
+      return violations.map(({ id, impact, nodes }) => [id, impact, nodes.map(({ html, any }) => [html.slice(0, 160), any[0]?.message])]);
     },
     shot: async (file, fullPage = true) => void (await page.screenshot({ path: file, fullPage })),
   };

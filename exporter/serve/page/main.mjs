@@ -82,13 +82,14 @@ async function main() {
   const view = site.scene === null ? null : viewOf(site);
   const names = new Names(contract, contract.labels, view?.labels);
   const stage = view === null ? null : new Stage(view, host, names, site.backends);
+  // First it plays. What takes time, the panel and the check, begins once it has moved.
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) await stage?.play();
   const panel = new Panel(host, names, { folded: view !== null });
   const verdict = new Verdict(host, site.backends, site.absent);
   chooser(site, host, () => {
     void panel.decide();
     stage?.retitle();
   });
-  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) stage?.play();
   await verdict.run();
 }
 

@@ -36,6 +36,7 @@ export class Stage {
   /** The loop that runs; one that was paused and has not noticed yet is another. */
   #loop = 0;
   #touched = false;
+  #moved;
   #gust = GUST_EVERY;
   #film = null;
   #beside = null;
@@ -63,8 +64,12 @@ export class Stage {
     return this.#lanes[0].tally.steps * this.#view.stepSeconds;
   }
 
+  /** Resolves when the scene has moved, or will not. */
   play() {
-    this.#pause(false);
+    return new Promise((resolve) => {
+      this.#moved = resolve;
+      this.#pause(false);
+    });
   }
 
   #policies() {
@@ -343,7 +348,7 @@ export class Stage {
 
   async #run() {
     const own = ++this.#loop;
-    let [last, behind] = [performance.now(), 0];
+    let [last, behind] = [performance.now(), this.#view.stepSeconds]; // it moves in the first frame
     try {
       while (!this.#paused && own === this.#loop) {
         await frame();
@@ -357,11 +362,21 @@ export class Stage {
         }
         this.#draw(Math.min(behind / this.#view.stepSeconds, 1));
         this.#tell();
+        this.#hasMoved();
       }
     } catch (error) {
       this.#pause(true);
       this.#parts.canvases[0].status.textContent = `The policy cannot act: ${error.message}`;
     }
+    this.#moved?.();
+  }
+
+  /** What else the page does can wait until then. */
+  #hasMoved() {
+    if (this.#moved === undefined) return;
+    performance.mark("first-movement");
+    this.#moved();
+    this.#moved = undefined;
   }
 
   // ---- what is shown ------------------------------------------------------------------------------------------------
