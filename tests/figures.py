@@ -85,7 +85,7 @@ class Cell:
         self.rounding += bool(comparison.rounding)
         place, key = (self.apart, comparison.output) if comparison.tolerance.reason else (self.worst, policy)
         place[key] = max(place.get(key, 0.0), comparison.max_abs_diff)
-        self.elements = added(self.elements, comparison.histogram)
+        self.elements = added([self.elements, comparison.histogram])
 
     def to_dict(self) -> dict[str, Any]:
         return {

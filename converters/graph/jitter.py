@@ -51,9 +51,12 @@ class Jitter:
         if array.dtype.kind != "f":
             return array
         with np.errstate(all="ignore"):
-            step = np.where(np.isfinite(array), np.maximum(np.spacing(np.abs(array)) * ulps, absolute), 0)
-            moved = array + self._signs(array.shape) * step
-        return np.asarray(np.where(array == 0, array, moved)).astype(array.dtype)
+            step = np.spacing(np.abs(array)) * ulps
+            if absolute:
+                step = np.maximum(step, absolute)
+            moved = array + np.copysign(step, self._random.random(array.shape) - 0.5)
+            stays = (array == 0) | ~np.isfinite(array)
+        return np.asarray(np.where(stays, array, moved)).astype(array.dtype)
 
     def _added_up(
         self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]

@@ -87,6 +87,8 @@ class Graph:
     _index: dict[str, Node] = field(init=False, repr=False, compare=False)
     #: what ``shapes.infer_types`` found, by its ``partial``: half of the passes ask for it
     inferred: dict[bool, dict[str, TensorType]] = field(init=False, repr=False, compare=False, default_factory=dict)
+    #: what ``run.run_graph`` has to compute, by what is fed and fetched
+    plans: dict[Any, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", by_name(self.nodes))

@@ -7,10 +7,12 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph, node_of, normal_ref, ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
+from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
 from signatures.errors import GraphError
+from signatures.records import dataclass
 
 
 def _needed(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:
@@ -24,6 +26,37 @@ def _needed(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str
         needed.add(node_of(reference))
         stack.extend(graph.producer(reference).inputs)
     return needed
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What is to be computed for some tensors, where some are fed."""
+
+    constants: Mapping[str, np.ndarray]
+    steps: Sequence[tuple[OpDef, Node]]
+
+
+def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
+    """The graph's own for these tensors: a policy is run hundreds of times for the same ones."""
+    key = (tuple(fed), tuple(fetch))
+    if key not in graph.plans:
+        needed = _needed(graph, fetch, fed)
+        constants, steps = dict[str, np.ndarray](), list[tuple[OpDef, Node]]()
+        for node in graph.nodes:
+            if node.name not in needed:
+                continue
+            if node.op == "Placeholder":
+                raise GraphError(
+                    f"the input {node.name!r} is not fed", fix="feed every input that the outputs asked for depend on"
+                )
+            if node.op == "Const":
+                assert node.value is not None
+                constants[node.name] = node.value
+            else:
+                steps.append((op_of(node), node))
+        graph.plans[key] = _Plan(constants, steps)
+    plan: _Plan = graph.plans[key]
+    return plan
 
 
 def run_graph(
@@ -42,19 +75,9 @@ def run_graph(
     How far the outputs then move is what rounding explains.
     """
     values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
-    needed = _needed(graph, fetch, values)
-    for node in graph.nodes:
-        if node.name not in needed:
-            continue
-        if node.op == "Placeholder":
-            raise GraphError(
-                f"the input {node.name!r} is not fed", fix="feed every input that the outputs asked for depend on"
-            )
-        if node.op == "Const":
-            assert node.value is not None
-            values[node.name] = node.value
-            continue
-        entry = op_of(node)
+    plan = _plan(graph, values, fetch)
+    values = {**plan.constants, **values}
+    for entry, node in plan.steps:
         arguments = [values[r] for r in node.inputs]
         if jitter is not None:
             arguments = jitter.operands(entry, arguments)

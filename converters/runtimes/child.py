@@ -24,6 +24,15 @@ class Model(Protocol):
         ...
 
 
+def _runs(model: Model, runs: Sequence[Mapping[str, Any]], tensors: Tensors) -> Tensors:
+    """Several runs in one request; what is fed to several of them crosses once."""
+    answers: Tensors = {}
+    for number, each in enumerate(runs):
+        feeds = {name: tensors[key] for name, key in each["feeds"].items()}
+        answers.update({f"{number}/{name}": a for name, a in model.run(feeds, each["fetch"], each).items()})
+    return answers
+
+
 Loader = Callable[[Mapping[str, Any]], Model]
 
 
@@ -71,6 +80,8 @@ def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception
                 write_frame(out, {"ok": True})
             elif command == "run":
                 write_frame(out, {"ok": True}, models[header["id"]].run(tensors, header["fetch"], header))
+            elif command == "runs":
+                write_frame(out, {"ok": True}, _runs(models[header["id"]], header["runs"], tensors))
             elif command == "unload":
                 models.pop(header["id"], None)
                 write_frame(out, {"ok": True})

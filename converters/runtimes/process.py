@@ -26,6 +26,10 @@ TIMEOUT = 300.0
 #: Seconds after which it is looked at again whether one has taken too long.
 _LOOK = 5.0
 
+#: Bytes that several runs are fed in one request: answers are held until the last of them, and one that takes longer
+#: than ``TIMEOUT`` is taken for dead.
+_REQUEST = 4 << 20
+
 #: Of numpy's matrix products: what they give does not depend on the machine's processors, and many sources are
 #: exported by a process for each of these.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
@@ -214,6 +218,18 @@ class RuntimeProcess:
         self.close()
 
 
+def _requests(inputs: Sequence[Mapping[str, np.ndarray]]) -> Iterator[tuple[int, int]]:
+    """From where to where ``inputs`` go into one request: as many as ``_REQUEST`` bytes hold, one at least."""
+    first = size = 0
+    for number, feeds in enumerate(inputs):
+        size += sum(array.nbytes for array in feeds.values())
+        if size > _REQUEST and number > first:
+            yield first, number
+            first, size = number, sum(array.nbytes for array in feeds.values())
+    if inputs:
+        yield first, len(inputs)
+
+
 def _size(path: str) -> int:
     """The bytes of a model: a file, or a folder of files."""
     place = Path(path)
@@ -242,12 +258,50 @@ class LoadedModel:
         """The outputs in ``fetch`` by name; raises RunFailedError. ``request`` is for what one runtime alone can do."""
         return self._run({"fetch": list(fetch), **request}, feeds, fetch)
 
+    def run_all(
+        self,
+        inputs: Sequence[Mapping[str, np.ndarray]],
+        fetch: Sequence[str],
+        requests: Sequence[Mapping[str, Any]] = (),
+    ) -> list[Tensors]:
+        """The same outputs for several inputs, in few requests; ``requests``: for each what ``run`` takes besides."""
+        wanted = {"fetch": list(fetch)}
+        headers = [{**wanted, **request} for request in requests] or [wanted] * len(inputs)
+        return self._run_all(inputs, headers, fetch)
+
     def predict(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str]) -> Tensors:
         """All outputs, by the call that users of the runtime make (TensorFlow.js: ``model.predict``)."""
         return self._run({}, feeds, outputs)
 
+    def predict_all(self, inputs: Sequence[Mapping[str, np.ndarray]], outputs: Sequence[str]) -> list[Tensors]:
+        """As ``predict``, for several inputs."""
+        return self._run_all(inputs, [{}] * len(inputs), outputs)
+
     def _run(self, header: Mapping[str, Any], feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
         _, results = self._process.request({"cmd": "run", "id": self._identity, **header}, dict(feeds))
+        return self._checked(results, fetch)
+
+    def _run_all(
+        self, inputs: Sequence[Mapping[str, np.ndarray]], headers: Sequence[Mapping[str, Any]], fetch: Sequence[str]
+    ) -> list[Tensors]:
+        found: list[Tensors] = []
+        for first, last in _requests(inputs):
+            keys: dict[int, str] = {}  # what several runs are fed is sent once
+            tensors: Tensors = {}
+            runs = []
+            for feeds, header in zip(inputs[first:last], headers[first:last], strict=True):
+                for array in feeds.values():
+                    tensors[keys.setdefault(id(array), str(len(keys)))] = array
+                runs.append({**header, "feeds": {name: keys[id(array)] for name, array in feeds.items()}})
+            _, results = self._process.request({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
+            answers: list[Tensors] = [{} for _ in runs]
+            for key, array in results.items():
+                number, _, name = key.partition("/")
+                answers[int(number)][name] = array
+            found += [self._checked(each, fetch) for each in answers]
+        return found
+
+    def _checked(self, results: Tensors, fetch: Sequence[str]) -> Tensors:
         missing = [name for name in fetch if name not in results]
         if missing:
             raise RunFailedError(f"{self._process.name} gave no output {missing[0]!r}")

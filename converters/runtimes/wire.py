@@ -11,6 +11,7 @@ import json
 import math
 import struct
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,8 +28,9 @@ def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[st
     parts = []
     entries = []
     for name, array in (tensors or {}).items():
-        entries.append({"name": name, "dtype": array.dtype.name, "shape": list(array.shape)})
-        parts.append(np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
+        dtype, little = _dtypes(array.dtype)
+        entries.append({"name": name, "dtype": dtype, "shape": list(array.shape)})
+        parts.append(array.astype(little, copy=False).tobytes())
     text = json.dumps({**header, "tensors": entries} if tensors is not None else dict(header)).encode()
     stream.write(struct.pack("<I", len(text)) + text + b"".join(parts))
     stream.flush()
@@ -48,6 +50,12 @@ def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise FramingError(f"what it said is no frame: {error}") from error
     return header, tensors
+
+
+@cache
+def _dtypes(dtype: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
+    """Its name, which numpy puts together every time, and itself as it crosses."""
+    return dtype.name, dtype.newbyteorder("<")
 
 
 def _exactly(stream: BinaryIO, count: int) -> bytes:

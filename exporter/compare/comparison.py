@@ -32,7 +32,7 @@ from exporter.export.sources import read_source
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, loading, unload
+from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, Run, loading, unload
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
@@ -430,7 +430,7 @@ def _same_numbers(
         return {}
     case = draw_cases(policy.signature)[1]
     try:
-        answers = _renamed(replace(candidate, outputs={n: n for n in left}), model)(case.feeds, left)
+        (answers,) = _renamed(replace(candidate, outputs={n: n for n in left}), model)([case.feeds], left)
     except RunFailedError:  # said where it is run for the comparison
         return {}
     expected = numpy_model.run(case.feeds, wanted)
@@ -442,12 +442,12 @@ def _same_numbers(
     return hints
 
 
-def _renamed(candidate: _Candidate, model: LoadedModel) -> Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]:
+def _renamed(candidate: _Candidate, model: LoadedModel) -> Run:
     """A run under canonical names."""
 
-    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
-        answers = model.run(candidate.fed(feeds), [candidate.outputs[n] for n in fetch])
-        return {n: answers[candidate.outputs[n]] for n in fetch}
+    def run(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
+        answers = model.run_all([candidate.fed(feeds) for feeds in inputs], [candidate.outputs[n] for n in fetch])
+        return [{n: answer[candidate.outputs[n]] for n in fetch} for answer in answers]
 
     return run
 

@@ -104,6 +104,8 @@ class Bisector:
             for chunk in _chunks(list(known), known):
                 got = inner.fetch(feeds, chunk)
                 for name, array in got.items():
+                    if array.dtype == known[name].dtype and np.array_equal(array, known[name]):
+                        continue
                     difference = compare(known[name], array, Tolerance(0, 0))
                     if not difference.passed:
                         found.append(_found(graph.producer(name), name, known[name], array, difference, self._source))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from exporter.verify.histogram import decades
+from exporter.verify.histogram import decades, decades_by_group
 from exporter.verify.tolerances import Tolerance
 from signatures.records import dataclass
 
@@ -90,6 +90,54 @@ def compare(
     smallest = float(needed.reshape(-1)[worst]) * (1 + 1e-12) if reference.dtype.kind == "f" else None
     histogram = decades(difference)
     return Difference(float(difference.max()), worst_relative, passed, "", explained, histogram, smallest, worst)
+
+
+def compare_all(
+    references: Sequence[np.ndarray],
+    candidates: Sequence[np.ndarray],
+    tolerance: Tolerance,
+    *,
+    narrowed: bool = False,
+    most: np.ndarray | None = None,
+) -> list[Difference | None]:
+    """``compare`` of pairs that differ in their rows only, in one go: to call numpy costs more than small arrays do.
+    None for a pair that does not pass, or of which more has to be said: that is for ``compare``.
+    """
+    nothing: list[Difference | None] = [None] * len(references)
+    kinds = {(r.dtype, c.dtype, r.shape[1:]) for r, c in zip(references, candidates, strict=True)}
+    if len(kinds) != 1 or any(r.shape != c.shape or not r.size for r, c in zip(references, candidates, strict=True)):
+        return nothing
+    ((wanted, got, _),) = kinds
+    if wanted != got and not (narrowed and (wanted.name, got.name) in NARROWED):
+        return nothing
+    a = np.concatenate(candidates, axis=None).astype(np.float64)
+    b = np.concatenate(references, axis=None).astype(np.float64)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return nothing
+    size, difference = np.abs(b), np.abs(a - b)
+    bound = tolerance.atol + tolerance.rtol * size if wanted.kind == "f" else np.zeros_like(b)
+    if most is not None:
+        bound = np.minimum(bound, np.concatenate([np.broadcast_to(most, r.shape) for r in references], axis=None))
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        relative = np.where(difference > 0, difference / np.maximum(size, tolerance.atol), 0.0)
+    sizes = [r.size for r in references]
+    starts = np.concatenate(([0], np.cumsum(sizes[:-1]))).astype(int)
+    passed = np.logical_and.reduceat(difference <= bound, starts)
+    absolute, relative = np.maximum.reduceat(difference, starts), np.maximum.reduceat(relative, starts)
+    needed = np.maximum.reduceat(difference / (1 + size), starts) * (1 + 1e-12)
+    counts = decades_by_group(difference, np.repeat(np.arange(len(sizes)), sizes), len(sizes)).tolist()
+    return [
+        Difference(
+            float(absolute[i]),
+            float(relative[i]),
+            True,
+            histogram=tuple(counts[i]),
+            smallest_tolerance=float(needed[i]) if wanted.kind == "f" else None,
+        )
+        if passed[i]
+        else None
+        for i in range(len(sizes))
+    ]
 
 
 def wrong(reason: str) -> Difference:

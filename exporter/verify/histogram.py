@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 #: Decades run from 10^FIRST to 10^LAST; the first takes what is smaller, the last what is larger.
@@ -20,9 +22,17 @@ def decades(differences: np.ndarray) -> tuple[int, ...]:
     return tuple(counts.tolist())
 
 
-def added(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    """The sum of two histograms; an empty one counts nothing."""
-    return tuple(x + y for x, y in zip(a, b, strict=True)) if a and b else a or b
+def decades_by_group(differences: np.ndarray, groups: np.ndarray, count: int) -> np.ndarray:
+    """As ``decades``, of ``count`` groups at once: [count, BINS]; ``groups`` says whose each difference is."""
+    positive = differences > 0
+    places = np.zeros(differences.shape, int)
+    places[positive] = np.clip(np.floor(np.log10(differences[positive])).astype(int), FIRST, LAST) - FIRST + 1
+    return np.bincount(groups * BINS + places, minlength=count * BINS).reshape(count, BINS)
+
+
+def added(histograms: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
+    """The sum of histograms; empty ones count nothing."""
+    return tuple(map(sum, zip(*filter(None, histograms), strict=True)))
 
 
 def to_dict(counts: tuple[int, ...]) -> dict[str, int]:

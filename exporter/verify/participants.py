@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,13 +20,17 @@ from exporter.verify.findings import Finding
 from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
+if TYPE_CHECKING:
+    from exporter.verify.reference import Reference
+
 #: The runtime that takes longest to start, by far.
 _SLOWEST = "tensorflow"
 
 Feeds = Mapping[str, np.ndarray]
 #: (format, runtime, error, the output or "*" for all): what did not run goes here.
 Failure = Callable[[str, str, RunFailedError, str], None]
-Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
+#: What is fetched for each of several inputs.
+Run = Callable[[Sequence[Feeds], Sequence[str]], list[dict[str, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ def participants_of(
     tested: PolicyUnderTest,
     runtimes: Sequence[str],
     pool: RuntimePool,
-    reference: LoadedModel,
+    reference: Reference,
     failure: Failure,
 ) -> Iterator[Participant]:
     """The numpy reference, then every format in every runtime, loaded one at a time.
@@ -95,9 +99,7 @@ def participants_of(
     What does not load goes to ``failure`` (format, runtime, error) and takes no part.
     """
     outputs = [s.name for s in tested.signature.outputs]
-    own = next((WRITTEN[k].answers for k, path in tested.artefacts.items() if path == tested.reference), None)
-    asked = outputs if own is None else own(tested.signature)
-    yield Participant("reference", "numpy", reference.run, asked, reference, path=tested.reference)
+    yield Participant("reference", "numpy", reference.run, reference.asked, reference.model, path=tested.reference)
     pairs = [(kind, runtime) for kind in tested.artefacts for runtime in WRITTEN[kind].runtimes]
     # A .bytes in numpy is the reference; what runs nowhere else does so there.
     alone = [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]
@@ -159,13 +161,13 @@ def unload(model: LoadedModel) -> None:
 def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:
     """Feed only what a signature takes."""
     if signature is None:
-        return model.run
-    inputs = frozenset(signature[0])
-    return lambda feeds, fetch: model.run({n: a for n, a in feeds.items() if n in inputs}, fetch)
+        return model.run_all
+    names = frozenset(signature[0])
+    return lambda inputs, fetch: model.run_all([{n: a for n, a in i.items() if n in names} for i in inputs], fetch)
 
 
 def _predicting(outputs: Sequence[str], model: LoadedModel) -> Run:
     """The call that people make in TensorFlow.js, ``predict``, wherever all outputs are asked for."""
-    return lambda feeds, fetch: (
-        model.predict(feeds, outputs) if list(fetch) == list(outputs) else model.run(feeds, fetch)
+    return lambda inputs, fetch: (
+        model.predict_all(inputs, outputs) if list(fetch) == list(outputs) else model.run_all(inputs, fetch)
     )

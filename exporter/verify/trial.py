@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
-from exporter.verify.difference import SHARE, Difference, compare, floored, spread, ties
+from exporter.verify.difference import SHARE, Difference, compare, compare_all, floored, spread, ties
 from exporter.verify.findings import Bisection, Finding
 from exporter.verify.golden import Golden, read_golden
 from exporter.verify.options import VerifyOptions
@@ -37,6 +37,7 @@ class Trial:
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
         self.steps = self._rollout_feeds()
+        self._scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
         self._cost = 0
         self._allowances: dict[tuple[str, str], Allowance] = {}
         #: files that were started twice, to see whether they draw alike
@@ -47,8 +48,10 @@ class Trial:
     def ask(self, reference: Reference) -> None:
         """Have every input answered by the reference. Raises RunFailedError."""
         self.reference = reference
-        self.expected = [reference.answers(case.feeds) for case in self.cases]
-        self.expected_steps = self.rolled(reference.answers)
+        inputs = [case.feeds for case in self.cases]
+        reference.remember(inputs)
+        self.expected = reference.answers(inputs)
+        self.expected_steps = self.rolled(lambda feeds: reference.answers([feeds])[0])
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
         self.rounding = Rounding(self.options.seed, numbers, self._settled)
         self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
@@ -87,10 +90,31 @@ class Trial:
             return found
         if isinstance(at, Case) and (flushed := at.flushed()) is not None:
             if at.name not in self._flushed:
-                self._flushed[at.name] = self.reference.answers(flushed)
+                (self._flushed[at.name],) = self.reference.answers([flushed])
             if (other := self._compared(name, self._flushed[at.name], got, participant)).passed:
                 return other
         return self._compared(name, expected, got, participant, self._explained(at, participant))
+
+    def differences(
+        self,
+        name: str,
+        expected: Sequence[Feeds],
+        got: Sequence[np.ndarray],
+        participant: Participant,
+        at: Sequence[Case] | Sequence[int],
+    ) -> list[Difference]:
+        """``difference`` of several inputs or steps. What passes as it is, nearly all, is compared at once."""
+        found = compare_all(
+            [self._settled({name: e[name]})[name] for e in expected],
+            [self._settled({name: g})[name] for g in got],
+            self.tolerance(name, participant),
+            narrowed=narrows(participant.format),
+            most=self._most(name, participant),
+        )
+        return [
+            self.difference(name, expected[i], got[i], participant, at[i]) if known is None else known
+            for i, known in enumerate(found)
+        ]
 
     def _explained(self, at: Case | int, participant: Participant) -> Feeds:
         """Per output, what rounding explains of it."""
@@ -188,7 +212,7 @@ class Trial:
 
     def _is_right(self, graph: Graph) -> bool:
         """Whether ``graph``, run by the numpy kernels, gives what the reference does."""
-        numpy = Participant("reference", "numpy", self.reference.model.run, [], self.reference.model)
+        numpy = Participant("reference", "numpy", self.reference.run, [], self.reference.model)
         for case, expected in zip(self.cases, self.expected, strict=True):
             got = run_graph(graph, case.feeds, list(expected))
             if not all(self.difference(name, expected, got[name], numpy, case).passed for name in expected):
@@ -197,9 +221,8 @@ class Trial:
 
     def _settled(self, values: Feeds) -> Arrays:
         """Values as they are compared: log-probabilities that say "never" are all the same."""
-        scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
         return {
-            n: floored(a, self.signature.branches) if n in scores and a.dtype.kind == "f" and a.ndim else a
+            n: floored(a, self.signature.branches) if n in self._scores and a.dtype.kind == "f" and a.ndim else a
             for n, a in values.items()
         }
 

@@ -83,7 +83,7 @@ def _findings(
 
     taking_part: Iterable[Participant]
     if participants is None:
-        taking_part = participants_of(trial.tested, runtimes, trial.pool, reference.model, failed)
+        taking_part = participants_of(trial.tested, runtimes, trial.pool, reference, failed)
     else:
         taking_part = participants(reference.model, failed)
     for participant in taking_part:

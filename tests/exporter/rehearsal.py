@@ -64,8 +64,14 @@ class Actor:
             raise RunFailedError(f"{self.process.name} gave no output {missing[0]!r}")
         return answer
 
-    def predict(self, feeds: Mapping[str, Array], outputs: Sequence[str]) -> Tensors:
-        return self.run(feeds, outputs)
+    def run_all(
+        self, inputs: Sequence[Mapping[str, Array]], fetch: Sequence[str], requests: Sequence[Mapping[str, Any]] = ()
+    ) -> list[Tensors]:
+        more = requests or [{}] * len(inputs)
+        return [self.run(feeds, fetch, **request) for feeds, request in zip(inputs, more, strict=True)]
+
+    def predict_all(self, inputs: Sequence[Mapping[str, Array]], outputs: Sequence[str]) -> list[Tensors]:
+        return self.run_all(inputs, outputs)
 
     def unload(self) -> None:
         self.process.must_live()

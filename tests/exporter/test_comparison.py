@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.verify.difference import compare, floored, ties
+from exporter.verify.difference import compare, compare_all, floored, ties
 from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from signatures.roles import Role
@@ -50,6 +51,30 @@ def test_the_relative_part_is_of_the_reference() -> None:
 def test_the_worst_element_counts() -> None:
     difference = compare(floats(1, 2, 3), floats(1, 2.5, 3), PLAIN)
     assert (difference.max_abs, difference.max_rel, difference.passed) == (0.5, 0.25, False)
+
+
+@given(
+    st.lists(st.integers(0, 3), min_size=1, max_size=4),
+    st.sampled_from([("float32", "float32"), ("int64", "int32"), ("float32", "float64")]),
+    st.sampled_from([0.0, 1e-6, 1e-3]),
+    st.booleans(),
+    st.integers(0, 99),
+)
+@settings(max_examples=150, deadline=None)
+def test_what_is_compared_at_once_is_what_each_comparison_says(
+    rows: list[int], dtypes: tuple[str, str], off: float, odd: bool, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    wanted = [(3 * random.standard_normal((n, 2))).astype(dtypes[0]) for n in rows]
+    got = [(w + off * random.standard_normal(w.shape) * random.integers(0, 2)).astype(dtypes[1]) for w in wanted]
+    if odd and dtypes[0] == "float32" and wanted[0].size:
+        wanted[0][0, 0] = np.nan
+    most = np.array([[np.inf, 1e-4]])
+    together = compare_all(wanted, got, PLAIN, narrowed=True, most=most)
+    each = [compare(w, g, PLAIN, narrowed=True, most=most) for w, g in zip(wanted, got, strict=True)]
+    assert all(t == (replace(e, worst=None) if e.passed else None) for t, e in zip(together, each, strict=True) if t)
+    plain = dtypes[1] != "float64" and all(rows) and not np.isnan(wanted[0]).any()
+    assert [t is not None for t in together] == [plain and e.passed for e in each]
 
 
 def test_nothing_is_equal_to_nothing() -> None:

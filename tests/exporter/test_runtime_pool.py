@@ -5,15 +5,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from converters.formats import DEFAULTS, WRITTEN
 from converters.runtimes import pool as pools
+from converters.runtimes import process as processes
 from converters.runtimes.javascript import node as javascript
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.runtimes.process import RunFailedError
+from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
@@ -104,6 +106,34 @@ def test_a_process_is_started_on_first_use_and_shared() -> None:
         assert model.run(feeds, ["action:0"])["action:0"].shape == (3, 2)
         model.unload()
     assert pool.versions() == {}
+
+
+def test_many_runs_are_few_requests_and_what_they_share_is_sent_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, np.ndarray]] = []
+    ask = RuntimeProcess.request
+
+    def request(self: RuntimeProcess, header: Any, tensors: Any = None) -> Any:
+        asked.append(tensors)
+        return ask(self, header, tensors)
+
+    inputs = [{"state:0": np.full((n, 8), n, np.float32), "epsilon:0": np.zeros((n, 2), np.float32)} for n in (1, 2, 5)]
+    with RuntimePool() as pool:
+        model = pool.process("numpy").load(str(fixture("continuous")))
+        alone = [model.run(feeds, ["action:0"])["action:0"] for feeds in inputs]
+        monkeypatch.setattr(RuntimeProcess, "request", request)
+        together = model.run_all([*inputs, inputs[0]], ["action:0"])
+        moved = model.run_all([inputs[0]] * 2, ["action:0"], [{}, {"jitter": [0, 1]}])
+        monkeypatch.setattr(processes, "_REQUEST", 1)
+        split = model.run_all(inputs, ["action:0"])
+        with pytest.raises(RunFailedError, match="'state' is not fed"):
+            model.run_all([inputs[0], {}], ["action:0"])
+        assert model.run_all([], ["action:0"]) == []
+    assert [len(tensors) for tensors in asked] == [6, 2, 2, 2, 2, 2, 0]
+    for answers in (together, split):
+        for expected, answer in zip(alone, answers, strict=False):
+            np.testing.assert_array_equal(answer["action:0"], expected)
+    assert (moved[0]["action:0"] == alone[0]).all()
+    assert (moved[1]["action:0"] != alone[0]).any()
 
 
 def test_a_process_that_died_is_started_again() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,8 @@ def verified(
     tested = PolicyUnderTest(policy.name, policy.signature, policy.graph, {}, {}, file)
 
     def participants(numpy: LoadedModel, failed: object) -> Iterator[Participant]:
-        def run(feeds: Feeds, fetch: Any) -> Arrays:
-            return spoil(feeds, dict(running(numpy, feeding(feeds), fetch)))
+        def run(inputs: Sequence[Feeds], fetch: Any) -> list[Arrays]:
+            return [spoil(feeds, dict(running(numpy, feeding(feeds), fetch))) for feeds in inputs]
 
         outputs = [s.name for s in policy.signature.outputs]
         yield Participant("onnx", "onnxruntime", run, outputs, numpy)

@@ -15,6 +15,7 @@ from exporter.export.again import verify_folder
 from exporter.verify.difference import compare
 from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
 from exporter.verify.participants import PolicyUnderTest, participants_of
+from exporter.verify.reference import Reference
 from exporter.verify.tolerances import Tolerance
 from signatures.sampling import draw_cases
 from tests.faults.conftest import Bundle
@@ -56,7 +57,7 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
     installed = [
         r.name for r in available_runtimes() if r.installed and "chromium" not in r.name and "webgl" not in r.name
     ]
-    reference = pool.process("numpy").load(str(tested.reference))
+    reference = Reference(tested, ["numpy"], pool, 0)
     tried = set()
     for participant in participants_of(tested, installed, pool, reference, lambda *failure: pytest.fail(str(failure))):
         assert participant.path is not None

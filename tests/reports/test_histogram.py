@@ -33,8 +33,9 @@ def test_every_element_is_counted_once_where_it_belongs(values: np.ndarray) -> N
 
 def test_sums() -> None:
     one = decades(np.array([1.0]))
-    assert added(one, ()) == added((), one) == one
-    assert to_dict(added(one, one)) == {"1e0": 2}
+    assert added([one, ()]) == added([(), one]) == one
+    assert to_dict(added([one, one])) == {"1e0": 2}
+    assert added([()]) == ()
 
 
 def test_a_comparison_counts_its_elements_and_none_where_there_are_no_numbers() -> None:

@@ -50,6 +50,20 @@ def test_requests_may_be_sent_ahead_and_in_pieces(own: Runner, tmp_path: Path) -
     assert own.end()[:2] == (0, b"")
 
 
+def test_several_runs_are_one_request(own: Runner, tmp_path: Path) -> None:
+    own.load(twins(tmp_path))
+    feeds = [batch(3, seed) for seed in range(3)]
+    sent = {f"{i}.{name}": array for i, each in enumerate(feeds) for name, array in each.items()}
+    runs = [{"feeds": {name: f"{i}.{name}" for name in each}} for i, each in enumerate(feeds)]
+    header, got = own.ask("runs", sent, id="m", runs=[*runs, {**runs[0], "fetch": ["value"]}])
+    assert header["ok"], header
+    for i, each in enumerate(feeds):
+        np.testing.assert_allclose(got[f"{i}/action"], twins_by_numpy(**each)["action"], rtol=1e-5, atol=1e-5)
+    assert [name for name in got if name.startswith("3/")] == ["3/value"]
+    np.testing.assert_array_equal(got["3/value"], got["0/value"])
+    assert "nothing" in own.error("runs", sent, id="m", runs=[runs[0], {**runs[1], "fetch": ["nothing"]}])
+
+
 def test_a_large_tensor_goes_there_and_back(own: Runner, tmp_path: Path) -> None:
     nodes = [placeholder("x", "float32", [None]), node("y", "Identity", "x", T={"type": "DT_FLOAT"})]
     signature = ({"x": info("x:0", "float32", [None])}, {"y": info("y:0", "float32", [None])})

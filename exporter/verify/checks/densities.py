@@ -30,21 +30,21 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     if not names:
         return
     case = trial.cases[0]
-    runs = (trial.reference.model.run, participant.run)
+    runs = (trial.reference.run, participant.run)
     cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
     count = DRAWS if cameras else DENSITY_DRAWS
     if not trial.allowance(participant, "draws").takes(count, f"{count} draws of numbers"):
         return
     feeds = _rows(trial, case, count)
-    samples = [run(feeds, names) for run in runs]
+    samples = [run([feeds], names)[0] for run in runs]
     if any((s[n] == s[n][:1]).all() for s in samples for n in names):
         # One draw for the whole batch, or none: as many runs as draws.
-        each = [[run(_rows(trial, case, 1, i), names) for i in range(DRAWS)] for run in runs]
+        each = [run([_rows(trial, case, 1, i) for i in range(DRAWS)], names) for run in runs]
         samples = [{n: np.concatenate([one[n] for one in every]) for n in names} for every in each]
     # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
     alike = {
         n
-        for n in repeated(trial, participant, lambda run: run(feeds, names))
+        for n in repeated(trial, participant, lambda run: run([feeds], names)[0])
         if (samples[1][n] != samples[1][n][:1]).any()
     }
     for name in names:

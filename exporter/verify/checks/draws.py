@@ -73,18 +73,22 @@ def _started_alike(
         return {}
 
     def ask(run: Run) -> dict[str, np.ndarray]:
-        drawn = {row: _of_one_row(run, action, rows[row], count, single=single) for row in {*shown.values()}}
+        told = sorted({*shown.values()})
+        drawn = dict(zip(told, _of_rows(run, action, [rows[row] for row in told], count, single=single), strict=True))
         return {str(branch): drawn[row][:, branch] for branch, row in shown.items()}
 
     alike = repeated(trial, participant, ask)
     return {branch: row for branch, row in shown.items() if str(branch) in alike}
 
 
-def _of_one_row(run: Run, action: str, row: Feeds, count: int, *, single: bool) -> np.ndarray:
-    """[draws, branches]: classes drawn for one row."""
-    feeds = row if single else {n: np.repeat(a, count, axis=0) for n, a in row.items()}
-    runs = [run(feeds, [action])[action] for _ in range(count if single else 1)]
-    return np.concatenate(runs).reshape(count, -1)
+def _of_rows(run: Run, action: str, rows: Sequence[Feeds], count: int, *, single: bool) -> np.ndarray:
+    """[inputs, draws, branches]: classes drawn for each of ``rows``."""
+    if single:
+        inputs = [row for row in rows for _ in range(count)]
+    else:
+        inputs = [{n: np.repeat(a, count, axis=0) for n, a in row.items()} for row in rows]
+    drawn = [answer[action] for answer in run(inputs, [action])]
+    return np.concatenate(drawn).reshape(len(rows), count, -1)
 
 
 def _edges(trial: Trial) -> np.ndarray:
@@ -106,7 +110,7 @@ def _drawn(trial: Trial, participant: Participant, action: str, rows: Sequence[F
         few = max(1, allowance.left // len(rows))
         allowance.left_out[-1] += f" but for {few * len(rows)}"
         count, allowance.left = few, 0
-    return np.stack([_of_one_row(participant.run, action, row, count, single=single) for row in rows])
+    return _of_rows(participant.run, action, rows, count, single=single)
 
 
 def with_zeros(log_probs: np.ndarray, branches: Sequence[int], rate: float) -> np.ndarray:

@@ -17,7 +17,7 @@ def recorded(trial: Trial) -> Iterator[Finding]:
     names = [s.name for s in trial.signature.outputs if s.name not in reference.drawn]
     noisy = trial.tested.graph.descendants(golden.noiseless)
     names = [n for n in names if n not in noisy]
-    participant = Participant("golden", reference.runtime, reference.model.run, names, reference.model)
+    participant = Participant("golden", reference.runtime, reference.run, names, reference.model)
     worst: dict[str, tuple[Difference, str]] = {}
     answers = trial.expected[len(trial.cases) - len(golden.cases) :]
     for case, expected, arrays in zip(golden.cases, answers, golden.answers, strict=True):

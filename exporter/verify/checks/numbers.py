@@ -11,7 +11,7 @@ from converters.formats import narrows
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Bisection, Finding, Numbers, Shape
 from exporter.verify.histogram import added
-from exporter.verify.participants import Participant
+from exporter.verify.participants import Feeds, Participant
 from exporter.verify.trial import Trial
 from signatures.roles import Role
 from signatures.sampling import Case
@@ -24,29 +24,32 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
     Every runtime is given the first input and what was recorded; a slow one of the others as many as it has time for.
     """
     worst: dict[str, tuple[Difference, Case]] = {}
-    needed: dict[str, list[float | None]] = {}
-    spread: dict[str, tuple[int, ...]] = {}
+    every: dict[str, list[Difference]] = {}
     allowance, recorded = trial.allowance(participant), len(trial.golden.cases)
+    tried: list[tuple[Case, Feeds]] = []
     for number, (case, expected) in enumerate(zip(trial.cases, trial.expected, strict=True)):
         optional = 0 < number < len(trial.cases) - recorded
-        if optional and not allowance.takes(case.batch, case.name):
+        if not optional or allowance.takes(case.batch, case.name):
+            tried.append((case, expected))
+    cases, expectations = [case for case, _ in tried], [expected for _, expected in tried]
+    answers = participant.run([case.feeds for case in cases], list(participant.outputs))
+    for name in participant.outputs:
+        got = [answer[name] for answer in answers]
+        if trial.drawn(name, participant):
+            narrowed = narrows(participant.format)
+            pairs = zip(cases, got, strict=True)
+            found = [plausible(trial.signature, name, array, case, narrowed=narrowed) for case, array in pairs]
+        elif name in expectations[0]:
+            found = trial.differences(name, expectations, got, participant, cases)
+        else:
             continue
-        got = participant.run(case.feeds, list(participant.outputs))
-        for name in participant.outputs:
-            if trial.drawn(name, participant):
-                difference = plausible(trial.signature, name, got[name], case, narrowed=narrows(participant.format))
-            elif name in expected:
-                difference = trial.difference(name, expected, got[name], participant, case)
-            else:
-                continue
-            spread[name] = added(spread.get(name, ()), difference.histogram)
-            needed.setdefault(name, []).append(difference.smallest_tolerance)
-            if name not in worst or rank(difference) > rank(worst[name][0]):
-                worst[name] = (difference, case)
+        every[name] = found
+        worst[name] = max(zip(found, cases, strict=True), key=lambda pair: rank(pair[0]))
     rounded = trial.bisector.constants(participant, trial.cases[0].feeds)
     for name, (difference, case) in worst.items():
         kind = Shape if trial.drawn(name, participant) else Numbers
-        difference = replace(difference, smallest_tolerance=largest(needed[name]), histogram=spread[name])
+        needed = largest([d.smallest_tolerance for d in every[name]])
+        difference = replace(difference, smallest_tolerance=needed, histogram=added(d.histogram for d in every[name]))
         begins = trial.bisected(participant, name, difference, case.feeds)
         if difference.passed and (other := _upstream(trial, name, rounded)) is not None:
             difference = replace(difference, passed=False, reason=f"the constant {other.tensor} has another value")

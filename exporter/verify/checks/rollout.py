@@ -25,17 +25,12 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
 
     def step(feeds: Feeds) -> dict[str, np.ndarray]:
         fed.append(feeds)
-        return participant.run(feeds, list(participant.outputs))
+        return participant.run([feeds], list(participant.outputs))[0]
 
     got = trial.rolled(step)
     names = [n for n in participant.outputs if n in trial.expected_steps[0] and not trial.drawn(n, participant)]
-    steps = {
-        n: [
-            trial.difference(n, e, g[n], participant, i)
-            for i, (e, g) in enumerate(zip(trial.expected_steps, got, strict=True))
-        ]
-        for n in names
-    }
+    numbers = range(len(fed))
+    steps = {n: trial.differences(n, trial.expected_steps, [g[n] for g in got], participant, numbers) for n in names}
     where = [f"step {i + 1} of {len(fed)}" for i in range(len(fed))]
     for name, differences in steps.items():
         worst = max(range(len(fed)), key=lambda i: rank(differences[i]))

@@ -5,6 +5,8 @@
  *     {"cmd": "load", "id": "m1", "path": PATH}    {"ok": true, "inputs": [{"name", "dtype", "shape"}], "outputs": []}
  *     {"cmd": "run", "id": "m1", "tensors": [...]} {"ok": true, "tensors": [...]}, all outputs
  *        with "fetch": [names]                     only these
+ *     {"cmd": "runs", "id": "m1", "runs": [{"feeds": {input: tensor}, "fetch"}], "tensors": [...]}
+ *                                                  {"ok": true, "tensors": [...]}, called "0/output", "1/output" …
  *     {"cmd": "memory"}                            {"ok": true, ...}, what the runtime counts
  *     {"cmd": "unload", "id": "m1"}                {"ok": true}
  *
@@ -48,6 +50,20 @@ function commandsOn(models) {
     async run(runtime, header, bodies) {
       const [tensors, bytes] = await runtime.run(loaded(header.id), header, bodies);
       return [{ tensors }, bytes];
+    },
+    async runs(runtime, header, bodies) {
+      const model = loaded(header.id);
+      const places = new Map(header.tensors.map(({ name }, i) => [name, i]));
+      const list = [];
+      const answers = [];
+      for (const [number, { feeds, ...rest }] of header.runs.entries()) {
+        const fed = Object.entries(feeds).map(([name, key]) => [name, places.get(key)]);
+        const specs = fed.map(([name, i]) => ({ ...header.tensors[i], name }));
+        const [tensors, bytes] = await runtime.run(model, { ...rest, tensors: specs }, fed.map(([, i]) => bodies[i]));
+        list.push(...tensors.map((spec) => ({ ...spec, name: `${number}/${spec.name}` })));
+        answers.push(...bytes);
+      }
+      return [{ tensors: list }, answers];
     },
     memory: async (runtime) => [await runtime.memory()],
     async unload(runtime, { id }) {
