@@ -28,7 +28,7 @@ os.environ.pop("COLUMNS", None)
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
 #: Those of them that cost little: half of a verification's time is Node's.
 QUICK = ("tensorflow", "onnxruntime")
-#: Set, every policy of a sweep is run in all of NEEDED, as one with ops of its own always is.
+#: Set, every policy of a sweep is run in all of NEEDED, as one that has something new always is.
 FULL = "EXPORT_MODEL_TEST_FULL"
 
 #: No time limit per example: on a busy machine it says nothing of the code. Each test has pytest's own.
@@ -44,10 +44,9 @@ _ROOMS = frozenset(
 )
 _FIXTURE = "processes"
 
-#: Where one file after the other runs the same lines, coverage traces one in so many: Python is two to three times as
-#: slow under it (3.11 has no other way), and the lines are the same.
-_TRACED = 8
-_SWEEPS = ("corpus", "legacy")
+#: Where one file after the other runs the same lines, coverage traces one in so many: Python takes nearly twice as long
+#: under it (3.11 has no other way), and the lines are the same.
+_TRACED = {"corpus": 8, "legacy": 8, "slow": 4}
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -57,9 +56,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         rooms = set(item.path.relative_to(Path(__file__).parent).parts)
         if rooms & _ROOMS or _FIXTURE in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.runtimes)
-        if config.pluginmanager.hasplugin("_cov") and any(item.get_closest_marker(name) for name in _SWEEPS):
+        of = max((count for name, count in _TRACED.items() if item.get_closest_marker(name)), default=1)
+        if config.pluginmanager.hasplugin("_cov"):
             family = item.nodeid.partition("[")[0]
-            if swept[family] % _TRACED:
+            if swept[family] % of:
                 item.add_marker(pytest.mark.no_cover)
             swept[family] += 1
 
@@ -84,45 +84,50 @@ Chosen = Callable[[Sequence[Policy]], tuple[str, ...]]
 
 
 @pytest.fixture(scope="session")
-def runtimes_for(tmp_path_factory: pytest.TempPathFactory) -> Chosen:
-    """What to run policies in: NEEDED where their ops and contract are met for the first time, else QUICK.
+def is_new(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Sequence[Policy]], bool]:
+    """(sweep, policies) → whether they have a feature that none before them in this session's sweep had.
 
     Hundreds of public and genuine files are some dozen networks with other weights, and other weights reach no other
     line of a writer or a runtime's kernel. Of all workers one is the first: it makes the file of that name.
     """
     folder = tmp_path_factory.getbasetemp()
-    met = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "structures"
+    met = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "features"
     met.mkdir(exist_ok=True)
 
-    def chosen(policies: Sequence[Policy]) -> tuple[str, ...]:
-        if os.environ.get(FULL):
-            return NEEDED
-        name = hashlib.sha256(repr([structure(p) for p in policies]).encode()).hexdigest()
-        try:
-            (met / name).touch(exist_ok=False)
-        except FileExistsError:
-            return QUICK
-        return NEEDED
+    def new(sweep: str, policies: Sequence[Policy]) -> bool:
+        found = bool(os.environ.get(FULL))
+        for feature in {f for policy in policies for f in features(policy)}:
+            with contextlib.suppress(FileExistsError):
+                (met / hashlib.sha256(f"{sweep} {feature}".encode()).hexdigest()).touch(exist_ok=False)
+                found = True
+        return found
 
-    return chosen
+    return new
+
+
+@pytest.fixture(scope="session")
+def runtimes_for(is_new: Callable[[str, Sequence[Policy]], bool]) -> Chosen:
+    """What to run policies in: NEEDED where they have something new, else QUICK."""
+    return lambda policies: NEEDED if is_new("runtimes", policies) else QUICK
+
+
+def features(policy: Policy) -> Iterator[str]:
+    """Each op with its attributes, each pair of ops one of which reads the other, each role with its dtype and rank."""
+    ops = {n.name: n.op for n in policy.graph.nodes}
+    for node in policy.graph.nodes:
+        if node.op != "Const":
+            attributes = {k: str(v) for k, v in node.attrs.items() if k not in ("shape", "seed", "seed2")}
+            yield f"{node.op} {sorted(attributes.items())}"
+            yield from (f"{ops.get(name.partition(':')[0])} → {i} of {node.op}" for i, name in enumerate(node.inputs))
+    signature = policy.signature
+    for spec in (*signature.inputs, *signature.outputs):
+        yield f"{spec.role} {spec.dtype} of rank {len(spec.shape)}"
+    yield f"{min(len(signature.branches), 2)} branches"
 
 
 def formats_in(runtimes: Sequence[str]) -> set[str]:
     """The default formats that are run in one of these."""
     return {f for f in DEFAULTS if set(WRITTEN[f].runtimes) & set(runtimes)}
-
-
-def structure(policy: Policy) -> tuple[object, ...]:
-    """The ops of a policy with their attributes, and its contract's roles, dtypes and ranks; no size and no weight."""
-    left_out = ("shape", "seed", "seed2")
-    ops = {
-        (n.op, *sorted((key, str(value)) for key, value in n.attrs.items() if key not in left_out))
-        for n in policy.graph.nodes
-        if n.op != "Const"
-    }
-    signature = policy.signature
-    specs = sorted((str(s.role), str(s.dtype), len(s.shape)) for s in (*signature.inputs, *signature.outputs))
-    return sorted(map(repr, ops)), specs, len(signature.branches)
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from tests.browser.conftest import BROWSERS, ONNX, TFJS
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
 PAIRS = {*(("tfjs", r) for r in TFJS), *(("onnx", r) for r in ONNX)}
-#: The kernels of two are those of Node: they run an image and a draw here, WebGL and ONNX Runtime all of it.
-IN_NODE_TOO, THEIRS = ("tfjs-cpu@chromium", "tfjs-wasm@chromium"), ("sampled", "visual")
+#: The kernels of two are those of Node: they run an image here, WebGL and ONNX Runtime all of it.
+IN_NODE_TOO, THEIRS = ("tfjs-cpu@chromium", "tfjs-wasm@chromium"), ("visual",)
 #: One number of samples: new shapes cost, new numbers do not.
 PARITY = VerifyOptions(samples=1)
 

@@ -1,6 +1,7 @@
 """Every public and genuine frozen graph: four formats, and all agree, in TensorFlow, numpy and onnxruntime.
 
-Each structure of a graph is run in Node too (``runtimes_for``); with EXPORT_MODEL_TEST_FULL=1 each file is.
+What has an op, a pair of ops or a role that none before had runs in Node too (``runtimes_for``); with
+EXPORT_MODEL_TEST_FULL=1 each file does.
 """
 
 from __future__ import annotations
