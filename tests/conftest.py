@@ -26,7 +26,7 @@ os.environ.pop("COLUMNS", None)
 
 #: What the tests that compare all formats run them in.
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
-#: Those of them that cost little: half of a verification's time is Node's.
+#: Those of them that cost little: three fifths of a verification's time are Node's.
 QUICK = ("tensorflow", "onnxruntime")
 #: Set, every policy of a sweep is run in all of NEEDED, as one that has something new always is.
 FULL = "EXPORT_MODEL_TEST_FULL"
@@ -38,8 +38,8 @@ settings.load_profile("busy")
 #: Rooms whose tests start runtimes, browsers, servers or the program; and what tests of other rooms then ask for.
 _ROOMS = frozenset(
     (
-        *("acting", "bench", "browser", "chains", "corpus", "docs", "faults", "install", "legacy", "live", "peers"),
-        *("runner", "serve", "trained"),
+        *("acting", "bench", "browser", "chains", "corpus", "docs", "faults", "fleet", "fuzz", "install", "legacy"),
+        *("live", "peers", "runtimes", "serve", "trained"),
     )
 )
 _FIXTURE = "processes"
