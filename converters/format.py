@@ -18,6 +18,7 @@ from signatures.records import dataclass
 if TYPE_CHECKING:
     from converters.content import Content
     from converters.fetch import Fetched
+    from converters.graph.passes.weights import Storage
     from converters.inner import InnerTensors, Loaded
     from converters.pieces import Pieces
     from converters.policy import Policy
@@ -31,13 +32,15 @@ Dims = tuple[int | None, ...]
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
     """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
-    file is made for one consumer (``--for``), and whether the result is to be proved valid (ONNX: by its checker).
+    file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), and how
+    weights that were rounded are kept.
     """
 
     contract: str
     opset: int = 15
     profile: str | None = None
     checked: bool = True
+    weights: Storage = "float32"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +142,8 @@ class Format:
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
       once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
       source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
-      ``answers`` are the outputs of a policy that an artefact answers (None: all).
+      ``answers`` are the outputs of a policy that an artefact answers (None: all). ``narrow``: it can hold weights in
+      float16 or int8.
     """
 
     key: str
@@ -165,6 +169,7 @@ class Format:
     snippets: tuple[Code, ...] = ()
     dtypes: frozenset[str] = frozenset()
     answers: Callable[[PolicySignature], list[str]] | None = None
+    narrow: bool = False
 
     @property
     def readable(self) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 from converters.source import ReadOptions
 from exporter.export.again import verify_folder
 from exporter.export.labels import Labels
-from exporter.export.options import compile_options
+from exporter.export.options import compile_options, storage
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
@@ -50,6 +50,8 @@ def export_model(
     labels: Labels | None = None,
     strict: bool = True,
     for_: str | None = None,
+    dtype: str = "float32",
+    quantize: str | None = None,
 ) -> list[ExportResult]:
     """Export every policy of a source to ``out/<policy>/``, and compare what was written in the runtimes that are here.
 
@@ -70,6 +72,8 @@ def export_model(
       ``deterministic``: ``action`` is the deterministic one.
     - ``opset``: of ONNX (default: 15, or what ``for_`` loads); ``labels``: names of observations and actions, a file or
       a mapping.
+    - ``dtype``: ``"float16"`` keeps weights in half the bytes, ``quantize``: ``"int8"`` in a quarter; computed is in
+      float32, and verification says how many decisions become other ones.
 
     How to read it:
 
@@ -100,6 +104,7 @@ def export_model(
         parity or VerifyOptions(),
         labels,
         for_,
+        storage(dtype, quantize),
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, step) as sources:

@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 
 from signatures.fields import printable
@@ -86,3 +86,9 @@ def hint(command: str, why: str) -> str:
 def size_text(count: int) -> str:
     """Bytes for people."""
     return f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1_000_000 else f"{count / 1e6:.1f} MB"
+
+
+def sized(kind: str, sizes: Mapping[str, int], whole: Mapping[str, int]) -> str:
+    """The size of a format, and what it would be with weights in float32 where these are kept in less."""
+    text = size_text(sizes[kind]) if kind in sizes else ""
+    return f"{text} of {size_text(whole[kind])}" if kind in whole else text

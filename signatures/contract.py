@@ -166,6 +166,8 @@ def parse(content: Any) -> Contract:
     made = {key: tool[key].text() for key in ("name", "version")}
     if not tool["profile"].missing:  # the consumer that it was made for
         made["profile"] = tool["profile"].text()
+    if not tool["weights"].missing:  # what they were rounded to
+        made["weights"] = tool["weights"].one_of(("float16", "int8"))
     return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
 
 

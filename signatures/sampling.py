@@ -83,6 +83,13 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     return cases
 
 
+def draw_typical(signature: PolicySignature, *, seed: int, count: int) -> list[Case]:
+    """``count`` large batches of what is typical: rows enough for shares and spreads."""
+    rng = np.random.default_rng((seed, 2))
+    batch = _large_batch(signature)
+    return [_case(signature, rng, f"typical, batch {batch}, #{i}", batch, _typical) for i in range(count)]
+
+
 def draw_rollout(signature: PolicySignature, *, seed: int, steps: int, batch: int = 2) -> list[dict[str, np.ndarray]]:
     """Feeds for ``steps`` steps in a row; the memory in the first is zero, as at the start of an episode."""
     rng = np.random.default_rng((seed, 1))

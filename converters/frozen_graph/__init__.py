@@ -56,6 +56,7 @@ FORMATS = (
         write=_write,
         main="{name}.bytes",
         default=True,
+        narrow=True,
         ports=_ports,
         vetted=_vetted,
         inner=_inner,

@@ -7,6 +7,7 @@ from converters.bundle.embed import with_contract
 from converters.detached import Detached, is_readable
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
+from converters.graph.passes.weights import Storage, stored
 from converters.pieces import Pieces
 from converters.policy import Policy
 from signatures.errors import TooLargeError
@@ -14,7 +15,7 @@ from signatures.errors import TooLargeError
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The ``.bytes`` artefact. Raises TooLargeError where no TensorFlow could read it."""
-    made = frozen(policy, options.contract)
+    made = frozen(policy, options.contract, options.weights)
     if not is_readable(made):
         raise TooLargeError(
             f"a .bytes of {made.size} bytes cannot be read",
@@ -25,7 +26,8 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     return {f"{policy.name}.bytes": made}
 
 
-def frozen(policy: Policy, contract: str = "{}") -> Pieces:
+def frozen(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
     """The policy's GraphDef with its contract; without one, as the numpy reference needs it."""
     detached = Detached()
-    return schema.pieces(encode(with_contract(policy.graph, contract), detached=detached), detached)
+    graph = with_contract(stored(policy.graph, weights), contract)
+    return schema.pieces(encode(graph, detached=detached), detached)

@@ -69,6 +69,7 @@ FORMATS = (
         main="{name}.onnx",
         beside="{name}.onnx.data",
         default=True,
+        narrow=True,
         ports=_ports,
         vetted=_vetted,
         inner=_inner,

@@ -19,8 +19,9 @@ from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.table import op_of, unsupported
 from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
+from converters.graph.passes.weights import Storage, compact
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import TensorType
+from converters.graph.types import FLOAT32, TensorType
 from converters.inner import View
 from converters.onnx import messages
 from converters.onnx.files import files_of
@@ -165,6 +166,26 @@ class _Builder:
         ranks = {self._values.get(r, r): len(t.shape) for r, t in self.types.items() if t.shape is not None}
         self.nodes = shortened(self.nodes, constants, ranks, wanted)
 
+    def store(self, storage: Storage) -> None:
+        """Keep initializers in fewer bytes where each of their numbers comes back as it was."""
+        arrays = {name: array for alike in self._constants.values() for array, name in alike}
+        initializers, widened = [], []
+        for initializer in self.initializers:
+            name = initializer.name
+            found = compact(arrays[name], storage)
+            if found is None:
+                initializers.append(initializer)
+                continue
+            narrow, step = found
+            small, wide = self.fresh(f"{name}/{storage}"), name if step is None else self.fresh(f"{name}/steps")
+            initializers.append(self._tensor(narrow, small))
+            widened.append(messages.node("Cast", [small], [wide], wide, to=FLOAT32))
+            if step is not None:
+                scale = self.fresh(f"{name}/step")
+                initializers.append(self._tensor(step, scale))
+                widened.append(messages.node("Mul", [wide, scale], [name], name))
+        self.initializers, self.nodes = initializers, [*widened, *self.nodes]
+
     def lower(self, node: Node) -> None:
         """Append what a node of the graph becomes, its result under the node's own name."""
         self.begin(node.name)
@@ -270,6 +291,9 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     builder.prune(wanted)
     if options.profile is None:
         builder.shorten(wanted)
+    if options.weights != "float32":
+        builder.store(options.weights)
+        builder.prune(wanted)
     used = {name for node in builder.nodes for name in node.input}
     present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
     tensors = builder.tensors(policy.graph, present).dumps()

@@ -65,6 +65,7 @@ FORMATS = (
         write=_write,
         main="saved_model",
         default=True,
+        narrow=True,
         ports=_ports,
         vetted=_vetted,
         inner=_inner,

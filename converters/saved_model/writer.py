@@ -18,6 +18,7 @@ from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
 from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
+from converters.graph.passes.weights import stored
 from converters.pieces import Pieces
 from converters.policy import Policy
 from converters.saved_model.variables import files_of
@@ -63,7 +64,8 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     message = schema.SavedModel(saved_model_schema_version=1)
     meta = message.meta_graphs.add()
     meta.meta_info_def.tags.append("serve")
-    meta.graph_def.CopyFrom(encode(with_contract(policy.graph, options.contract), detached=detached))
+    graph = with_contract(stored(policy.graph, options.weights), options.contract)
+    meta.graph_def.CopyFrom(encode(graph, detached=detached))
     for key, (inputs, outputs) in signatures_of(policy).items():
         definition = meta.signature_def[key]
         definition.method_name = METHOD

@@ -64,6 +64,7 @@ FORMATS = (
         write=_write,
         main="tfjs",
         default=True,
+        narrow=True,
         ports=_ports,
         vetted=_vetted,
         inner=_inner,

@@ -3,7 +3,8 @@
 - Weights are taken from the ``Const`` nodes by name; their bytes lie in shards of 4 MiB, as the official converter
   cuts them (so that browsers cache them).
 - TensorFlow.js has float32, int32 and bool only: int64 is narrowed here (never out of range: checked), float64 and
-  float16 become float32, and every dtype attribute says so.
+  float16 become float32, and every dtype attribute says so. A shard may hold weights in fewer bytes (``quantization``),
+  which are float32 once they are loaded.
 - An output is a node of its own (the naming pass sees to it): tfjs-converter silently mixes up two outputs of one node
   and two names of one tensor.
 - The signature has the canonical names for inputs *and* outputs (the official converter loses them where two tensors
@@ -29,6 +30,7 @@ from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import op_of
 from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
+from converters.graph.passes.weights import Storage, are_steps, compact, stored
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
 from converters.pieces import Pieces
@@ -49,6 +51,8 @@ _NARROW = {
     np.dtype(np.int16): INT32,
     np.dtype(np.uint16): INT32,
 }
+#: What a byte of 0 stands for where weights are int8.
+_LOWEST = -128
 
 
 def _narrowed(node: Node) -> np.ndarray:
@@ -143,13 +147,19 @@ def _tensor_info(spec: TensorSpec) -> dict[str, Any]:
     }
 
 
-def _weights(graph: Graph) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
+def _weights(graph: Graph, storage: Storage) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
     entries, values = [], []
     for node in graph.nodes:
         if node.op != "Const":
             continue
         value = _narrowed(node)
-        entries.append({"name": node.name, "shape": list(value.shape), "dtype": value.dtype.name})
+        entry: dict[str, Any] = {"name": node.name, "shape": list(value.shape), "dtype": value.dtype.name}
+        if storage == "float16" and (half := compact(value, storage)) is not None:
+            value, entry["quantization"] = half[0], {"dtype": "float16"}
+        elif storage == "int8" and are_steps(value):
+            value = (value - _LOWEST).astype(np.uint8)
+            entry["quantization"] = {"dtype": "uint8", "scale": 1, "min": _LOWEST}
+        entries.append(entry)
         values.append(value)
     return entries, values
 
@@ -165,7 +175,9 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
     roots = policy.fetches.values()
     graph = fuse(parts_for_slices(for_tfjs(policy.graph), roots), roots, activations=True)
-    entries, values = _weights(graph)
+    if options.weights == "int8":
+        graph = stored(graph, options.weights, casts=False)
+    entries, values = _weights(graph, options.weights)
     shards = _shards(Pieces(*values))
     contract = json.loads(options.contract)
     model = {

@@ -115,9 +115,9 @@ class Console:
         if result.report is not None:
             self._report(result.report)
             return
-        from exporter.tables import size_text, table
+        from exporter.tables import sized, table
 
-        rows = [[kind, size_text(size)] for kind, size in result.sizes.items()]
+        rows = [[kind, sized(kind, result.sizes, result.whole_sizes)] for kind in result.sizes]
         say_lines(table(("format", "size"), rows))
         say("NOT VERIFIED: --verify none")
 

@@ -70,6 +70,14 @@ if TYPE_CHECKING:
 @trusting
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
 @activating
+@click.option(
+    "--dtype",
+    type=click.Choice(["float32", "float16"]),
+    default="float32",
+    show_default=True,
+    help="What weights are kept in.",
+)
+@click.option("--quantize", type=click.Choice(["int8"]), help="Keep weights in a byte each.")
 @click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @click.option(
@@ -100,6 +108,8 @@ def export_command(
     activation: str | None,
     trust_source: bool,
     labels: Path | None,
+    dtype: str,
+    quantize: str | None,
     jobs: int | None,
     cluster: str | None,
     again: bool,
@@ -113,6 +123,7 @@ def export_command(
     This is the command that is meant where none is named.
     """
     from converters.fetch import address_of
+    from exporter.export.options import storage
     from exporter.export.pipeline import ExportOptions, export
     from exporter.fleet.sources import is_many
 
@@ -131,6 +142,7 @@ def export_command(
         options,
         labels,
         profile,
+        storage(dtype, quantize),
     )
     many = again or fail_fast or is_many(sources) or address_of(out) is not None
     if many or jobs is not None or cluster is not None:

@@ -17,8 +17,10 @@ from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions
+from exporter.export.options import storage_of
 from exporter.export.pipeline import Job, Progress, consumer, joined, tested_in
 from exporter.export.sources import Source, read_source
+from exporter.verify.checks.decisions import decisions
 from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
 from exporter.verify.outline import outline
@@ -110,7 +112,14 @@ def verify_folder(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
             made_for, artefacts,
         )  # fmt: skip
-        report = verify(tested, () if asked else used or ("numpy",), known, pool, options, progress)
+        weights = contract.tool.get("weights")
+        # What was rounded is held against itself; the source is asked what it decides.
+        held = replace(tested, source=None) if weights else tested
+        report = verify(held, () if asked else used or ("numpy",), known, pool, options, progress)
+        if weights and original is not None:
+            kept = storage_of(weights)
+            decided = decisions(tested, held, kept, used or ("numpy",), pool, options or VerifyOptions())
+            report = replace(report.with_findings(decided), self_consistent=False)
         if again is not None and again.own is not None:
             under = tested_in(replace(again, policy=again.own, profile=None), formats, scratch / "own")
             report = joined(report, verify(under, used or ("numpy",), known, pool, None, progress))

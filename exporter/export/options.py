@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import get_args
 
 from converters.graph.options import CompileOptions, NoiseMode
+from converters.graph.passes.weights import Storage
 from signatures.errors import UsageError
 from signatures.roles import Role, parse_role
 
@@ -44,3 +46,20 @@ def compile_options(
         _roles(outputs, "--output"),
         dict(values or {}),
     )
+
+
+def storage(dtype: str, quantize: str | None) -> Storage:
+    """What weights are kept in. Raises UsageError."""
+    if dtype != "float32" and quantize is not None:
+        raise UsageError(f"--dtype {dtype} and --quantize {quantize} contradict each other", fix="give one of them")
+    return storage_of(
+        dtype if quantize is None else quantize, ("float32", "float16") if quantize is None else ("int8",)
+    )
+
+
+def storage_of(name: str, known: Sequence[Storage] = get_args(Storage)) -> Storage:
+    """One of those that are known. Raises UsageError."""
+    for storage in known:
+        if storage == name:
+            return storage
+    raise UsageError(f"weights are not kept in {name!r}", fix=f"one of: {', '.join(known)}")

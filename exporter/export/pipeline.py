@@ -15,6 +15,7 @@ from converters.folders import scratch_folder
 from converters.format import Artifact, Format, WriteOptions
 from converters.formats import DEFAULTS, WRITTEN, written
 from converters.graph.options import CompileOptions
+from converters.graph.passes.weights import Storage, rounded
 from converters.policy import Policy
 from converters.source import ReadOptions, SourceModel
 from exporter.export.labels import Labels, check_labels, labelled, read_labels
@@ -65,6 +66,8 @@ class ExportOptions:
     labels: Labels | None = None
     #: the consumer that the files are made for (``--for``)
     profile: str | None = None
+    #: what weights are rounded to and kept in (``--dtype``, ``--quantize``)
+    weights: Storage = "float32"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +83,8 @@ class ExportResult:
     renamed: str | None = None
     #: the formats that nobody asked for and that cannot hold it, and why
     left_out: tuple[str, ...] = ()
+    #: what the formats would take with weights in float32, where these are kept in less
+    whole_sizes: Mapping[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         verdict = "not verified" if self.report is None else self.report.verdict
@@ -107,6 +112,7 @@ class ExportResult:
             "folder": shown(self.folder),
             "passed": self.passed,
             "sizes": dict(self.sizes),
+            **({"whole_sizes": dict(self.whole_sizes)} if self.whole_sizes else {}),
             "parity": None if self.report is None else self.report.to_dict(),
         }
 
@@ -128,6 +134,8 @@ class Job:
     own: Policy | None = None
     #: why it has another name than its source's
     note: str | None = None
+    #: the policy with its weights as they were, where those of ``policy`` are rounded
+    whole: Policy | None = None
 
 
 class Exporter:
@@ -142,6 +150,7 @@ class Exporter:
         self._formats = _formats(options, wanted)
         if not self._formats:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
+        _check_weights(options, self._formats)
         self._profile = wanted
         #: None where the writers of its formats give a policy the consumer's names
         self._dress = None if wanted is None or self._formats[0].key in wanted.own_names else wanted.dress
@@ -191,7 +200,8 @@ class Exporter:
         for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
             dressed = labelled(own if dress is None else dress(own), self._labels)
-            jobs.append(Job(source, model, dressed, self._profile, None if dress is None else own, note))
+            job = Job(source, model, dressed, self._profile, None if dress is None else own, note)
+            jobs.append(job if options.weights == "float32" else _smaller(job, options.weights))
         return jobs
 
     def written(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
@@ -210,6 +220,7 @@ class Exporter:
     ) -> ExportResult:
         """The bundle of a policy, verified and put in its place."""
         options, policy = self.options, job.policy
+        whole_sizes = _whole_sizes(job, [a.format for a in artifacts], options)
         with (
             landing(options.out) as (out, put),
             bundle.staged(out / policy.name, contract, artifacts) as stage,
@@ -227,11 +238,22 @@ class Exporter:
                     under = tested_in(plain, self._formats, folder / "own")
                     rules = replace(options.parity, rules=(), golden=None, budget={})
                     report = joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
+                if job.whole is not None:
+                    from exporter.verify.checks.decisions import decisions
+
+                    whole = _tested(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
+                    rules = replace(options.parity, rules=(), golden=None, budget={})
+                    own = verify(whole, self.runtimes, self._known, pool, rules, progress)
+                    report = joined(report, own, "the policy with its weights as they were, by the numpy kernels")
+                    found = decisions(whole, tested, options.weights, self.runtimes, pool, options.parity)
+                    report = replace(report.with_findings(found), whole_sizes=whole_sizes)
                 with bundle.writing(out):
                     (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
             failed = report is not None and report.passed is False
             place = put(stage, f"{policy.name}.failed" if failed else policy.name)
-        return ExportResult(policy, place, contract, {a.format.key: a.size for a in artifacts}, report, job.note)
+        return ExportResult(
+            policy, place, contract, {a.format.key: a.size for a in artifacts}, report, job.note, (), whole_sizes
+        )
 
 
 def export(
@@ -327,16 +349,58 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     return [written(target) for target in targets]
 
 
+def _check_weights(options: ExportOptions, formats: Sequence[Format]) -> None:
+    """Raise UsageError where rounded weights are asked for and what is written cannot hold them."""
+    if options.weights == "float32":
+        return
+    flag = "--dtype float16" if options.weights == "float16" else "--quantize int8"
+    if options.profile is not None:
+        raise UsageError(
+            f"{flag} does not go with --for {options.profile}",
+            why="the importers of Unity and TensorFlowSharp were not shown to read weights in less than float32",
+            fix="leave one of them out",
+        )
+    wide = [f.key for f in formats if not f.narrow]
+    if wide:
+        raise UsageError(
+            f"{flag} does not go with --to {','.join(wide)}",
+            why=f"weights in {options.weights} are written to {', '.join(f.key for f in WRITTEN.values() if f.narrow)}",
+            fix="leave one of them out",
+        )
+
+
+def _smaller(job: Job, weights: Storage) -> Job:
+    """The policy with its weights rounded, which a note in its contract says."""
+    whole = job.policy
+    note = f"weights were rounded to {weights}; what is computed with them is float32"
+    signature = replace(whole.signature, notes=(*whole.signature.notes, note))
+    return replace(job, policy=replace(whole, graph=rounded(whole.graph, weights), signature=signature), whole=whole)
+
+
+def _whole_sizes(job: Job, formats: Sequence[Format], options: ExportOptions) -> dict[str, int]:
+    """What the formats would take with weights in float32; nothing where that is how they are written."""
+    if job.whole is None:
+        return {}
+    whole = replace(job, policy=job.whole, whole=None)
+    _, artifacts, _ = _write(whole, formats, replace(options, weights="float32", verify="none"))
+    return {a.format.key: a.size for a in artifacts}
+
+
 def _write(
     job: Job, formats: Sequence[Format], options: ExportOptions
 ) -> tuple[Contract, list[Artifact], tuple[str, ...]]:
     """The contract, the artefacts, and why some of the usual formats are not among these."""
     with naming(job.source.path):
         contract = contract_of(
-            job.policy, job.source, job.model, options.read, None if job.profile is None else job.profile.name
+            job.policy,
+            job.source,
+            job.model,
+            options.read,
+            None if job.profile is None else job.profile.name,
+            None if job.whole is None else options.weights,
         )
         if job.profile is None:
-            how = WriteOptions(contract.compact(), checked=options.verify != "none")
+            how = WriteOptions(contract.compact(), checked=options.verify != "none", weights=options.weights)
             if options.opset is not None:
                 how = replace(how, opset=options.opset)
             artifacts, notes = list[Artifact](), list[str]()
@@ -357,7 +421,12 @@ def _write(
 
 
 def contract_of(
-    policy: Policy, source: Source, model: SourceModel, read: ReadOptions, profile: str | None = None
+    policy: Policy,
+    source: Source,
+    model: SourceModel,
+    read: ReadOptions,
+    profile: str | None = None,
+    weights: str | None = None,
 ) -> Contract:
     """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
     origin = Origin(
@@ -369,7 +438,8 @@ def contract_of(
         read.goals,
         read.activation,
     )
-    tool = {"name": "export-model", "version": __version__, **({} if profile is None else {"profile": profile})}
+    made = {"name": "export-model", "version": __version__, "profile": profile, "weights": weights}
+    tool = {key: value for key, value in made.items() if value is not None}
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
         parse(contract.to_dict())
@@ -392,6 +462,7 @@ def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path)
     reference = paths.get("bytes")
     if reference is None:
         # The numpy reference reads a .bytes; one is made for it where none was asked for.
+        scratch.mkdir(exist_ok=True)
         reference = scratch / "reference.bytes"
         frozen(policy).write(reference)
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
@@ -402,7 +473,7 @@ def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path)
         paths,
         {a.format.key: a.size for a in artifacts},
         reference,
-        job.model.original if job.own is None else None,
+        job.model.original if job.own is None and job.whole is None else None,
         policy.source,
         keys,
         None if job.profile is None else job.profile.name,
@@ -419,9 +490,14 @@ def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderT
     return _tested(job, folder, artifacts, folder)
 
 
-def joined(report: ParityReport, own: ParityReport) -> ParityReport:
-    """The report of a policy in a consumer's names, with what came of the policy that it was made from."""
-    note = f"the policy under its own names, from which this was made: {own.verdict}, against {own.reference}"
+def joined(
+    report: ParityReport,
+    own: ParityReport,
+    what: str = "the policy under its own names, from which this was made",
+) -> ParityReport:
+    """The report of a policy, with what came of the one that it was made from."""
+    said = own.verdict if own.passed is not None else f"{len(own.comparisons)} comparisons passed"
+    note = f"{what}: {said}, against {own.reference}"
     passed = False if own.passed is False else report.passed
     comparisons, notes = (*report.comparisons, *own.failures), (*report.notes, note)
     return replace(report, passed=passed, comparisons=comparisons, notes=notes, self_consistent=own.self_consistent)

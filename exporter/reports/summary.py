@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from exporter.tables import size_text, table
-from exporter.verify.findings import Accepted, Size
+from exporter.tables import sized, table
+from exporter.verify.findings import Accepted, Decisions, Size
 from exporter.verify.report import ParityReport
 
 
@@ -14,8 +14,7 @@ def parity_table(report: ParityReport) -> str:
     """Verdict, format, runtime, size, and the worst difference with its output."""
     rows = []
     for pair in report.pairs:
-        size = report.sizes.get(pair.format)
-        shown = "" if size is None else size_text(size)
+        shown = sized(pair.format, report.sizes, report.whole_sizes)
         rows.append([_word(pair.passed), pair.format, pair.runtime, shown, pair.worst_text])
     return table(("verdict", "format", "runtime", "size", "worst |Δ|"), rows)
 
@@ -54,7 +53,7 @@ def verdict(report: ParityReport) -> str:
     pairs = {
         (c.format, c.runtime)
         for c in report.comparisons
-        if c.format not in ("reference", "golden") and not isinstance(c, Size)
+        if c.format not in ("reference", "golden") and not isinstance(c, (Decisions, Size))
     }
     count, seen = len(pairs), {kind.partition(":")[0] for kind, _ in pairs}
     unseen = [kind for kind in report.sizes if kind.partition(":")[0] not in seen]

@@ -216,6 +216,27 @@ class Draws(Shape):
         return "", "", f"p >= {FALSE_ALARM:g}: p = {1 - self.max_abs_diff:.2g}"
 
 
+class Decisions(Finding):
+    """How many choices of a policy whose weights were rounded are other ones, or how far an action moves beside how
+    far it varies; ``reason`` says it whether it passed or not, ``runtime`` is what weights were rounded to.
+    """
+
+    __slots__ = ()
+    kind: ClassVar[str] = "decisions"
+
+    def cell(self) -> str:
+        """The share."""
+        return f"{self.max_abs_diff:.2%} off"
+
+    def columns(self) -> tuple[str, str, str]:
+        """The share, and what it may be."""
+        return f"{self.max_abs_diff:.2%}", "", f"{self.tolerance.atol:.0%}"
+
+    def sentence(self) -> str:
+        """What it does otherwise."""
+        return f"with weights rounded to {self.runtime}, {self.output} is another one: {self.reason}"
+
+
 class Failure(Finding):
     """A runtime that gave no answer; ``output`` is "*" where that is so for all."""
 

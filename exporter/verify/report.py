@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import field
+from collections.abc import Iterable, Mapping
+from dataclasses import field, replace
 from typing import Any
 
 from exporter.verify.findings import Failure, Finding, Shape
@@ -47,6 +47,8 @@ class ParityReport:
     comparisons: tuple[Finding, ...]
     sizes: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    #: what the formats would take with weights in float32, where these are kept in less
+    whole_sizes: Mapping[str, int] = field(default_factory=dict)
     #: No runtime reads the source by itself (a .nn): the formats were compared with this project's own reading of it.
     self_consistent: bool = False
 
@@ -89,6 +91,12 @@ class ParityReport:
         """The comparisons that did not pass."""
         return tuple(c for c in self.comparisons if not c.passed)
 
+    def with_findings(self, found: Iterable[Finding]) -> ParityReport:
+        """The report with further findings."""
+        comparisons = (*self.comparisons, *found)
+        passed = False if any(not c.passed for c in comparisons) else self.passed
+        return replace(self, comparisons=comparisons, passed=passed)
+
     def to_dict(self) -> dict[str, Any]:
         """The content of parity.json."""
         return {
@@ -102,5 +110,6 @@ class ParityReport:
             "runtimes": {name: dict(entry) for name, entry in self.runtimes.items()},
             "comparisons": [c.to_dict() for c in self.comparisons],
             "sizes": dict(self.sizes),
+            **({"whole_sizes": dict(self.whole_sizes)} if self.whole_sizes else {}),
             "notes": list(self.notes),
         }

@@ -132,17 +132,38 @@ function attribute(value) {
 /** Bytes stand in JSON in base64, or as a list of numbers. */
 const string = (value) => (Array.isArray(value) ? String.fromCharCode(...value) : atob(value));
 
+/** What weights that are float32 may be stored as. */
+const NARROW = { float16: Uint16Array, uint8: Uint8Array };
+
+/** Weights as float32: halves by their bits (not every engine has a Float16Array), or steps of one length. */
+function widened(data, { dtype, scale, min }) {
+  return Float32Array.from(data, dtype === "uint8" ? (value) => value * scale + min : half);
+}
+
+/** A float16, of its bits. */
+function half(bits) {
+  const exponent = (bits >> 10) & 31;
+  const digits = bits & 1023;
+  const size = exponent === 0 ? digits * 2 ** -24
+    : exponent === 31 ? (digits ? NaN : Infinity)
+      : (1 + digits / 1024) * 2 ** (exponent - 15);
+  return bits & 0x8000 ? -size : size;
+}
+
 /** Constants by their nodes' names. */
 function weights({ weightsManifest = [], weightData }) {
   const found = new Map();
   let offset = 0;
   for (const { name, shape, dtype, quantization } of weightsManifest.flatMap((group) => group.weights)) {
-    if (quantization !== undefined || !Object.hasOwn(ARRAYS, dtype)) {
-      throw new Error(`the weights '${name}' are ${quantization?.dtype ?? dtype}; float32, int32 and bool are taken`);
+    const kind = quantization?.dtype ?? dtype;
+    const kinds = quantization === undefined ? ARRAYS : dtype === "float32" ? NARROW : {};
+    if (!Object.hasOwn(kinds, kind)) {
+      throw new Error(`the weights '${name}' are ${kind}; float32, int32 and bool are taken`);
     }
-    const bytes = sizeOf(shape) * ARRAYS[dtype].BYTES_PER_ELEMENT;
+    const bytes = sizeOf(shape) * kinds[kind].BYTES_PER_ELEMENT;
     if (offset + bytes > weightData.byteLength) throw new Error("the weights are cut off");
-    found.set(name, [{ dtype, shape, data: new ARRAYS[dtype](weightData.slice(offset, offset + bytes)) }]);
+    const data = new kinds[kind](weightData.slice(offset, offset + bytes));
+    found.set(name, [{ dtype, shape, data: quantization === undefined ? data : widened(data, quantization) }]);
     offset += bytes;
   }
   return found;

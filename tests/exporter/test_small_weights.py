@@ -1,0 +1,157 @@
+"""``--dtype float16`` and ``--quantize int8``: smaller files, the same numbers in each, decisions that hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.format import WriteOptions
+from converters.formats import DEFAULTS, WRITTEN
+from converters.graph.nodes import Graph, Node
+from converters.graph.passes.weights import LEAST, Storage, compact, rounded
+from converters.runtimes.pool import RuntimePool
+from exporter import export_model, verify_bundle
+from exporter.export.sources import read_source
+from exporter.verify.checks import decisions as check
+from fixtures import path as fixture
+from signatures.errors import UsageError
+
+_KEPT: tuple[Storage, ...] = ("float16", "int8")
+
+
+def graph_of(weights: np.ndarray, op: str = "MatMul", **attrs: object) -> Graph:
+    return Graph((Node("x", "Placeholder"), Node("w", "Const", value=weights), Node("y", op, ("x", "w"), attrs)))
+
+
+def drawn(*shape: int, seed: int = 0) -> np.ndarray:
+    """Weights whose channels differ a thousandfold."""
+    rng = np.random.default_rng(seed)
+    return (rng.standard_normal(shape) * 10.0 ** rng.uniform(-2, 1, shape[-1])).astype(np.float32)
+
+
+@pytest.mark.parametrize("storage", _KEPT)
+@pytest.mark.parametrize("turned", [False, True], ids=["", "transposed"])
+def test_what_is_rounded_comes_back_to_the_bit(storage: Storage, turned: bool) -> None:
+    whole = drawn(24, 40).T if turned else drawn(40, 24)
+    made = rounded(graph_of(whole, transpose_b=turned), storage)["w"].value
+    assert made is not None and made.dtype == np.float32 and not np.array_equal(made, whole)
+    axis = 0 if turned else 1
+    limit = np.abs(whole).max(axis=1 - axis, keepdims=True) * (2.0**-11 if storage == "float16" else 0.51 / 127)
+    assert (np.abs(made - whole) <= limit).all()
+    found = compact(made, storage)
+    assert found is not None
+    narrow, step = found
+    assert narrow.nbytes * (2 if storage == "float16" else 4) == whole.nbytes
+    back = narrow.astype(np.float32) if step is None else narrow.astype(np.float32) * step
+    assert back.tobytes() == np.ascontiguousarray(made).tobytes()
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        graph_of(drawn(5, 3)),
+        graph_of(drawn(LEAST), "BiasAdd"),
+        graph_of(drawn(20, 20), "Sub"),
+        graph_of(np.eye(20, dtype=np.float32)),
+        graph_of(np.where(drawn(20, 20) > 0, np.float32(np.inf), 0).astype(np.float32)),
+    ],
+    ids=["small", "bias", "normaliser", "whole numbers", "infinite"],
+)
+def test_what_needs_every_digit_keeps_it(kept: Graph) -> None:
+    for storage in ("float16", "int8"):
+        assert rounded(kept, storage)["w"] == kept["w"]
+
+
+def test_what_float16_cannot_hold_stays() -> None:
+    large = graph_of(drawn(40, 24) * np.float32(1e6))
+    assert rounded(large, "float16")["w"] == large["w"]
+
+
+@pytest.mark.parametrize("storage", _KEPT)
+def test_every_format_holds_the_same_numbers(storage: Storage, tmp_path: Path) -> None:
+    ((_, policy),) = read_source(fixture("visual")).compiled()
+    (result,) = export_model(
+        fixture("visual"),
+        tmp_path,
+        verify="none",
+        **({"dtype": "float16"} if storage == "float16" else {"quantize": "int8"}),
+    )
+    wanted = rounded(policy.graph, storage)
+    changed = {
+        n.value.tobytes() for n in wanted.nodes if n.value is not None and n.value is not policy.graph[n.name].value
+    }
+    assert len(changed) >= 3 and result.contract["tool"]["weights"] == storage
+    for key in DEFAULTS:
+        form = WRITTEN[key]
+        again = read_source(result.folder / form.main_of(result.policy.name))
+        ((_, read),) = again.compiled()
+        assert changed <= {n.value.tobytes() for n in read.graph.nodes if n.value is not None}, key
+        assert result.sizes[key] < form.artifact(policy, WriteOptions("{}")).size * 0.9
+    assert {*result.whole_sizes} == {*DEFAULTS}
+
+
+@pytest.mark.parametrize("storage", _KEPT)
+def test_runtimes_run_it_and_decisions_are_told(storage: Storage, tmp_path: Path, runtimes: RuntimePool) -> None:
+    options = {"dtype": "float16"} if storage == "float16" else {"quantize": "int8"}
+    (result,) = export_model(
+        fixture("recurrent"), tmp_path, verify="numpy,tensorflow,onnxruntime,tfjs-wasm,js", **options
+    )
+    report = result.report
+    assert report is not None and report.passed, report
+    ran = {(c.format, c.runtime) for c in report.comparisons}
+    assert {("bytes", "tensorflow"), ("saved_model", "tensorflow"), ("tfjs", "js"), ("onnx", "onnxruntime")} <= ran
+    (decided,) = [c for c in report.comparisons if c.kind == "decisions"]
+    assert (decided.output, decided.runtime) == ("deterministic_action", storage)
+    assert decided.max_abs_diff <= check.LIMITS[storage]
+    assert all(report.whole_sizes[k] > size for k, size in report.sizes.items())
+    again = verify_bundle(result.folder, source=fixture("recurrent"), runtimes="numpy,tensorflow")
+    assert [c.reason for c in again.comparisons if c.kind == "decisions"] == [decided.reason]
+    assert not [c for c in verify_bundle(result.folder, runtimes="onnxruntime").comparisons if c.kind == "decisions"]
+
+
+def test_too_many_other_decisions_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(check.LIMITS, "int8", 1e-6)
+    (result,) = export_model(
+        fixture("continuous"),
+        tmp_path,
+        to="onnx",
+        quantize="int8",
+        verify="numpy,onnxruntime",
+        strict=False,
+    )
+    assert result.passed is False and result.folder.name == "continuous.failed"
+    (failed,) = result.report.failures if result.report is not None else ()
+    assert failed.kind == "decisions" and "of its spread" in failed.sentence()
+
+
+@pytest.mark.parametrize(
+    ("was", "made", "share"),
+    [
+        (np.array([[0], [1], [2], [3]]), np.array([[0], [1], [2], [0]]), 0.25),
+        (np.array([[-1.0], [1.0]]), np.array([[-1.1], [0.9]]), 0.1),
+        (np.array([[5.0, -1.0], [5.0, 1.0]]), np.array([[5.0, -1.0], [5.0, 1.0]]), 0.0),
+        (np.array([[0.0], [0.0]]), np.array([[0.0], [1e-9]]), np.inf),
+        (np.array([[1.0]]), np.array([[np.nan]]), np.inf),
+    ],
+    ids=["choices", "spread", "same", "what never varied", "not a number"],
+)
+def test_shares(was: np.ndarray, made: np.ndarray, share: float) -> None:
+    assert check.compared(was, made)[0] == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"dtype": "float16", "for_": "unity6"}, "--dtype float16 does not go with --for unity6"),
+        ({"quantize": "int8", "to": "onnx,nn"}, "--quantize int8 does not go with --to nn"),
+        ({"dtype": "float16", "quantize": "int8"}, "contradict"),
+        ({"dtype": "bfloat16"}, "not kept in 'bfloat16'"),
+        ({"quantize": "int4"}, "not kept in 'int4'"),
+    ],
+)
+def test_what_cannot_be_is_refused(asked: dict[str, str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=said):
+        export_model(fixture("discrete"), tmp_path, verify="none", **asked)  # type: ignore[arg-type]
+    assert not any(tmp_path.iterdir())
