@@ -60,7 +60,7 @@ class Bundle:
             contract = parse(content)
         except (FileNotFoundError, NotADirectoryError) as error:
             raise BundleError(
-                "is not a bundle",
+                "not a bundle",
                 where=str(folder),
                 why=f"it has no {POLICY}",
                 fix="give the folder that export-model wrote",

@@ -86,14 +86,26 @@ def again(entry: Entry) -> Markup | None:
 
 
 _WORDS = (
-    ("reference", "what all are compared with: the source in its own runtime where one reads it, else numpy's kernels"),
+    (
+        "reference",
+        "what everything is compared with: the source in its own runtime if one can read it, otherwise numpy kernels",
+    ),
     ("|Δ|", "the absolute difference between a number and the reference's"),
-    ("tolerance", "|Δ| may be up to atol + rtol·|reference|; one that is not the default stands here with its reason"),
-    ("rounding", "how far float32's own rounding moves a result at an input, measured: no runtime is closer by right"),
-    ("rollout", "the memory is fed back, step after step, in each runtime by itself"),
+    (
+        "tolerance",
+        "how large |Δ| may be: atol + rtol·|reference|; any that is not the default is listed with its reason",
+    ),
+    (
+        "rounding",
+        "how far float32 rounding alone moves a result, measured; no runtime can be expected to do better",
+    ),
+    ("rollout", "several steps in a row: each runtime is fed its own memory back"),
     ("draws", "actions drawn by chance are compared as distributions, with a stated rate of false alarms"),
-    ("self-consistent", "no other runtime reads the source, so the formats were compared with this tool's own reading"),
-    ("not verified", "no runtime but this tool's own kernels was there to ask"),
+    (
+        "self-consistent",
+        "no other runtime can read the source, so the formats were compared with this tool's own reading of it",
+    ),
+    ("not verified", "nothing was installed to run it in except this tool's own kernels"),
 )
 
 

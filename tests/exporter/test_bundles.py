@@ -235,8 +235,8 @@ def test_a_bundle_that_was_not_touched_is_whole(ball: Path) -> None:
 
 
 def test_a_folder_without_a_contract_is_no_bundle(tmp_path: Path) -> None:
-    is_no_bundle(tmp_path, tmp_path, "is not a bundle", "policy.json")
-    is_no_bundle(tmp_path / "nothing", "is not a bundle")
+    is_no_bundle(tmp_path, tmp_path, "not a bundle", "policy.json")
+    is_no_bundle(tmp_path / "nothing", "not a bundle")
     (tmp_path / "file").write_text("x")
     is_no_bundle(tmp_path / "file", tmp_path / "file")
 

@@ -56,7 +56,7 @@ def test_the_policy_keeps_the_balls_up_for_20_seconds_on_each_backend(bundle: Bu
         assert (status["good"], status["bad"]) == ("12", "0")
         assert described.startswith("12 tilting platforms")
         names = ["js", "cpu", "wasm", "webgl"]
-        assert verdict.startswith("Yes. In your browser js, cpu, wasm, webgl give the reference's")
+        assert verdict.startswith("Yes. In your browser, js, cpu, wasm, webgl give the reference's")
         assert states == [[name, "agrees"] for name in names]
 
 
@@ -181,7 +181,7 @@ def test_one_file_plays_from_the_disk(bundle: Bundle, tmp_path: Path) -> None:
         ],
     )
     assert seen.results[1] != seen.results[3]
-    assert seen.results[-2].startswith("Yes. In your browser js")
+    assert seen.results[-2].startswith("Yes. In your browser, js")
     assert seen.results[-1] is None
     assert (seen.console, seen.requests) == ([], [page.as_uri()])
 
@@ -232,9 +232,10 @@ def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
 
 
 def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
-    """In each other's place they act the same; how little they differ is shown as it happens."""
+    """In each other's place they act the same, as does an .onnx that is dropped; how little they differ is shown."""
     assert export_model(run_folder("3DBall"), "-o", tmp_path, "--to", "bytes,tfjs,onnx", "--verify", "none").status == 0
     words = "document.querySelector('#apart')?.textContent ?? ''"
+    onnx = tmp_path / "3DBall" / "3DBall.onnx"
     played = "document.querySelector('#status-2')?.dataset.seconds > 2"
     with served(assemble(tmp_path / "3DBall")) as server:
         seen = visit(
@@ -246,9 +247,13 @@ def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
                 ["wait", "document.querySelectorAll('.lane .title')[1].textContent.endsWith('onnxruntime-web')"],
                 ["wait", played],
                 ["eval", words],
+                ["drop", [["theirs.onnx", base64.b64encode(onnx.read_bytes()).decode()]]],
+                ["wait", "document.querySelectorAll('.lane .title')[1].textContent === '3DBall (dropped here)'"],
+                ["wait", played],
+                ["eval", words],
             ],
         )
-    for said in (seen.results[1], seen.results[5]):
+    for said in (seen.results[1], seen.results[5], seen.results[-1]):
         answers, states = (float(n) for n in re.findall(r"by (\S+?)[,.](?:\s|$)", said))
         assert 0 <= answers < 1e-3, said
         assert 0 <= states < 1e-3, said

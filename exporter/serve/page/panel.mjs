@@ -29,12 +29,12 @@ export class Panel {
       h("div", { class: "asking", role: "group", "aria-label": "Inputs" }, this.#presets(changed), inputs),
       h("div", { class: "numbers answering", role: "region", tabindex: "0", "aria-label": "Answer" }, outputs, this.#timing),
     );
-    const title = h("h2", { id: "panel-title" }, folded ? "Ask it yourself" : "What does it do?");
+    const title = h("h2", { id: "panel-title" }, folded ? "Try it yourself" : "What does it do?");
     if (folded) {
       const details = h("details", { class: "big" }, h("summary", {}, "Set the observations by hand"), columns);
       details.addEventListener("toggle", () => details.open && this.decide());
       $("panel").append(title, details);
-    } else $("panel").append(title, h("p", { class: "lead" }, "Move a slider: the policy decides anew with every change."), columns);
+    } else $("panel").append(title, h("p", { class: "lead" }, "Move a slider: the policy decides again with every change."), columns);
     $("panel").hidden = false;
     this.#controls.memory?.show();
     if (!folded) void this.decide();

@@ -116,7 +116,7 @@ export class Stage {
             view.poke && button("poke", view.poke, () => this.#queued(() => this.#poke())),
             h("span", { class: "field" }, h("label", { for: "speed" }, "Speed"), speed),
             h("span", { class: "field" }, exact, h("label", { for: "exact" }, "Deterministic")),
-            h("span", { class: "field" }, h("label", { for: "beside" }, "Beside it"), beside),
+            h("span", { class: "field" }, h("label", { for: "beside" }, "Compare with"), beside),
             button("copy", "Copy link", () => this.#copy()),
             canRecord() && button("record", "Record", () => this.#record()),
           ),
@@ -207,7 +207,7 @@ export class Stage {
       tell("beside", what === "" || given !== null ? null : what);
     } catch (error) {
       this.#parts.beside.value = this.#beside?.what ?? "";
-      this.#say(`It cannot be put beside: ${error.message}.`);
+      this.#say(`It cannot be compared: ${error.message}.`);
     }
   }
 
@@ -234,7 +234,7 @@ export class Stage {
     tell("seed", this.#seed);
     try {
       await navigator.clipboard.writeText(location.href);
-      this.#say("The link is copied: it leads to this seed, speed and comparison.");
+      this.#say("Link copied. It opens this seed, speed and comparison.");
     } catch {
       this.#say(`The link: ${location.href}`);
     }

@@ -131,7 +131,7 @@ export class Verdict {
     const names = ran.map(({ backend }) => backend).join(", ");
     const numbers = ran[0].numbers.toLocaleString("en");
     return this.#say(
-      `Yes. In your browser ${names} give the reference's ${numbers} numbers; the worst difference is ${text(worst)}.${note}`,
+      `Yes. In your browser, ${names} ${ran.length === 1 ? "gives" : "give"} the reference's ${numbers} numbers; the worst difference is ${text(worst)}.${note}`,
       "ok",
     );
   }
