@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.graph.allowance import Allowance
+from converters.graph.allowance import MAX_MADE, Allowance
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE, op_of
@@ -78,6 +78,14 @@ class Builder:
         if key is not None:
             self._constants[key] = made
         return made
+
+    def room(self, elements: int) -> None:
+        """Count a constant that follows from lengths alone, before it is made. Raises UnsupportedOpError."""
+        if not self.allowance.take(elements if elements > _SHARED_CONSTANT else 0):
+            raise UnsupportedOpError(
+                f"it makes a constant of {elements} elements",
+                why=f"with those of other nodes that is more than {MAX_MADE}, and they are not in the file",
+            )
 
     def floats(self, numbers: npt.ArrayLike, name: str = "const") -> str:
         """A float32 constant."""

@@ -9,7 +9,7 @@ from typing import Any
 from converters.graph.compilation import Compilation, Pass, on_graph, on_inputs, on_tensors
 from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
 from converters.graph.ops.table import is_fed
-from converters.graph.options import CompileOptions
+from converters.graph.options import MAX_PORTS, CompileOptions
 from converters.graph.passes import conditions as has
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import complete_shapes, set_values, settle_inputs
@@ -59,8 +59,8 @@ PASSES = (
 )
 
 
-#: A policy's placeholders, and its outputs.
-MAX_PORTS = 1 << 10
+#: Tensors that a policy's nodes read, all together: a sum may name one of five bytes a million times.
+MAX_READ = 1 << 15
 
 
 def compile_graph(
@@ -92,17 +92,16 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         canonical = brain.canonical
         outputs = [(canonical[base], reference) for base, _, reference in brain.outputs if base in canonical]
         upstream = graph.pruned([reference for _, reference in outputs])
-        if len(upstream.nodes) > MAX_NODES:
-            raise NotAPolicyError(
-                f"{len(upstream.nodes)} nodes lead to the policy's outputs",
-                why=f"no more than {MAX_NODES} are converted; a policy has some hundreds",
-                fix="give the policy alone, or say which node is its action: --output NODE=action",
-            )
-        for what, count in (("inputs", sum(map(is_fed, upstream.nodes))), ("outputs", len(outputs))):
-            if count > MAX_PORTS:
+        for what, count, most in (
+            ("nodes", len(upstream.nodes), MAX_NODES),
+            ("tensors that its nodes read", sum(len(n.inputs) for n in upstream.nodes), MAX_READ),
+            ("inputs", sum(map(is_fed, upstream.nodes)), MAX_PORTS),
+            ("outputs", len(outputs), MAX_PORTS),
+        ):
+            if count > most:
                 raise NotAPolicyError(
                     f"the policy has {count} {what}",
-                    why=f"no more than {MAX_PORTS} are converted; a policy has a few",
+                    why=f"no more than {most} are converted; a policy has some hundreds of nodes, and a few inputs",
                     fix="give the policy alone, or say which node is its action: --output NODE=action",
                 )
         sources = {out: _source_of(graph, reference) for out, reference in outputs}

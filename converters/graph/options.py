@@ -9,6 +9,8 @@ from typing import Literal
 from signatures.records import dataclass
 from signatures.roles import Role
 
+#: A policy's placeholders, and its outputs.
+MAX_PORTS = 1 << 10
 #: What becomes of the normals that are drawn inside the graph: an input, they stay, or zeros.
 NoiseMode = Literal["lift", "keep", "zero"]
 

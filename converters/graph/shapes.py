@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import operator
 from collections.abc import Mapping, Sequence
+from functools import cache
+from math import inf
 
 import numpy as np
 
 from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, ref
-from converters.graph.ops.base import MISFIT, OpDef, misfit
+from converters.graph.ops.base import MISFIT, Kernel, OpDef, misfit, shape_error
 from converters.graph.ops.table import CONTROL_FLOW, op_of
 from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, of_array
 from signatures.errors import ExportModelError, GraphError
@@ -108,6 +111,8 @@ def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:
 def _results(
     op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols, allowance: Allowance
 ) -> Sequence[TensorType]:
+    if op.kernel is not None and len(args) > _most_inputs(op.kernel):
+        raise shape_error(node, args, f"it takes {_most_inputs(op.kernel):.0f} inputs")
     try:
         results = op.infer(node, args, symbols)
     except ExportModelError:
@@ -120,7 +125,7 @@ def _results(
     values = [a.value for a in args]
     if any(v is None for v in values):
         return results
-    sizes = [_elements(r) for r in results]
+    sizes = [elements_of(r) for r in results]
     large = sum(size for size in sizes if size > _SMALL)
     least = min(large, 1) if op.moves in _VIEWS else large
     if max(sizes, default=0) > _MAX_FOLD or (least > allowance.left and not allowance.take(least)):
@@ -133,7 +138,14 @@ def _results(
     return folded if allowance.take(_folded(node, args, folded)) else results
 
 
-def _elements(kind: TensorType) -> int:
+@cache
+def _most_inputs(kernel: Kernel) -> float:
+    """How many tensors a kernel takes: an infer rule does not ask for those behind the ones that it reads."""
+    given = list(inspect.signature(kernel).parameters.values())[1:]
+    return inf if any(p.kind is p.VAR_POSITIONAL for p in given) else len(given)
+
+
+def elements_of(kind: TensorType) -> int:
     """Elements of a tensor; an axis that is free counts as one."""
     count = 1
     for length in kind.shape or ():
@@ -144,10 +156,10 @@ def _elements(kind: TensorType) -> int:
 
 def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> None:
     """Raise GraphError where a result is larger than any policy's, before anything of that size is allocated."""
-    largest = max(map(_elements, results), default=0)
+    largest = max(map(elements_of, results), default=0)
     if largest <= MAX_ELEMENTS:
         return
-    if node.op == "Placeholder" or largest > max(map(_elements, args), default=0):
+    if node.op == "Placeholder" or largest > max(map(elements_of, args), default=0):
         raise GraphError(
             f"node {node.name!r} ({node.op}) makes a tensor of {largest} elements",
             why=f"no policy has one of more than {MAX_ELEMENTS} per row",

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
 
+from converters.graph.nodes import NameScope
 from signatures.errors import DamagedFileError
 from signatures.records import dataclass
 
@@ -89,13 +90,8 @@ def _text(value: object) -> str:
 
 def _functional(name: str, config: Mapping[str, Any]) -> LayeredModel:
     layers = tuple(layer_of(entry) for entry in config["layers"])
-    outputs: dict[str, Place] = {}
-    for key, place in _places(config["output_layers"]):
-        wish = key or place.layer
-        taken = wish
-        while taken in outputs:
-            taken = f"{wish}_{len(outputs)}"
-        outputs[taken] = place
+    scope = NameScope(())
+    outputs = {scope.fresh(key or place.layer): place for key, place in _places(config["output_layers"])}
     return LayeredModel(name, layers, tuple(place for _, place in _places(config["input_layers"])), outputs)
 
 

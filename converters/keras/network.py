@@ -9,6 +9,7 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.passes.unroll import MAX_NODES
 from converters.graph.types import FLOAT32
 from converters.keras.layers.step import Step
 from converters.keras.layers.table import LAYERS, OPERATIONS
@@ -58,9 +59,9 @@ class Network(Builder):
         self._single_step = _carries_state(model)
         places: dict[str, Tensor] = {}
         given: dict[Place, str] = {}
+        layers = {layer.name: layer for layer in model.layers}
         for place in model.inputs:
-            layer = next(x for x in model.layers if x.name == place.layer)
-            given[place] = self._input(layer, places)
+            given[place] = self._input(layers[place.layer], places)
         self.results = dict(zip(model.outputs, self.model(model, weights, given, "", 0), strict=True))
         for placeholder, name in self.kept.items():
             self.results[name] = self.states[placeholder]
@@ -112,23 +113,10 @@ class Network(Builder):
             )
         arrays = weights.among(model.layers)
         results: Results = {(place.layer, place.call): [reference] for place, reference in given.items()}
-        waiting = [(layer, n) for layer in model.layers for n in range(len(layer.calls))]
         first = _first_calls(model)
-        while waiting:
-            left = []
-            for layer, number in waiting:
-                call = layer.calls[number]
-                needs = [*tensors_in(call.args), *tensors_in(call.kwargs)]
-                if all((p.layer, p.call) in results for p in needs):
-                    made = self._called(layer, number, results, arrays, prefix, depth)
-                    results[layer.name, number + first.get(layer.name, 0)] = made
-                else:
-                    left.append((layer, number))
-            if len(left) == len(waiting):
-                raise DamagedFileError(
-                    f"the layer {left[0][0].name!r} reads what no layer gives", fix="save the model again"
-                )
-            waiting = left
+        for layer, number in _ordered(model, results, first):
+            made = self._called(layer, number, results, arrays, prefix, depth)
+            results[layer.name, number + first.get(layer.name, 0)] = made
         return [results[p.layer, p.call][p.tensor] for p in model.outputs.values()]
 
     def _called(
@@ -218,6 +206,40 @@ def _first_calls(model: LayeredModel) -> dict[str, int]:
     calls = [call for layer in model.layers for call in layer.calls]
     places = [*model.outputs.values(), *tensors_in([[c.args, c.kwargs] for c in calls])]
     return {p.layer: 1 for p in places if p.layer in counts and p.call == counts[p.layer]}
+
+
+def _ordered(model: LayeredModel, given: Results, first: Mapping[str, int]) -> list[tuple[Layer, int]]:
+    """The calls of a model, each behind those that it reads; layers are gone through again and again, as Keras does.
+
+    Raises DamagedFileError where one waits for what no layer gives.
+    """
+    calls = [(layer, number) for layer in model.layers for number in range(len(layer.calls))]
+    if len(calls) > MAX_NODES:
+        raise NotAPolicyError(
+            f"its layers are called {len(calls)} times",
+            why=f"no more than {MAX_NODES} calls are read; a policy has some tens",
+            fix="save the policy alone",
+        )
+    maker = {(layer.name, number + first.get(layer.name, 0)): at for at, (layer, number) in enumerate(calls)}
+    readers: list[list[int]] = [[] for _ in calls]
+    missing, turn = [0] * len(calls), [0] * len(calls)
+    for at, (layer, number) in enumerate(calls):
+        call = layer.calls[number]
+        needs = {(p.layer, p.call) for p in (*tensors_in(call.args), *tensors_in(call.kwargs))} - given.keys()
+        missing[at] = len(needs)
+        for need in needs & maker.keys():
+            readers[maker[need]].append(at)
+    ready = [at for at, count in enumerate(missing) if not count]
+    for at in ready:
+        for reader in readers[at]:
+            turn[reader] = max(turn[reader], turn[at] + (reader < at))
+            missing[reader] -= 1
+            if not missing[reader]:
+                ready.append(reader)
+    if len(ready) < len(calls):
+        stuck = next(layer for (layer, _), count in zip(calls, missing, strict=True) if count)
+        raise DamagedFileError(f"the layer {stuck.name!r} reads what no layer gives", fix="save the model again")
+    return [calls[at] for at in sorted(ready, key=lambda at: (turn[at], at))]
 
 
 def unknown(layer: Layer, path: str) -> UnknownLayerError:

@@ -25,19 +25,25 @@ class Memory:
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self._base = _data(pid)
-        self._models = 0
+        #: Bytes of the models that it has, and the most that it had at once: what it freed it may keep for the next.
+        self._models = self._most = 0
         self._set = 0
 
     def allow(self, model: int) -> None:
         """Count a model of that many bytes, which is going to be loaded."""
         self._models += model
+        self._most = max(self._most, self._models)
+
+    def release(self, model: int) -> None:
+        """Count a model no more, which was unloaded, or never loaded."""
+        self._models -= model
 
     def allow_for_request(self, fed: int) -> None:
         """Bound what the child has, for a request that feeds it that many bytes."""
         if self._base is None:
             return
         bound = self._base + FREE + _PER_PROCESSOR * (os.cpu_count() or 1)
-        bound += PER_MODEL_BYTE * self._models + PER_FED_BYTE * fed
+        bound += PER_MODEL_BYTE * self._most + PER_FED_BYTE * fed
         if bound != self._set:
             self._set = bound
             _limit(self.pid, bound)

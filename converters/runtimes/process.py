@@ -119,10 +119,22 @@ class RuntimeProcess:
         self.start()
         self._loaded += 1
         identity = f"m{self._loaded}"
+        size, memory = _size(path), self._memory
+        if memory is not None:
+            memory.allow(size)
+        try:
+            self.request({"cmd": "load", "id": identity, "path": path, **options})
+        except RunFailedError:
+            if memory is not None:
+                memory.release(size)
+            raise
+        return LoadedModel(self, identity, size)
+
+    def unload(self, identity: str, size: int) -> None:
+        """Free a model of that many bytes."""
+        self.request({"cmd": "unload", "id": identity})
         if self._memory is not None:
-            self._memory.allow(_size(path))
-        self.request({"cmd": "load", "id": identity, "path": path, **options})
-        return LoadedModel(self, identity)
+            self._memory.release(size)
 
     def request(
         self, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None
@@ -250,9 +262,8 @@ def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
 class LoadedModel:
     """A model in a runtime's process."""
 
-    def __init__(self, process: RuntimeProcess, identity: str) -> None:
-        self._process = process
-        self._identity = identity
+    def __init__(self, process: RuntimeProcess, identity: str, size: int) -> None:
+        self._process, self._identity, self._size = process, identity, size
 
     def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str], **request: Any) -> Tensors:
         """The outputs in ``fetch`` by name; raises RunFailedError. ``request`` is for what one runtime alone can do."""
@@ -309,7 +320,7 @@ class LoadedModel:
 
     def unload(self) -> None:
         """Free it."""
-        self._process.request({"cmd": "unload", "id": self._identity})
+        self._process.unload(self._identity, self._size)
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ import numpy as np
 from converters.format import Port
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
 from converters.graph.ops.table import is_fed
+from converters.graph.options import MAX_PORTS
 from converters.graph.types import Symbols, TensorType
 from converters.renaming import renamed
 from converters.schema import dtype_number
@@ -25,7 +26,7 @@ from converters.understand.facts import SourceFacts
 from converters.understand.inputs import role_by_name
 from converters.understand.memories import float_rows, paired_memories
 from signatures.contract import EMBEDDED
-from signatures.errors import DamagedFileError
+from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.memories import SeparateMemory
 from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
@@ -94,6 +95,12 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
     """
     if not signature.outputs:
         return graph, {}
+    if max(len(signature.inputs), len(signature.outputs)) > MAX_PORTS:
+        raise NotAPolicyError(
+            f"its signature has {len(signature.inputs)} inputs and {len(signature.outputs)} outputs",
+            why=f"no more than {MAX_PORTS} are converted; a policy has a few",
+            fix="save the policy alone",
+        )
     for key, tensor in (*signature.inputs.items(), *signature.outputs.items()):
         if node_of(tensor.name) not in graph:
             raise DamagedFileError(

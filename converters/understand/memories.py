@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types, run_kernel
+from converters.graph.shapes import elements_of, infer_types, run_kernel
 from converters.graph.types import FLOAT32, TensorType, static_shape
 from converters.understand.state_names import looks_like_state, part_of, stem_of
 from signatures.errors import GraphError
@@ -69,11 +70,14 @@ def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
     # tensor → the columns of the memory that it shows, as one row of it
     shown = {name: np.arange(shape[-1]).reshape((1,) * (len(shape) - 1) + (shape[-1],))}
     parts: dict[tuple[int, ...], str] = {}
+    allowance = Allowance()
     for node in graph.nodes:
         read = [shown[r] for r in node.inputs if r in shown]
         operands = [shown.get(r, types[r].constant) for r in node.inputs]
         known = [o for o in operands if o is not None]
         joined = op_of(node).moves == "join"
+        if read and not allowance.take(sum(r.size for r in read) + elements_of(types[node.name])):
+            return ()
         if read and op_of(node).moves and len(known) == len(operands):
             for index, columns in enumerate(_moved(node, known)):
                 shown[ref(node.name, index)] = columns

@@ -212,6 +212,26 @@ def test_a_loop_of_too_many_nodes_is_refused_before_they_are_made() -> None:
     assert [n.op for n in straight(wide(2), "x").nodes].count("Neg") == 1200
 
 
+def test_a_condition_of_two_numbers_is_refused() -> None:
+    with pytest.raises(GraphError, match="no single whole number"):
+        straight(loop(constant("limit", [1, 2])), "x")
+
+
+def test_an_array_that_is_handed_on_again_and_again_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was written before was copied at every writing: 16,384 of them in a loop took hours."""
+    flow = "array:1"
+    nodes: list[Any] = [placeholder("x", (2,)), constant("size", 9)]
+    nodes.append(node("array", "TensorArrayV3", "size", dtype=F32))
+    for i in range(9):
+        nodes += [constant(f"i{i}", i), node(f"w{i}", "TensorArrayWriteV3", "array", f"i{i}", "x", flow, T=F32)]
+        flow = f"w{i}"
+    nodes.append(node("read", "TensorArrayReadV3", "array", "i0", flow, dtype=F32))
+    assert straight(nodes, "read").nodes
+    monkeypatch.setattr("converters.graph.passes.unroll.MAX_HANDED_ON", 44)
+    with pytest.raises(NotAPolicyError, match="hand on more than 44"):
+        straight(nodes, "read")
+
+
 @pytest.mark.parametrize("inside", ["loop/x", "loop/next_x"])
 def test_an_output_inside_of_a_loop_is_refused(inside: str) -> None:
     with pytest.raises(GraphError, match="lies inside of it"):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from converters.keras.model import tensors_in
+from converters.runtimes.memory import Memory
 from converters.stable_baselines3.spaces import space_of
 from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError
+from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
 
 Config = dict[str, Any]
 
@@ -58,6 +61,82 @@ def test_models_that_call_one_another_twice(tmp_path: Path) -> None:
     assert read_source(written(doubling(3), tmp_path / "few")).policies()
     with pytest.raises(DamagedFileError, match="call one another too often"):
         read_source(written(doubling(25), tmp_path / "many")).policies()
+
+
+def activations(order: list[int], names: list[str], outputs: list[Any]) -> Config:
+    """A chain of activations, listed in another order."""
+    chain = [
+        layer("Activation", n, {"activation": "relu"}, called_with(tensor(b)))
+        for b, n in zip(["i", *names], names, strict=False)
+    ]
+    start = layer("InputLayer", "i", {"batch_shape": [None, 2]})
+    model = functional("m", [*(chain[n] for n in order), start], outputs)
+    model["config"]["output_layers"] = outputs
+    return model
+
+
+def test_layers_in_any_order_are_gone_through_once(tmp_path: Path) -> None:
+    """Backwards, 2,000 of them took 7 s: the list was looked through for each."""
+    names = [f"a{n}" for n in range(300)]
+    counted = 0
+
+    def count(value: Any) -> Any:
+        nonlocal counted
+        counted += 1
+        return tensors_in(value)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("converters.keras.network.tensors_in", count)
+        model = activations([*reversed(range(300))], names, [["a299", 0, 0]])
+        (policy,) = read_source(written(model, tmp_path / "m")).policies()
+    assert sum(n.op == "Relu" for n in policy.graph.nodes) == 300
+    assert counted < 10 * 300
+
+
+def test_outputs_of_one_name_have_an_end(tmp_path: Path) -> None:
+    """The third was called a_2 again and again, which was taken."""
+    model = activations([0, 1], ["a", "a_2"], [["a", 0, 0], ["a_2", 0, 0], ["a", 0, 0]])
+    with pytest.raises(ExportModelError, match="action"):
+        read_source(written(model, tmp_path / "m")).policies()
+
+
+def test_more_calls_of_layers_than_any_policy_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("converters.keras.network.MAX_NODES", 2)
+    model = activations([0, 1, 2], ["a", "b", "c"], [["c", 0, 0]])
+    with pytest.raises(NotAPolicyError, match="called 3 times"):
+        read_source(written(model, tmp_path / "m")).policies()
+
+
+def test_constants_that_are_not_in_the_file_are_counted_together(tmp_path: Path) -> None:
+    """An identity matrix of 8,192 rows was 512 MB on its way, for each node that asks for one."""
+    from onnx import TensorProto, helper
+
+    ends = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", 3]) for n in ("obs_0", "action")]
+    shape = helper.make_tensor("shape", TensorProto.INT64, [2], [8192, 8192])
+    nodes = [
+        helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
+        helper.make_node("EyeLike", ["zeros"], ["eye"]),
+        helper.make_node("ReduceSum", ["eye"], ["sum"], keepdims=0),
+        helper.make_node("Add", ["obs_0", "sum"], ["action"]),
+    ]
+    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [shape])
+    (tmp_path / "policy.onnx").write_bytes(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)]).SerializeToString()
+    )
+    with pytest.raises(UnsupportedOpError, match="makes a constant of 67108864 elements"):
+        read_source(tmp_path / "policy.onnx")
+
+
+def test_a_child_is_allowed_for_the_models_that_it_has() -> None:
+    memory = Memory(os.getpid())
+    memory._base, limits = 0, list[int]()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("converters.runtimes.memory._limit", lambda pid, bound: limits.append(bound))
+        for _ in range(3):
+            memory.allow(1 << 20)
+            memory.allow_for_request(0)
+            memory.release(1 << 20)
+    assert len(limits) == 1
 
 
 def test_a_cropping_that_leaves_nothing(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ def top_k(b: Builder, x: str, k: int, *, largest: bool = True) -> tuple[str, str
         place = b.add("ArgMax" if largest else "ArgMin", [x, b.ints(rank - 1, "axis")], output_type=INT64)
         return best, b.expand_dims(place, rank - 1)
     _bounded(length, length)
+    b.room(length * length)
     mine, other = b.expand_dims(x, rank), b.expand_dims(x, rank - 1)
     better = b.add("Greater" if largest else "Less", [other, mine])
     earlier = b.const(np.tril(np.ones((length, length), bool), -1), "earlier")
@@ -45,6 +46,7 @@ def cumulated(b: Builder, x: str, *, exclusive: bool = False, reverse: bool = Fa
     """The sums (or products) of the last axis up to each element, or from it on."""
     length, rank = b.length(x, -1), b.rank(x)
     _bounded(length, length)
+    b.room(length * length)
     whole = np.ones((length, length), bool)
     mask = np.triu(whole, int(exclusive)) if reverse else np.tril(whole, -int(exclusive))
     nothing = b.number(x, 1 if product else 0, "nothing")

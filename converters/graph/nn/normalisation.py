@@ -83,6 +83,7 @@ def group(b: Builder, x: str, groups: int, scale: str, bias: str, epsilon: float
 def local(b: Builder, x: str, size: int, alpha: float, beta: float, bias: float) -> str:
     """X/(bias + alpha/size·Σx²)^beta, the squares summed over ``size`` neighbouring channels of x [B, C, …]."""
     channels, axis = b.length(x, 1), 1
+    b.room(channels * channels)
     number = np.arange(channels)
     away = number[:, None] - number[None, :]
     near = (away >= -((size - 1) // 2)) & (away <= size // 2)  # [channel that is summed, channel]

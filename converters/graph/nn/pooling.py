@@ -39,7 +39,7 @@ def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pa
         value, *rest = _under(b, padded(b, image, [(0, 0), *window.pads, (0, 0)]), window)
         for part in rest:
             value = b.add("Add", [value, part])
-        count = _counts(lengths, window, counted or ((0, 0), (0, 0))).astype(FLOAT32)
+        count = _counts(b, lengths, window, counted or ((0, 0), (0, 0))).astype(FLOAT32)
         return b.add("RealDiv", [value, b.const(count[None, :, :, None], "count")])
     if counted is None or not any(map(any, window.pads)):
         if window.same or not any(map(any, window.pads)):
@@ -48,7 +48,7 @@ def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pa
     lengths = [b.length(image, axis) for axis in (1, 2)]
     if not any(map(any, counted)) and window.pads == window.same_pads(lengths):
         return b.add("AvgPool", [image], **_attrs(window, "SAME"))
-    counts = _counts(lengths, window, counted)
+    counts = _counts(b, lengths, window, counted)
     data = padded(b, image, [(0, 0), *window.pads, (0, 0)])
     mean = b.add("AvgPool", [data], **_attrs(window, padding))
     factor = (window.size[0] * window.size[1] / counts).astype(FLOAT32)
@@ -78,13 +78,15 @@ def _attrs(window: Window, padding: str) -> dict[str, Any]:
     return {"ksize": (1, *window.size, 1), "strides": (1, *window.strides, 1), "padding": padding}
 
 
-def _counts(lengths: Sequence[int], window: Window, counted: tuple[Pair, Pair]) -> np.ndarray:
+def _counts(b: Builder, lengths: Sequence[int], window: Window, counted: tuple[Pair, Pair]) -> np.ndarray:
     """How many elements each window has that count: the image's, and the padding's in ``counted``."""
     sums = []
     for length, size, gap, stride, (before, after), (first, last) in zip(
         lengths, window.size, window.dilations, window.strides, window.pads, counted, strict=True
     ):
-        line = np.zeros(before + length + after)
+        whole = before + length + after
+        b.room(whole + max(whole - (size - 1) * gap, 0) // stride * size)
+        line = np.zeros(whole)
         line[before - first : before + length + last] = 1
         windows = np.lib.stride_tricks.sliding_window_view(line, (size - 1) * gap + 1)
         sums.append(windows[::stride, ::gap].sum(axis=1))

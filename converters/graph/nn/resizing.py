@@ -44,6 +44,7 @@ def resampled(b: Builder, x: str, axis: int, length: int, scale: float, how: Res
     before = b.length(x, axis)
     if length < 1 or before < 1 or before * length > _MAX_WEIGHTS:
         raise UnsupportedOpError(f"it makes {length} elements of {before}", why="the model is damaged")
+    b.room(before * length)
     places = _places(before, length, scale, how)
     left_out = _outside(places, before, how)
     if how.mode == "nearest":

@@ -200,10 +200,12 @@ def type_attr(name: str = "T", derive: str = "in:0") -> Attr:
 # ------------------------------------------------------------------ helpers for infer rules
 
 
-def same_as(position: int = 0) -> Infer:
-    """Result has the dtype and shape of input ``position``."""
+def same_as(position: int = 0, *, count: int | None = None) -> Infer:
+    """Result has the dtype and shape of input ``position`` (of ``count``)."""
 
     def infer(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+        if count is not None and len(args) != count:
+            raise shape_error(node, args, f"it takes {count} inputs")
         return [TensorType(args[position].dtype, args[position].shape)]
 
     return infer

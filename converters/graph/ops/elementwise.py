@@ -69,7 +69,7 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
     lowering = direct(lower) if isinstance(lower, str) else lower
-    return OpDef(name, same_as(0), kernel, lowering, (T,), elementwise=True, **traits)
+    return OpDef(name, same_as(0, count=1), kernel, lowering, (T,), elementwise=True, **traits)
 
 
 def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
@@ -365,7 +365,14 @@ UNARY = (
         activation="softplus",
     ),
     _unary("Softsign", _wide(lambda x: x / (1 + np.abs(x))), "Softsign", tfjs=_tfjs_softsign, activation="softsign"),
-    OpDef("LogicalNot", same_as(0), _plain(np.logical_not), direct("Not"), precision="exact", elementwise=True),
+    OpDef(
+        "LogicalNot",
+        same_as(0, count=1),
+        _plain(np.logical_not),
+        direct("Not"),
+        precision="exact",
+        elementwise=True,
+    ),
     OpDef(
         "LeakyRelu",
         same_as(0),

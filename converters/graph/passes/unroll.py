@@ -7,27 +7,31 @@ cells go the same way, as do ``tf.cond`` branches whose predicate is a constant.
 
 Precondition: normalised graph, ``sequence_length`` constant. Postcondition: no control flow is left. Raises
 UnsupportedOpError where a predicate is not constant or a loop runs for more than ``MAX_TURNS``; NotAPolicyError where
-the turns are more than ``MAX_NODES`` together.
+the turns are more than ``MAX_NODES`` together, or write more than ``MAX_HANDED_ON``.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
+from converters.graph.allowance import Allowance
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
-from converters.graph.shapes import Types, infer_types, run_kernel
-from converters.graph.types import INT32
+from converters.graph.shapes import Types, add_types, infer_types
+from converters.graph.types import INT32, Symbols, of_array
 from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 from signatures.records import dataclass
 
 MAX_TURNS = 64
 #: Of a policy, before its loops are unrolled and after.
 MAX_NODES = 1 << 14
+#: Elements of tensor arrays that may be handed on, from each writing to the next: an array of 64 has 2,080.
+MAX_HANDED_ON = 1 << 22
 
 
 #: How many inputs each has; a Merge has any number.
@@ -44,15 +48,9 @@ class _Flow:
     """The content of a tensor array at one point of the program: index → tensor of the new graph."""
 
     size: int | None
-    items: tuple[tuple[int, str], ...] = ()
+    items: Mapping[int, str] = field(default_factory=dict)
     #: the tensor whose rows are the elements (TensorListFromTensor)
     source: str = ""
-
-    def get(self, index: int) -> str | None:
-        return dict(self.items).get(index)
-
-    def with_item(self, index: int, value: str) -> _Flow:
-        return replace(self, items=tuple({**dict(self.items), index: value}.items()))
 
 
 class _DeadError(Exception):
@@ -82,6 +80,8 @@ class _Unroller:
         self.memo: dict[tuple[str, int | None], str | _Flow | None] = {}
         self.known: dict[str, np.ndarray | None] = {}
         self.turns: dict[str, int] = {}
+        self.symbols, self.allowance = Symbols(), Allowance()
+        self.handed_on = 0
         self.predicates = {self.frames[n.name]: n for n in graph.nodes if n.op == "LoopCond" and n.name in self.frames}
 
     def run(self) -> Graph:
@@ -169,7 +169,7 @@ class _Unroller:
     def _switch(self, node: Node, index: int, turn: int | None) -> str | _Flow:
         if self.graph.producer(node.inputs[1]).op == "LoopCond":
             return self.tensor(node.inputs[0], turn)
-        predicate = self.constant(self.plain(node.inputs[1], turn))
+        predicate = self._number(node, node.inputs[1], turn)
         if predicate is None:
             raise _undecided(node, "the condition of a branch")
         if bool(predicate) != bool(index):
@@ -193,7 +193,7 @@ class _Unroller:
             for turn in range(MAX_TURNS + 1):
                 for variable in variables:  # turn by turn: no chain of calls is longer than a body
                     self.tensor(variable, turn)
-                predicate = self.constant(self.plain(condition.inputs[0], turn))
+                predicate = self._number(condition, condition.inputs[0], turn)
                 if predicate is None:
                     raise _undecided(condition, "a loop's condition")
                 if not bool(predicate):
@@ -211,8 +211,7 @@ class _Unroller:
     # ---- tensor arrays
 
     def _array(self, node: Node, index: int, turn: int | None) -> _Flow:
-        size = self.constant(self.plain(node.inputs[0], turn))
-        return _Flow(None if size is None else int(size))
+        return _Flow(self._number(node, node.inputs[0], turn))
 
     def _flow(self, reference: str, turn: int | None) -> _Flow:
         flow = self.tensor(reference, turn)
@@ -220,11 +219,22 @@ class _Unroller:
             raise unsupported([self.graph.producer(reference)])
         return flow
 
+    def _number(self, node: Node, reference: str, turn: int | None) -> int | None:
+        """A condition, a size; None where it is not known. Raises GraphError where it is no whole number."""
+        value = self.constant(self.plain(reference, turn))
+        if value is None:
+            return None
+        if value.size != 1 or value.dtype.kind not in "biu":
+            raise _broken(node, f"{reference!r} is {value.dtype} {list(value.shape)}, no single whole number")
+        return int(value.item())
+
     def _indices(self, node: Node, reference: str, turn: int | None) -> list[int]:
         value = self.constant(self.plain(reference, turn))
         if value is None:
             raise _undecided(node, "the indices of a tensor array")
         self._room(value.size)  # each becomes nodes
+        if value.ndim > 1 or value.dtype.kind not in "iu":
+            raise _broken(node, f"{reference!r} is {value.dtype} {list(value.shape)}, no row of indices")
         return [int(i) for i in np.atleast_1d(value)]
 
     def _index(self, node: Node, turn: int | None) -> int:
@@ -237,7 +247,7 @@ class _Unroller:
         _, indices, value, flow_in = node.inputs
         flow, source = self._flow(flow_in, turn), self.plain(value, turn)
         for position, i in enumerate(self._indices(node, indices, turn)):
-            flow = flow.with_item(i, self._element(source, position, f"{node.name}/{i}"))
+            flow = self._with(flow, i, self._element(source, position, f"{node.name}/{i}"))
         return flow
 
     def _element(self, source: str, position: int, name: str) -> str:
@@ -254,7 +264,7 @@ class _Unroller:
         position = self._index(node, turn)
         flow = self._flow(node.inputs[3], turn)
         value = self.plain(node.inputs[2], turn)
-        return flow.with_item(position, value)
+        return self._with(flow, position, value)
 
     def _gather(self, node: Node, index: int, turn: int | None) -> str:
         flow = self._flow(node.inputs[2], turn)
@@ -267,9 +277,20 @@ class _Unroller:
             raise _undecided(node, "the size of a tensor array")
         return self._const(np.array(flow.size, INT32), f"{node.name}/size")
 
+    def _with(self, flow: _Flow, index: int, value: str) -> _Flow:
+        """The array with one more element. Raises NotAPolicyError."""
+        self.handed_on += len(flow.items) + 1
+        if self.handed_on > MAX_HANDED_ON:
+            raise NotAPolicyError(
+                f"the graph's tensor arrays hand on more than {MAX_HANDED_ON} elements",
+                why="each writing hands on what was written before; a policy's arrays have a row for each turn",
+                fix="give the policy alone",
+            )
+        return replace(flow, items={**flow.items, index: value})
+
     def _item(self, node: Node, flow: _Flow, index: int) -> str:
         """An element of an array, which was written, or is a row of what the array was made of."""
-        item = flow.get(index)
+        item = flow.items.get(index)
         if item is None and flow.source and index >= 0:
             key = (f"{flow.source}[{index}]", None)
             if key not in self.memo:
@@ -282,8 +303,7 @@ class _Unroller:
     # ---- tensor lists, the arrays of TensorFlow 2: values, where a tensor array is a resource with a flow
 
     def _list_reserve(self, node: Node, index: int, turn: int | None) -> _Flow:
-        size = self.constant(self.plain(node.inputs[1], turn))
-        return _Flow(None if size is None else int(size))
+        return _Flow(self._number(node, node.inputs[1], turn))
 
     def _list_fromtensor(self, node: Node, index: int, turn: int | None) -> _Flow:
         known = self.types.get(node.inputs[0])
@@ -294,7 +314,8 @@ class _Unroller:
         return self._item(node, self._flow(node.inputs[0], turn), self._index(node, turn))
 
     def _list_setitem(self, node: Node, index: int, turn: int | None) -> _Flow:
-        return self._flow(node.inputs[0], turn).with_item(self._index(node, turn), self.plain(node.inputs[2], turn))
+        flow = self._flow(node.inputs[0], turn)
+        return self._with(flow, self._index(node, turn), self.plain(node.inputs[2], turn))
 
     def _list_stack(self, node: Node, index: int, turn: int | None) -> str:
         flow = self._flow(node.inputs[0], turn)
@@ -350,7 +371,9 @@ class _Unroller:
         operands = [self.constant(r) for r in node.inputs]
         if not operands or any(o is None for o in operands) or not op_of(node).foldable:
             return None
-        return run_kernel(op_of(node), node, [o for o in operands if o is not None])[index]
+        types = {r: of_array(o) for r, o in zip(node.inputs, operands, strict=True) if o is not None}
+        add_types(types, node, self.symbols, self.allowance)
+        return types[ref(name, index)].constant
 
 
 def _alive(value: str | _Flow | None) -> str | _Flow:

@@ -31,6 +31,7 @@ def _hidden(b: Builder, scores: str, mask: str) -> str:
 def _causal(b: Builder, scores: str) -> str:
     """Scores [B, …, T, S] without those of later steps."""
     rows, columns = b.length(scores, -2), b.length(scores, -1)
+    b.room(rows * columns)
     later = np.triu(np.full((rows, columns), _HIDDEN, FLOAT32), 1)
     return b.add("Add", [scores, b.const(later.reshape((1,) * (b.rank(scores) - 2) + later.shape), "later")])
 

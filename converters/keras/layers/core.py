@@ -122,6 +122,7 @@ def _up_sampling(step: Step) -> str:
         length = step.net.length(value, axis)
         if count * length > 1 << 16:
             raise UnsupportedOpError(f"it makes {count * length} rows or columns")
+        step.net.room(count * length)
         if count != 1:
             value = taken(step.net, value, np.repeat(np.arange(length), count).tolist(), axis)
     return value

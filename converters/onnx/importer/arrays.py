@@ -39,8 +39,7 @@ def _constant_of_shape(op: Op, net: Importer) -> str:
 
 def _eye_like(op: Op, net: Importer) -> str:
     rows, columns = net.length(op.need(0), 0), net.length(op.need(0), 1)
-    if rows * columns > MAX_ELEMENTS:
-        raise op.refused(f"it makes {rows}×{columns} elements")
+    net.room(rows * columns)
     dtype = op.dtype("dtype", 1) if "dtype" in op.attrs else net.dtype(op.need(0))
     return net.const(np.eye(rows, columns, op.integer("k", 0)).astype(dtype), "eye")
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from converters.graph.nn.shaping import padded, taken
 from converters.graph.types import INT32, INT64, Dim
-from converters.onnx.importer.arrays import MAX_ELEMENTS
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
 
@@ -171,18 +170,19 @@ def _pad(op: Op, net: Importer) -> str:
     pairs = dict(zip(axes, zip(pads[: len(axes)], pads[len(axes) :], strict=True), strict=True))
     if mode in ("reflect", "edge", "wrap"):
         for axis in (a for a in axes if any(pairs[a])):
-            x = taken(net, x, _mirrored(op, net.length(x, axis), pairs[axis], mode), axis)
+            x = taken(net, x, _mirrored(op, net, net.length(x, axis), pairs[axis], mode), axis)
         return x
     if mode != "constant":
         raise op.refused(f"mode {mode!r}", "the model is damaged")
     return padded(net, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
 
 
-def _mirrored(op: Op, length: int, pair: tuple[int, int], mode: str) -> list[int]:
+def _mirrored(op: Op, net: Importer, length: int, pair: tuple[int, int], mode: str) -> list[int]:
     """Which elements of an axis stand where once it is padded with its own; a negative padding cuts off."""
     before, after = (max(n, 0) for n in pair)
-    if before + after > MAX_ELEMENTS or not length:
-        raise op.refused(f"it pads an axis of {length} with {before + after} elements", "the model is damaged")
+    if not length:
+        raise op.refused("it pads an axis of no elements with its own", "the model is damaged")
+    net.room(before + length + after)
     cut = np.arange(length)[max(-pair[0], 0) : length - max(-pair[1], 0)]
     padded: list[int] = np.pad(cut, (before, after), mode=cast(Literal["reflect", "edge", "wrap"], mode)).tolist()
     return padded
@@ -210,8 +210,7 @@ def _trilu(op: Op, net: Importer) -> str:
     x, operand = op.need(0), op.get(1)
     k = 0 if operand is None else int(net.needed_constant(operand, "the diagonal").reshape(-1)[0])
     rows, columns = net.length(x, -2), net.length(x, -1)
-    if rows * columns > MAX_ELEMENTS:
-        raise op.refused(f"it has {rows}×{columns} elements")
+    net.room(rows * columns)
     whole = np.ones((rows, columns), bool)
     mask = np.triu(whole, k) if op.integer("upper", 1) else np.tril(whole, k)
     return net.where(net.const(mask, "triangle"), x, net.add("ZerosLike", [x]))
