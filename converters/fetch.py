@@ -70,9 +70,9 @@ def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> byt
             raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
         if status.st_size > most:
             raise SourceError(
-                f"has {status.st_size} bytes, and no file of {(most + 1) >> 30} GiB or more is read",
+                f"has {status.st_size} bytes, and no more than {most} are read",
                 where=str(path),
-                fix="give the frozen graph of the policy; it has some hundred kilobytes",
+                fix="give the policy alone; it has some hundred kilobytes, settings a few",
             )
         data = path.read_bytes()
     except FileNotFoundError as error:

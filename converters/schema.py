@@ -178,8 +178,15 @@ def dtype_of(number: int) -> np.dtype:
 
 
 def dtype_number(dtype: np.dtype) -> int:
-    """The DataType of a numpy dtype."""
-    return _NUMBERS[np.dtype(np.bytes_) if dtype.kind == "S" else dtype]
+    """The DataType of a numpy dtype. Raises DamagedFileError for those that no policy has: resources are objects."""
+    number = _NUMBERS.get(np.dtype(np.bytes_) if dtype.kind == "S" else dtype)
+    if number is None:
+        raise DamagedFileError(
+            f"a tensor of {dtype} is given or taken",
+            why="policies take and give numbers; a signature may name a variable's handle",
+            fix="save the policy with tensors alone as inputs and outputs",
+        )
+    return number
 
 
 def dtype_name(dtype: np.dtype) -> str:

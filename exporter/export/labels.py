@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from converters.policy import Policy
+from exporter.options_file import read_options
 from signatures.errors import UsageError
 from signatures.labels import checked
 
 Labels = Path | str | Mapping[str, Any]
-_MOST_BYTES = 1 << 20
 
 
 def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
     """What a file of labels holds (TOML where its name ends so, else JSON). Raises UsageError."""
     if given is None or isinstance(given, Mapping):
         return given
-    import tomllib
-
     path = Path(given)
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise UsageError(f"--labels {path}: the file is larger than 1 MiB", fix="give a file of names")
-        text = path.read_text(encoding="utf-8-sig")
-        content = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
-    except OSError as error:
-        raise UsageError(f"--labels {path}: cannot be read", why=error.strerror, fix="check the path") from error
+        content = read_options(path, f"--labels {path}", toml=path.suffix.lower() == ".toml")
     except (ValueError, RecursionError) as error:  # a JSON, TOML or UTF-8 error is a ValueError
         raise UsageError(f"--labels {path}: is no JSON or TOML", why=str(error)[:200], fix="mend the file") from error
     if not isinstance(content, dict):

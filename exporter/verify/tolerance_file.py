@@ -13,14 +13,13 @@ The last entry that covers a comparison decides.
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from converters.formats import WRITTEN
 from converters.runtimes.registry import RUNTIMES
+from exporter.options_file import read_options
 from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError
 
@@ -33,12 +32,7 @@ _FIX = "each [[tolerance]] has a reason, atol or rtol or both, and any of output
 def read_tolerances(path: Path) -> tuple[ToleranceRule, ...]:
     """The rules of a file. Raises UsageError that names the entry where one is not complete."""
     try:
-        text = path.read_text(encoding="utf-8")
-        content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise UsageError(
-            "cannot be read", where=str(path), why=error.strerror, fix="give a file that is there"
-        ) from error
+        content = read_options(path, str(path), toml=path.suffix.lower() != ".json")
     except (ValueError, RecursionError) as error:
         raise UsageError(
             "is neither TOML nor JSON", where=str(path), why=str(error), fix="a name that ends in .json is read as JSON"

@@ -165,7 +165,10 @@ def protobuf(data: bytes, random: Random, whole: Callable[[bytes], object] | Non
     if random.random() < 0.04:
         return damaged(data, random)
     for _ in range(8):
-        fields = tree(data)
+        try:
+            fields = tree(data)
+        except ValueError:  # what was damaged before
+            return damaged(data, random)
         for _ in range(random.choice((1, 1, 1, 2, 2, 3, 6))):
             places = list(_all(fields))
             if places:

@@ -33,6 +33,22 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "export, its reports": ("FILE", "-o", "OUT", "--verify", "numpy", "--html", "OUT/a.html", "--junit", "OUT/a.xml"),
     "export, Markdown": ("FILE", "-o", "OUT", "--verify", "numpy", "--markdown", "-", "-v"),
     "export, names kept": ("FILE", "-o", "OUT", "--verify", "numpy", "--names", "source", "-v"),
+    "export, tolerances": (
+        "FILE",
+        "-o",
+        "OUT",
+        "--verify",
+        "numpy",
+        "--tolerances",
+        "TOL",
+        "--html",
+        "OUT/a.html",
+        "-v",
+    ),
+    "export, labels": ("FILE", "-o", "OUT", "--verify", "none", "--labels", "LABELS", "-v"),
+    "a list of sources": ("LIST", "-o", "OUT", "--verify", "none", "--html", "OUT/a.html", "--junit", "OUT/a.xml"),
+    "a list, as JSON": ("LIST", "-o", "OUT", "--verify", "none", "--json"),
+    "a recording": ("FILE", "-o", "OUT", "--verify", "numpy", "--golden", "NPZ"),
     "a file that is not there": ("inspect", f"OUT/{NAME}"),
     "an op that nothing knows": ("FOREIGN", "-o", "OUT"),
     "an option": ("FILE", f"--{NAME}"),
@@ -52,6 +68,13 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     foreign = [*continuous_policy(), node(NAME, f"Odd{NAME}", "mu")]
     next(n for n in foreign if n.name == "action").input[0] = NAME
     (folder / "foreign.bytes").write_bytes(graph_bytes(foreign))
+    rule = {"output": NAME, "atol": 1, "reason": NAME}
+    (folder / "tolerances.json").write_text(json.dumps({"tolerance": [rule, {"atol": 1, "reason": NAME}]}))
+    (folder / "labels.json").write_text(json.dumps({"actions": {NAME: [NAME]}, NAME: NAME}))
+    line = NAME.replace("\n", "\\n").replace("\r", "").replace("\u2028", "")
+    lines = [folder / "policy.bytes", f"{line}.onnx", f"{folder}/{line}", f"https://{line}@example.invalid/{line}"]
+    (folder / "list.txt").write_text("\n".join(map(str, lines)), encoding="utf-8")
+    np.savez(folder / "recorded.npz", **{NAME: np.ones(3, np.float32)})
     weights = numpy_helper.from_array(np.ones((3, 2), np.float32), NAME)
     graph = helper.make_graph(
         [helper.make_node("MatMul", ["obs_0", NAME], [f"{NAME}!"], NAME), helper.make_node(NAME, [f"{NAME}!"], ["a"])],
@@ -76,6 +99,7 @@ def test_no_command_says_or_writes_what_acts(
     for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(processes))
     places = {"FILE": "policy.bytes", "ONNX": "policy.onnx", "FOREIGN": "foreign.bytes"}
+    places |= {"TOL": "tolerances.json", "LABELS": "labels.json", "LIST": "list.txt", "NPZ": "recorded.npz"}
     arguments = [str(given / places[a]) if a in places else a.replace("OUT", str(tmp_path)) for a in COMMANDS[what]]
     ran: Ran = export_model(*arguments)
     clean(ran.out)

@@ -144,6 +144,12 @@ def test_a_signature_of_more_outputs_than_any_policy_has_is_refused(
         read_source(path)
 
 
+def test_a_tensor_of_no_number_is_refused_by_its_dtype() -> None:
+    """A signature may name a variable's handle, whose dtype is numpy's object: a KeyError of the last net's."""
+    with pytest.raises(DamagedFileError, match="a tensor of object"):
+        schema.dtype_number(np.dtype(object))
+
+
 @pytest.mark.parametrize("what", ["inputs", "outputs"])
 def test_more_inputs_or_outputs_than_any_policy_has_are_refused(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
