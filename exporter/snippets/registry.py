@@ -91,7 +91,9 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
         raise BundleError(
             f"has no {needed}, which {chosen[0].title} needs",
             where=str(bundle.folder),
-            fix="export the policy again with all formats (the default of --to)",
+            fix="export the policy again with all formats (the default of --to)"
+            if bundle.made_for is None
+            else f"it was made for {bundle.made_for}: --for {bundle.made_for}, or export the policy again for another",
         )
     return [Snippet(t, t.render(bundle)) for t in chosen if t.name not in lacking], lacking
 

@@ -200,13 +200,17 @@ def test_the_last_action_goes_with_the_memory_where_nothing_feeds_it(tmp_path: P
         node("kept", "Add", "logits", "recurrent_in"),
         node("scores", "Add", "kept", "last"),
     ]
-    policy = drawing(tmp_path / "last.bytes", *inputs, scores=scores, given=[node("recurrent_out", "Tanh", "scores")])
+    path = tmp_path / "last.bytes"
+    policy = drawing(path, *inputs, scores=scores, given=[node("recurrent_out", "Tanh", "scores")])
     pair = Pair.of(policy, profile("tfsharp-0.2"))
     assert {s.name: s.shape for s in pair.dressed.signature.inputs} == {"state": (None, 3), "recurrent_in": (None, 5)}
     assert any("the Memory Size of the brain is 5" in note for note in pair.dressed.signature.notes)
     assert pair.difference(3, 0) is None
     fed = Pair.of(policy, profile("tfsharp-0.3")).dressed.signature
     assert fed.has_input("prev_action") and fed.memory is not None and fed.memory.size == 4
+    (made,) = export_model(path, tmp_path / "out", for_="tfsharp-0.2", verify="none")
+    asked = commands.export_model("verify", made.folder, "--runtimes", "numpy", "--allow-unverified")
+    assert asked.status == 0, asked.err
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,8 @@ class Generation:
     branches: bool = False
     #: prev_action is fed
     previous: bool = True
+    #: what is wrong with its pictures
+    pictures: str | None = None
     #: memory_size is read before the first step; sequence_length is fed whether the graph has it or not
     memory_constant: bool = True
     #: the four constants of 0.6, and log-probabilities as the action
@@ -81,6 +83,8 @@ def _take_observations(dressing: Dressing, generation: Generation) -> dict[str, 
         name = f"{generation.visual}{number}"
         feeding.take_image_rows(dressing, name, spec)
         images[name] = {"layout": "NHWC", "range": [0, 1], "from_bytes": "divide by 255"}
+    if images and generation.pictures is not None:
+        dressing.notes.append(f"pictures are taken from 0 to 1; {generation.pictures}")
     vectors = [s for s in signature.observations if s.role is Role.VECTOR]
     if len(vectors) == 1 and np.dtype(vectors[0].dtype).kind in "iu":
         # a discrete state space is fed as int32 [B, 1] up to 0.4
