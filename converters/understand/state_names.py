@@ -21,13 +21,17 @@ _CELL_WORDS, _HIDDEN_WORDS = frozenset(("c", "cx", "cell", "cells")), frozenset(
 
 def looks_like_state(name: str) -> bool:
     """Whether an output's name says that it is fed back at the next step."""
-    return bool(_STATE_WORDS & set(_words(name)))
+    return bool(_STATE_WORDS & {w.rstrip("0123456789") for w in _words(name)})
 
 
 def _words(name: str) -> list[str]:
-    """``"stateOut_0"`` as state, out, 0; ``"h0"`` and ``"hn"`` as h (PyTorch's names for a step's two ends)."""
+    """``"stateOut_0"`` as state, out, 0; ``"h0"`` and ``"hn"`` as h (PyTorch's names for a step's two ends), but
+    ``"h1_in"`` as h1, in: the first of several.
+    """
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", node_of(name).rsplit("/", 1)[-1])
     words = [w for w in re.split(r"[^a-z0-9]+", base.lower()) if w]
+    if _ENDS & {*words}:
+        return words
     return [w[0] if w in ("h0", "c0", "hn", "cn", "h1", "c1", "ht", "ct") else w for w in words]
 
 

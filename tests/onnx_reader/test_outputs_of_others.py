@@ -97,6 +97,38 @@ def test_a_state_without_its_input_is_an_error(tmp_path: Path) -> None:
     assert [s.name for s in result.policy.signature.outputs if s.role is Role.OTHER] == ["h_out"]
 
 
+@pytest.mark.parametrize("given", ["kept", "s_1", "1"])
+def test_an_output_that_is_made_of_an_input_and_has_its_shape_is_asked_for(given: str, tmp_path: Path) -> None:
+    """No name says so, but it may be the memory: dropped or kept as another output, the policy forgets."""
+    path = cell(tmp_path / "cell.onnx", given, "s")
+    for named in ({}, {"action": "action"}):  # naming the action leaves the rest out
+        with pytest.raises(SignatureError, match=rf"'{given}' may be a memory: .* \(obs, s\)"):
+            export_model(path, tmp_path / "out", outputs=named, verify="none")
+    (kept,) = export_model(
+        path, tmp_path / "out", inputs={"s": "memory_in"}, outputs={given: "memory_out"}, verify="none"
+    )
+    assert kept.policy.signature.memory is not None
+    (other,) = export_model(path, tmp_path / "out", outputs={given: "other"}, verify="none")
+    assert [s.role for s in other.policy.signature.inputs] == [Role.VECTOR, Role.VECTOR]
+
+
+def test_numbered_memories_are_told_apart(tmp_path: Path) -> None:
+    """h1 and h2, given in the other order: both are fed back, each to its own."""
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["x"]),
+        *(helper.make_node("Add", ["x", "h1_in"], ["a"]), helper.make_node("Tanh", ["a"], ["h1_out"])),
+        *(helper.make_node("Add", ["h1_out", "h2_in"], ["b"]), helper.make_node("Tanh", ["b"], ["h2_out"])),
+        helper.make_node("MatMul", ["h2_out", "w"], ["action"]),
+    ]
+    inputs: dict[str, list[int | str]] = {n: ["batch", 3] for n in ("obs", "h1_in", "h2_in")}
+    policy = only(model(tmp_path / "two.onnx", inputs, nodes, ["action", "h2_out", "h1_out"]))
+    memory = np.array([[0.1, 0.2, 0.3, -1, -2, -3]], np.float32)
+    feeds = {"state": np.ones((1, 3), np.float32), "recurrent_in": memory}
+    out = run_graph(policy.graph, feeds, ["recurrent_out"])["recurrent_out"]
+    first = np.tanh(np.ones((1, 3)) @ WEIGHTS + memory[:, :3])
+    np.testing.assert_allclose(out, np.concatenate([first, np.tanh(first + memory[:, 3:])], 1), rtol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["sigma", "std", "action_std"])
 @pytest.mark.parametrize("shape", [(3,), (1, 3)])
 def test_a_spread_that_is_a_parameter_of_the_network_is_kept_for_every_row(
