@@ -138,6 +138,7 @@ class Format:
     - ``vetted`` copies an artefact that anyone may have made to an empty folder, as far as a runtime may be given it:
       what the wanted nodes (of a graph that any node can be asked of) or signatures need, no op that does more than
       compute, no file from elsewhere.
+    - ``held`` gives the contract that an artefact of ours embeds, as text or as JSON's values (None: it has none).
     - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
       once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
@@ -159,6 +160,7 @@ class Format:
     main: str = ""
     beside: str = ""
     default: bool = False
+    held: Callable[[Path], Any] | None = None
     ports: Callable[[Path], Ports] | None = None
     vetted: Callable[[Path, Sequence[str], Path], Path] | None = None
     runtimes: tuple[str, ...] = ()

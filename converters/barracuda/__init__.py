@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from converters.format import Format, WriteOptions
 
@@ -42,6 +43,12 @@ def _answers(signature: PolicySignature) -> list[str]:
     return answered(signature)
 
 
+def _held(path: Path) -> Any:
+    from converters.barracuda.writer import contract_text
+
+    return contract_text(path.read_bytes())
+
+
 FORMATS = (
     Format(
         key="nn",
@@ -50,6 +57,7 @@ FORMATS = (
         read=_read,
         write=_write,
         main="{name}.nn",
+        held=_held,
         runtimes=("numpy",),
         answers=_answers,
     ),

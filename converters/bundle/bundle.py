@@ -152,17 +152,18 @@ class Bundle:
         self.verify_contract(embedded(whole) or "")
         return without_contract(whole)
 
-    def verify_contract(self, text: str | bytes) -> None:
-        """Raise BundleError where an artefact embeds another contract than policy.json."""
+    def verify_contract(self, held: Any) -> None:
+        """Raise BundleError where an artefact embeds another contract (text, or JSON's values) than policy.json."""
         try:
-            same = json_of(text) == {k: v for k, v in self.content.items() if k != "files"}
+            content = json_of(held) if isinstance(held, str | bytes) else held
+            same = content == {k: v for k, v in self.content.items() if k != "files"}
         except FieldError:
             same = False
         if not same:
             raise BundleError(
                 "has been changed since it was exported",
                 where=str(self.folder / POLICY),
-                why="it is not the contract that the bundle's own graph embeds",
+                why="it is not the contract that the artefact embeds",
                 fix=_AGAIN,
             )
 

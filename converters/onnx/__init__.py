@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from converters.format import Format, Ports, WriteOptions
 
@@ -33,6 +33,12 @@ def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     from converters.onnx.writer import write
 
     return write(policy, options)
+
+
+def _held(path: Path) -> Any:
+    from converters.onnx.source import held
+
+    return held(path)
 
 
 def _ports(path: Path) -> Ports:
@@ -70,6 +76,7 @@ FORMATS = (
         beside="{name}.onnx.data",
         default=True,
         narrow=True,
+        held=_held,
         ports=_ports,
         vetted=_vetted,
         inner=_inner,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from converters.format import Format, Ports, WriteOptions
 
@@ -37,6 +37,12 @@ def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     return write(policy, options)
 
 
+def _held(path: Path) -> Any:
+    from converters.saved_model.source import held
+
+    return held(path)
+
+
 def _ports(path: Path) -> Ports:
     from converters.saved_model.ports import ports
 
@@ -66,6 +72,7 @@ FORMATS = (
         main="saved_model",
         default=True,
         narrow=True,
+        held=_held,
         ports=_ports,
         vetted=_vetted,
         inner=_inner,

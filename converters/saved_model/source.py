@@ -6,15 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.bundle.embed import facts_of, recalled
+from converters.bundle.embed import embedded, facts_of, recalled
 from converters.checkpoint.definition import with_values
 from converters.checkpoint.freeze import freeze
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import Saved as Place
 from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
 from converters.content import Content
-from converters.fetch import Fetched
+from converters.fetch import Fetched, read_bytes
 from converters.frozen_graph import source as frozen_graph
+from converters.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
@@ -45,6 +46,12 @@ def read(given: Fetched) -> list[SourceModel]:
         graph, facts = exposed(frozen.graph, frozen.signature, _notes(saved))
     original = OriginalRun("tensorflow", folder, definition=frozen.definition, detached=saved.detached)
     return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
+
+
+def held(folder: Path) -> str | None:
+    """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
+    saved = read_saved_model(read_bytes(folder / FILE))
+    return embedded(from_graph_def(saved.graph_def, saved.detached))
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,16 @@ def read_model(given: Fetched) -> WebModel:
         raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
 
 
+def held(path: Path) -> Any:
+    """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
+    try:
+        return (json.loads(read_bytes(path / MODEL if path.is_dir() else path)).get("userDefinedMetadata") or {}).get(
+            "contract"
+        )
+    except (AttributeError, ValueError, RecursionError) as error:
+        raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
+
+
 def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
     """(the signature, node → op) of a model.json, without its weights. Raises SourceError, DamagedFileError."""
     try:

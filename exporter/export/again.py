@@ -72,16 +72,17 @@ def verify_folder(
     dressed = made_for is not None and consumer(made_for).own_names.isdisjoint(artefacts)
     again = _made_again(read, contract, consumer(made_for)) if read is not None and made_for and dressed else None
     original = None if read is None or again is not None else _original_of(read, contract)
+    if read is not None and made_for is None:
+        _check_meaning(read, contract, folder)
     # Without the source, it is the consumer alone that is asked.
     asked = again is None and made_for is not None and not {"bytes", "nn"} & artefacts.keys()
     if asked:
         _check_asked(folder, artefacts, str(made_for), runtimes, options)
     reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if made_for else found.graph_file)
-    if "nn" in artefacts:
-        from converters.barracuda.writer import contract_text
-
-        with naming(artefacts["nn"]):
-            found.verify_contract(contract_text(artefacts["nn"].read_bytes()))
+    for each in formats:
+        if each.held is not None:
+            with naming(artefacts[each.key]):
+                found.verify_contract(each.held(artefacts[each.key]))
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
     if "bytes" in artefacts:
         with naming(reference):
@@ -234,6 +235,38 @@ def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
     original = (named or list(found.models))[0].original
     with naming(found.path):
         return None if original is None else original.narrowed(contract.source)
+
+
+def _check_meaning(found: Source, contract: Contract, folder: Path) -> None:
+    """Raise BundleError where the source, read again, means something else by the tensors that the contract names.
+
+    A bundle that was exported with options (--input, --output) may have others: nothing is held against it then.
+    """
+    with naming(found.path):
+        signatures = [p.signature for _, p in found.compiled()]
+    alike = [s for s in signatures if _tensors(s) == _tensors(contract.signature)]
+    wrong = [[what for what, ours, its in _meanings(contract.signature, s) if ours != its] for s in alike]
+    if wrong and all(wrong):
+        raise BundleError(
+            f"says otherwise of {', '.join(wrong[0])} than its source",
+            where=str(folder / POLICY),
+            why=f"{found.path.name} was read again, and means something else",
+            fix="export the policy again",
+        )
+
+
+def _meanings(ours: PolicySignature, its: PolicySignature) -> list[tuple[str, object, object]]:
+    """(what a contract says beside its tensors, as one says it, as the other does)."""
+    return [
+        ("branches", ours.branches, its.branches),
+        ("memory", ours.memory, its.memory),
+        ("preprocess", {**ours.preprocess}, {**its.preprocess}),
+        *(
+            (f"{a.name}'s distribution", a.distribution, b.distribution)
+            for a, b in zip(ours.inputs, its.inputs, strict=True)
+        ),
+        *((f"{a.name}'s source", a.source, b.source) for a, b in zip(ours.outputs, its.outputs, strict=True)),
+    ]
 
 
 def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
