@@ -205,7 +205,7 @@ def _symbolic(
     kind = results[0]
     if len(results) > 1 or kind.shape is None or not all(isinstance(d, int) for d in kind.shape):
         return results  # how much it makes depends on the symbols
-    found = _probed(op, node, values) if _elements(kind) <= _SMALL else None
+    found = _probed(op, node, values) if elements_of(kind) <= _SMALL else None
     if found is None:
         return results
     for cell in np.ndindex(found.shape):
