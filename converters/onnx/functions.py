@@ -19,6 +19,8 @@ FIRST_OPSET = 7
 #: Copies of functions may hold this many bytes, and this factor of the model's.
 _BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
 _MAX_DEPTH = 64
+#: Nodes that onnx's inliner looks at: all for each op whose definition asks for types. 1,000 among 1,000 take 5 s.
+_MAX_LOOKED_AT = 1 << 18
 #: What an attribute that a call gives is charged beside its bytes.
 _ATTRIBUTE = 64
 
@@ -44,7 +46,16 @@ def inlined(model: Any) -> Any:
     defined = _defined(model)
     if not defined:
         return model
-    nodes = [n for n in all_nodes(model.graph) if n.domain in STANDARD and n.op_type in defined]
+    everything = all_nodes(model.graph)
+    nodes = [n for n in everything if n.domain in STANDARD and n.op_type in defined]
+    typed = [n for n in nodes if defined[n.op_type].has_context_dependent_function]
+    if len(typed) * len(everything) > _MAX_LOOKED_AT:
+        raise UnsupportedOpError(
+            f"the model has {len(typed)} nodes that ONNX defines by others, among {len(everything)}",
+            issues=[(n.name, n.op_type) for n in typed[:9]],
+            why="its inliner looks at the whole model for each; a policy has a few of them",
+            fix="give the policy alone, or export it with functions inlined (onnx.inliner)",
+        )
     _complete(nodes, {_identity(n, n.op_type): _defaults(defined[n.op_type]) for n in nodes})
     try:
         chosen = [("", kind) for kind in defined]

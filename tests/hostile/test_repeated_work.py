@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from converters.keras.model import tensors_in
+from converters.onnx.functions import inlined
 from converters.runtimes.memory import Memory
 from converters.stable_baselines3.spaces import space_of
 from exporter.export.sources import read_source
@@ -125,6 +127,22 @@ def test_constants_that_are_not_in_the_file_are_counted_together(tmp_path: Path)
     )
     with pytest.raises(UnsupportedOpError, match="makes a constant of 67108864 elements"):
         read_source(tmp_path / "policy.onnx")
+
+
+def test_ops_that_onnx_defines_by_others_are_counted_before_they_are_written_out() -> None:
+    """2,000 of them in 60 kB took 20 s."""
+    from onnx import TensorProto, helper
+
+    def model(count: int) -> Any:
+        names = ["obs_0", *(f"x{i}" for i in range(count))]
+        nodes = [helper.make_node("Bernoulli", [a], [b]) for a, b in itertools.pairwise(names)]
+        ends = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", 3]) for n in (names[0], names[-1])]
+        graph = helper.make_graph(nodes, "g", ends[:1], ends[1:])
+        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)])
+
+    assert len(inlined(model(9)).graph.node) > 9
+    with pytest.raises(UnsupportedOpError, match="600 nodes that ONNX defines by others"):
+        inlined(model(600))
 
 
 def test_a_child_is_allowed_for_the_models_that_it_has() -> None:
