@@ -130,6 +130,8 @@ def _nothing_in(folder: Path) -> SourceError:
     nested = listing.runs(folder)
     if nested:
         fix = f"give one of the folders in it: {', '.join(map(str, nested[:5]))}" + (", …" if nested[5:] else "")
+    elif any(n.startswith("rllib_checkpoint.") for n in inside):
+        fix = "it is a checkpoint of RLlib: load it there, export its module (torch.onnx.export), and give the .onnx"
     else:
         fix = "give a run's folder (models/<run>, results/<run>), a SavedModel, a TensorFlow.js model, or a model file"
     return SourceError(

@@ -17,6 +17,13 @@ LET_IT_EXPORT = (
 )
 #: Parts of the saved actor that an exported policy does not have: the critic of 0.22 to 0.24, a shared critic's heads.
 _NOT_POLICY = ("critic.", "value_heads.")
+#: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt.
+_OTHERS = {
+    "a2c_network.": "rl_games",
+    **dict.fromkeys(("log_std_parameter", "policy_layer.", "net_container.", "state_preprocessor"), "skrl"),
+    "actor.preprocess.": "Tianshou",
+    "encoder.actor_encoder.": "RLlib",
+}
 
 
 class State(Weights):
@@ -29,6 +36,14 @@ class State(Weights):
         if policy is None and isinstance(value, dict) and "version_number" in value:
             policy = value  # the actor's own state dictionary, saved by hand
         if not isinstance(policy, dict) or not _is_actor(policy):
+            if maker := _other_trainer(value):
+                raise NotAPolicyError(
+                    f"is a checkpoint of {maker}, whose networks are not rebuilt",
+                    why=f"it holds weights ({_content(value)}); which activations and layers they belong to stands in "
+                    "the run's configuration and code",
+                    fix=f"load it in {maker}, export the module that gives the action (torch.onnx.export, the "
+                    "observation's normaliser included), and give the .onnx",
+                )
             raise NotAPolicyError(
                 "is no checkpoint of a policy whose network is known",
                 why=f"it holds {_content(value)}, not the names that ML-Agents, rsl_rl or CleanRL give; a state "
@@ -45,6 +60,15 @@ class State(Weights):
 def _is_actor(policy: Mapping[Any, Any]) -> bool:
     names = [k for k in policy if isinstance(k, str)]
     return "version_number" in names and any(n.startswith("network_body.") for n in names)
+
+
+def _other_trainer(value: Any) -> str:
+    """Who else wrote a checkpoint, by the names of its tensors (rl_games 1.6, skrl 2, Tianshou 2, RLlib 2)."""
+    names = [n for n in value if isinstance(n, str)] if isinstance(value, dict) else []
+    for part in ("model", "policy"):
+        inner = value.get(part) if names else None
+        names += [n for n in inner if isinstance(n, str)] if isinstance(inner, dict) else []
+    return next((maker for start, maker in _OTHERS.items() if any(n.startswith(start) for n in names)), "")
 
 
 def _content(value: Any) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import passes_on, traits
+from converters.graph.shapes import infer_types
 from signatures.records import dataclass
 from signatures.roles import Role
 
@@ -101,9 +102,23 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
     return leaves
 
 
+def _clips_nothing(graph: Graph, node: Node) -> bool:
+    """Whether a node holds classes within bounds that they cannot leave (TF-Agents clips to the action's space)."""
+    bound = graph.constant(node.inputs[1]) if node.op in ("Minimum", "Maximum") else None
+    if bound is None or bound.dtype.kind not in "iu":
+        return False
+    if node.op == "Maximum":
+        return bool((bound <= 0).all())
+    chosen = [graph.producer(leaf) for leaf in _leaves(graph, node.inputs[0])]
+    types = infer_types(graph)
+    widths = [(types[p.inputs[0]].shape or (None,))[-1] for p in chosen if p.inputs]
+    picked = all(traits(p).sampler == "categorical" or p.op == "ArgMax" for p in chosen)
+    return picked and all(isinstance(w, int) and (bound >= w - 1).all() for w in widths)
+
+
 def _parts(graph: Graph, node: Node) -> Sequence[str]:
     """What a node passes on or joins along the last axis; empty where it computes."""
-    if passes_on(node) or node.op == "Cast":
+    if passes_on(node) or node.op == "Cast" or _clips_nothing(graph, node):
         return node.inputs[:1]
     if node.op == "ConcatV2":
         axis = graph.constant(node.inputs[-1])

@@ -103,3 +103,21 @@ def test_a_gumbel_draw_is_a_draw(form: str) -> None:
     draws = np.concatenate([run(policy, "action")[0][:1] for _ in range(400)])
     frequencies = np.bincount(draws, minlength=3) / len(draws)
     np.testing.assert_allclose(frequencies, np.exp(scores[0]), atol=0.11)
+
+
+@pytest.mark.parametrize(("most", "meaning"), [(2, Role.SAMPLED), (1, None)])
+def test_a_class_held_within_bounds_that_it_cannot_leave_is_a_draw(most: int, meaning: Role | None) -> None:
+    """TF-Agents clips what it draws to the action's space; a bound that a class is beyond makes another action."""
+    made = graph(
+        *(OBSERVATION, const("one", 1), const("most", most), const("least", 0)),
+        node("draw", "Multinomial", OBSERVATION.name, "one", output_dtype=np.dtype("i4")),
+        node("below", "Minimum", "draw", "most"),
+        node("action", "Maximum", "below", "least"),
+    )
+    if meaning is None:
+        with pytest.raises(SignatureError, match="another one in every run"):
+            compiled(made)
+        return
+    policy = compiled(made)
+    assert policy.signature.output("action").role is meaning
+    np.testing.assert_array_equal(run(policy, "deterministic_action")[0][:, 0], STATE.argmax(1))

@@ -41,6 +41,34 @@ def image(folder: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize(
+    ("names", "maker"),
+    [
+        ({"model": ["a2c_network.actor_mlp.0.weight", "a2c_network.mu.weight"], "epoch": []}, "rl_games"),
+        ({"policy": ["net_container.0.weight", "log_std_parameter"], "optimizer": []}, "skrl"),
+        ({"policy": ["net.0.weight"], "state_preprocessor": ["running_mean"]}, "skrl"),
+        ({"actor.preprocess.model.model.0.weight": None}, "Tianshou"),
+        ({"encoder.actor_encoder.net.mlp.0.weight": None}, "RLlib"),
+    ],
+)
+def test_checkpoints_of_other_trainers_are_named(
+    names: dict[str, list[str] | None], maker: str, tmp_path: Path
+) -> None:
+    ones = np.ones((2, 3), np.float32)
+    writer = Writer()
+    alone = {k: ones for k, inner in names.items() if inner is None}
+    parts = {k: writer.state(dict.fromkeys(inner, ones)) for k, inner in names.items() if inner is not None}
+    (tmp_path / "agent.pt").write_bytes(writer.zip(parts or writer.state(alone)))
+    with pytest.raises(NotAPolicyError, match=f"is a checkpoint of {maker}, .*\n.*\n.*load it in {maker}"):
+        read_source(tmp_path / "agent.pt")
+
+
+def test_a_checkpoint_of_rllib_is_a_folder_without_a_model(tmp_path: Path) -> None:
+    (tmp_path / "rllib_checkpoint.json").write_text("{}")
+    with pytest.raises(SourceError, match="it is a checkpoint of RLlib"):
+        read_source(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("value", "words"),
     [
         ({"model": 1, "optimizer": 2}, "it holds model, optimizer"),
