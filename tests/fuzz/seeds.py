@@ -517,7 +517,7 @@ def _recording(files: Files, random: Random) -> Files:
         name = random.choice(sorted(entries))
         array = entries.pop(name)
         how = random.random()
-        if how < 0.5:
+        if how < 0.5 and len(array) > 10:  # it may have been damaged before
             head, rest = array[:10], array[10:]
             end = struct.unpack("<H", head[8:10])[0]
             pieces = rest[:end].replace(b"(", b" ( ").replace(b",", b" , ").split(b" ")
