@@ -62,6 +62,13 @@ def classify_inputs(
     _by_structure(graph, found, roles, decided, declared=declared)
     if not any(r in OBSERVATIONS for r in roles.values()):
         names = ", ".join(f"{n.name} {_shape_text(n)}" for n in found) or "none"
+        turned = next((n.name for n in found if _has_time_first(n)), None)
+        if turned is not None:
+            raise SignatureError(
+                f"the agents' axis of the input {turned!r} is its second",
+                why=f"it is {names}: a history with time first; rows of a policy's inputs are agents",
+                fix="export the model with the agents' axis first ([B, T, n]: batch_first=True)",
+            )
         raise SignatureError(
             "no policy found: none of the inputs can be told to be an observation",
             why=f"inputs upstream of the outputs: {names}",
@@ -141,6 +148,13 @@ def _by_structure(
     numbered = [n for n in unknown if declared and roles[n.name] is Role.PARAMETER and placeholder_rank(n) in (1, 2)]
     if not floats and len(numbered) == 1:  # a discrete state, given as its number
         roles[numbered[0].name] = Role.VECTOR
+
+
+def _has_time_first(node: Node) -> bool:
+    """Whether a placeholder is [T, B, n]."""
+    shape: TensorShape | None = node.attrs.get("shape")
+    dims = () if shape is None or shape.dims is None else shape.dims
+    return len(dims) == 3 and dims[1] is None and None not in (dims[0], dims[2])
 
 
 def _has_rows(node: Node) -> bool:

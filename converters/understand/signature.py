@@ -178,7 +178,7 @@ def _outputs(compiled: Compilation, types: Types) -> tuple[list[TensorSpec], dic
     specs = []
     for name in order:
         kind = types[fetches[name]]
-        _check_batch(name, kind.shape, compiled.sources.get(name))
+        _check_batch(name, kind.shape, compiled)
         specs.append(
             TensorSpec(
                 _output_name(compiled, name),
@@ -216,9 +216,18 @@ def _output_name(compiled: Compilation, name: str) -> str:
     return brain.scope + base if node.startswith(brain.scope) else base
 
 
-def _check_batch(name: str, shape: tuple[int | str, ...] | None, source: object) -> None:
+def _check_batch(name: str, shape: tuple[int | str, ...] | None, compiled: Compilation) -> None:
     if shape is None or (shape and isinstance(shape[0], str)):
         return
+    source = compiled.sources.get(name)
+    taken = {n: compiled.graph[n].attrs["shape"].dims for n in compiled.roles if n in compiled.graph}
+    if taken and all(dims is not None and None not in dims for dims in taken.values()):
+        shown = ", ".join(f"{n} {list(dims)}" for n, dims in taken.items())
+        raise SignatureError(
+            f"the graph decides for one agent alone: {shown}",
+            why=f"{name!r} ({source}) comes as {list(shape)}; only an ONNX model is made one for any number of agents",
+            fix="freeze it from placeholders with a free first axis ([None, n]), or give the ONNX of the same network",
+        )
     raise SignatureError(
         f"output {name!r} ({source}) has shape {list(shape)}, without the batch axis",
         why="every output of a policy has one row per agent (TF Serving asks for it)",

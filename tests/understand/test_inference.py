@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from converters.graph.compile import compile_graph
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.understand.action import action_meaning
 from converters.understand.brains import find_brains
@@ -470,3 +471,16 @@ def test_a_join_that_doubles_is_given_up() -> None:
 def test_a_long_chain_of_views_needs_no_deep_stack() -> None:
     views = [op("v0", "Reshape", "l0"), *(op(f"v{i}", "Identity", f"v{i - 1}") for i in range(1, 5000))]
     assert meaning(views) == (Role.CONTINUOUS, ())
+
+
+@pytest.mark.parametrize("dims", [(1, 3), (3,)])
+def test_a_graph_for_one_agent_says_so(dims: tuple[int, ...]) -> None:
+    made = Graph((placeholder("vector_observation", dims, FLOAT), Node("action", "Tanh", ("vector_observation",))))
+    with pytest.raises(SignatureError, match=r"decides for one agent alone: vector_observation .*\n.*\n.*\[None, n\]"):
+        compile_graph(made, "one")
+
+
+def test_a_history_with_time_first_says_so() -> None:
+    made = Graph((placeholder("x", (4, None, 3), FLOAT), Node("action", "Tanh", ("x",))))
+    with pytest.raises(SignatureError, match=r"the agents' axis of the input 'x' is its second"):
+        compile_graph(made, "turned")

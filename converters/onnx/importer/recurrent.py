@@ -69,7 +69,9 @@ def _steps(op: Op, net: Importer) -> _Steps:
         raise op.refused("its rows are of other lengths than its input")
     direction = op.text("direction", "forward")
     if direction not in ("forward", "reverse") or net.shape(op.need(1))[0] != 1:
-        raise op.refused(f"its direction is {direction!r}", "a policy cannot look into the future")
+        raise op.refused(
+            f"its direction is {direction!r}", "layers that run one way are read: forward, or reverse over a history"
+        )
     given = tuple(a.lower() for a in op.attrs.get("activations", _DEFAULTS[op.kind]))
     if given != _DEFAULTS[op.kind] or op.attrs.get("activation_alpha") or op.attrs.get("activation_beta"):
         raise op.refused(f"its activations are {', '.join(given)}", f"only {', '.join(_DEFAULTS[op.kind])} occur")
