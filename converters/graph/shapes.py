@@ -209,7 +209,7 @@ def _symbolic(
     if found is None:
         return results
     for cell in np.ndindex(found.shape):
-        if found[cell] is None and op.name not in ("Mul", "Prod"):  # not a list: the op table alone has those
+        if found[cell] is None and op.name != "Mul" and op.name != "Prod":  # not a list: the op table alone has those
             return results
         if found[cell] is None:
             found[cell] = symbols.fresh()  # a length, whatever it is

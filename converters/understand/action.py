@@ -104,7 +104,7 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
 
 def _clips_nothing(graph: Graph, node: Node) -> bool:
     """Whether a node holds classes within bounds that they cannot leave (TF-Agents clips to the action's space)."""
-    bound = graph.constant(node.inputs[1]) if node.op in ("Minimum", "Maximum") else None
+    bound = graph.constant(node.inputs[1]) if node.op == "Minimum" or node.op == "Maximum" else None
     if bound is None or bound.dtype.kind not in "iu":
         return False
     if node.op == "Maximum":
