@@ -19,6 +19,8 @@ FIRST_OPSET = 7
 #: Copies of functions may hold this many bytes, and this factor of the model's.
 _BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
 _MAX_DEPTH = 64
+#: The largest version that onnx asks its schemas for.
+_INT32 = (1 << 31) - 1
 #: Nodes that onnx's inliner looks at: all for each op whose definition asks for types. 1,000 among 1,000 take 5 s.
 _MAX_LOOKED_AT = 1 << 18
 #: What an attribute that a call gives is charged beside its bytes.
@@ -73,7 +75,7 @@ def _defined(model: Any) -> dict[str, Any]:
     found = {}
     for kind in sorted(used - known):
         with suppress(onnx.defs.SchemaError):
-            schema: Any = onnx.defs.get_schema(kind, version)
+            schema: Any = onnx.defs.get_schema(kind, min(version, _INT32))
             if schema.has_function or schema.has_context_dependent_function:
                 found[kind] = schema
     return found

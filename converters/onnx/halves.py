@@ -13,6 +13,7 @@ import numpy as np
 
 from converters.detached import LARGE, Detached
 from converters.onnx.proto import raw_of, tensors
+from signatures.errors import DamagedFileError
 
 _FLOAT, _FLOAT16, _BFLOAT16 = 1, 10, 16  # TensorProto.DataType
 _HALVES = (_FLOAT16, _BFLOAT16)
@@ -55,7 +56,13 @@ def _bodies(part: Any) -> Iterator[Any]:
 
 def _widen_tensor(tensor: Any, detached: Detached | None) -> None:
     whole = tensor.HasField("raw_data")
-    raw = raw_of(tensor, detached).view("<u2") if whole else np.array(tensor.int32_data, "<u2")
+    data = raw_of(tensor, detached) if whole else np.array(tensor.int32_data, "<i4").astype("<u2")
+    if data.nbytes % 2:
+        raise DamagedFileError(
+            f"the tensor {tensor.name!r} holds {data.nbytes} bytes, which are no 16-bit numbers",
+            fix="export the model again",
+        )
+    raw = data.view("<u2")
     wide = raw.view(np.float16).astype("<f4") if tensor.data_type == _FLOAT16 else (raw.astype("<u4") << 16).view("<f4")
     tensor.ClearField("int32_data")
     tensor.raw_data = wide.tobytes() if detached is None or wide.nbytes < LARGE else detached.mark(wide.view(np.uint8))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,6 +149,46 @@ def test_a_tensor_of_no_number_is_refused_by_its_dtype() -> None:
     """A signature may name a variable's handle, whose dtype is numpy's object: a KeyError of the last net's."""
     with pytest.raises(DamagedFileError, match="a tensor of object"):
         schema.dtype_number(np.dtype(object))
+
+
+def constant_of_a_graph(model: Any) -> None:
+    made = model.graph.node.add(op_type="Constant", name="odd", output=["odd"]).attribute.add(name="value", type=5)
+    made.t.data_type, made.t.raw_data = 1, bytes(4)
+
+
+def half_of_three_bytes(model: Any) -> None:
+    model.graph.initializer.add(name="odd", data_type=10, raw_data=b"123", dims=[1])
+
+
+def opset_beyond_int32(model: Any) -> None:
+    model.opset_import[0].version = 1 << 40
+    model.graph.node[-1].op_type = "CenterCropPad"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (constant_of_a_graph, "it holds no numbers"),
+        (half_of_three_bytes, "are no 16-bit numbers"),
+        (opset_beyond_int32, "CenterCropPad"),
+    ],
+)
+def test_an_onnx_that_is_not_as_onnx_has_it_is_refused_by_a_check(
+    change: Callable[[Any], None], said: str, tmp_path: Path
+) -> None:
+    import onnx
+    from onnx import helper
+
+    nodes = [
+        helper.make_node("MatMul", ["obs_0", "kernel"], ["product"]),
+        helper.make_node("Add", ["product", "odd"], ["continuous_actions"]),
+    ]
+    model = onnx.ModelProto.FromString(zoo.onnx_policy(nodes))
+    change(model)
+    model.graph.node.sort(key=lambda n: n.op_type != "Constant")
+    (tmp_path / "policy.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises((UnsupportedOpError, DamagedFileError), match=said):
+        read_source(tmp_path / "policy.onnx").policies()
 
 
 @pytest.mark.parametrize("what", ["inputs", "outputs"])

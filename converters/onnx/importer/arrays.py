@@ -28,7 +28,10 @@ def _constant(op: Op, net: Importer) -> str:
         ("value_ints", INT64),
     ):
         if name in op.attrs:
-            return net.const(np.asarray(op.attrs[name], dtype), "value")
+            value = np.asarray(op.attrs[name], dtype)
+            if value.dtype.kind not in "biuf":  # an attribute that says to be a graph, or a text
+                break
+            return net.const(value, "value")
     raise op.refused("it holds no numbers", "strings and sparse tensors are no part of a policy")
 
 
