@@ -38,6 +38,8 @@ IR_VERSIONS = {11: 6, 12: 7, 13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20
 ASKED_FOR = range(13, 22)
 #: Profiles whose importer swaps the operands of a Sub or Div of which the first is constant, and has no Where.
 FIRST_IMPORTERS = ("barracuda-1.0",)
+#: Those of which an importer does not know Erf.
+_WITHOUT_ERF = (*FIRST_IMPORTERS, "barracuda-1.4")
 #: What works element by element, so that a Transpose may as well come behind it.
 _ELEMENTWISE = frozenset(
     (
@@ -68,6 +70,7 @@ class _Builder:
     def __init__(self, graph: Graph, opset: int, outputs: Collection[str], profile: str | None = None) -> None:
         self.opset = opset
         self.constant_first = self.chooses = profile not in FIRST_IMPORTERS
+        self.has_erf = profile not in _WITHOUT_ERF
         self._sinks = profile is not None
         self._transposed: dict[str, tuple[str, tuple[int, ...]]] = {}
         self._scalars: set[str] = set()

@@ -38,12 +38,8 @@ UNITY = [p for p in PROFILES if p.formats[0] == "onnx"]
 
 #: Policies that a profile cannot hold: (file, profile) → what the refusal names.
 CANNOT_IN = {
-    ("sb3_ppo_gelu__dynamo_dyn.onnx", "barracuda-1.4"): "Erf",
-    ("sb3_ppo_gelu__dynamo_dyn.onnx", "barracuda-1.0"): "Erf",
     ("norms__legacy.onnx", "barracuda-1.0"): "ReduceMean",
     ("clean_c51__legacy.onnx", "barracuda-1.0"): "Add",
-    ("keras_dense.keras", "barracuda-1.4"): "Erf",
-    ("keras_dense.keras", "barracuda-1.0"): "Erf",
     ("entity_attention__legacy.onnx", "barracuda-3"): "Reshape",
     ("entity_attention__legacy.onnx", "barracuda-1.4"): "Reshape",
     ("autoregressive__legacy.onnx", "barracuda-1.0"): "ArgMax",

@@ -36,6 +36,8 @@ class OnnxBuilder(Protocol):
     constant_first: bool
     #: whether there are Where, Shape and Expand
     chooses: bool
+    #: whether there is Erf
+    has_erf: bool
 
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""

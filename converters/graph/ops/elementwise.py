@@ -129,6 +129,26 @@ def _lower_square(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Mul", [value, value])
 
 
+def _lower_erf(node: Node, builder: OnnxBuilder) -> Any:
+    """As it is, or Abramowitz and Stegun 7.1.26, right to 1.5e-7: Barracuda has the op from 2.3 on."""
+    x = builder.value(node.inputs[0])
+    if builder.has_erf:
+        return builder.emit("Erf", [x])
+
+    def with_number(op: str, value: str, number: float) -> str:
+        return str(builder.emit(op, [value, builder.const(np.asarray(number, FLOAT32))]))
+
+    size = builder.emit("Abs", [x])
+    t = builder.emit("Reciprocal", [with_number("Add", with_number("Mul", size, 0.3275911), 1)])
+    series = with_number("Mul", t, 1.061405429)
+    for factor in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
+        series = builder.emit("Mul", [with_number("Add", series, factor), t])
+    bell = builder.emit("Exp", [with_number("Mul", builder.emit("Mul", [x, x]), -1)])
+    upper = with_number("Add", with_number("Mul", builder.emit("Mul", [series, bell]), -1), 1)
+    sign = builder.emit("Mul", [x, builder.emit("Reciprocal", [with_number("Add", size, 1e-30)])])
+    return builder.emit("Mul", [upper, sign])
+
+
 def _lower_squared_difference(node: Node, builder: OnnxBuilder) -> Any:
     value = builder.emit("Sub", [builder.value(r) for r in node.inputs])
     return builder.emit("Mul", [value, value])
@@ -330,7 +350,7 @@ UNARY = (
     _unary("Sin", _wide(np.sin), "Sin", precision="approximate"),
     _unary("Cos", _wide(np.cos), "Cos", precision="approximate"),
     _unary("Tan", _wide(np.tan), "Tan", precision="approximate"),
-    _unary("Erf", _wide(_erf), "Erf", precision="approximate"),
+    _unary("Erf", _wide(_erf), _lower_erf, precision="approximate"),
     _unary("Sigmoid", _wide(_sigmoid), "Sigmoid", precision="approximate", activation="sigmoid", tfjs_fuses=True),
     _unary("Tanh", _wide(np.tanh), "Tanh", precision="approximate", activation="tanh"),
     _unary(
