@@ -11,7 +11,8 @@ from dataclasses import field, replace
 from typing import Any
 
 from converters.graph.nodes import NameScope
-from signatures.errors import DamagedFileError
+from converters.graph.passes.unroll import MAX_NODES
+from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass
 
 #: Classes that are models themselves.
@@ -81,6 +82,17 @@ def layer_of(entry: Mapping[str, Any]) -> Layer:
     return Layer(kind, name, config, _calls(nodes), operation=bare or ".ops." in f"{module}.")
 
 
+def _few(entries: Any) -> Any:
+    """The layers of a model, which are counted before one is looked at."""
+    if len(entries) > MAX_NODES:
+        raise NotAPolicyError(
+            f"it has {len(entries)} layers",
+            why=f"no more than {MAX_NODES} are read; a policy has some tens",
+            fix="save the policy alone",
+        )
+    return entries
+
+
 def _text(value: object) -> str:
     """A name; what else stands there may be a tree of any size, which no message should hold."""
     if not isinstance(value, str):
@@ -89,7 +101,7 @@ def _text(value: object) -> str:
 
 
 def _functional(name: str, config: Mapping[str, Any]) -> LayeredModel:
-    layers = tuple(layer_of(entry) for entry in config["layers"])
+    layers = tuple(layer_of(entry) for entry in _few(config["layers"]))
     scope = NameScope(())
     outputs = {scope.fresh(key or place.layer): place for key, place in _places(config["output_layers"])}
     return LayeredModel(name, layers, tuple(place for _, place in _places(config["input_layers"])), outputs)
@@ -97,7 +109,7 @@ def _functional(name: str, config: Mapping[str, Any]) -> LayeredModel:
 
 def _sequential(name: str, config: Any) -> LayeredModel:
     """A chain; where the first layer is no input, it says the shape of one."""
-    entries = config if isinstance(config, list) else config["layers"]
+    entries = _few(config if isinstance(config, list) else config["layers"])
     layers = [layer_of(entry) for entry in entries]
     if layers and layers[0].kind != "InputLayer":
         first = layers[0]

@@ -109,6 +109,13 @@ def test_more_calls_of_layers_than_any_policy_has(tmp_path: Path, monkeypatch: p
         read_source(written(model, tmp_path / "m")).policies()
 
 
+def test_more_layers_than_any_policy_has_are_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A million of them took a minute before their calls were counted."""
+    monkeypatch.setattr("converters.keras.model.MAX_NODES", 2)
+    with pytest.raises(NotAPolicyError, match="3 layers"):
+        read_source(written(activations([0, 1], ["a", "b"], [["b", 0, 0]]), tmp_path / "m")).policies()
+
+
 def test_constants_that_are_not_in_the_file_are_counted_together(tmp_path: Path) -> None:
     """An identity matrix of 8,192 rows was 512 MB on its way, for each node that asks for one."""
     from onnx import TensorProto, helper

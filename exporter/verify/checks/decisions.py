@@ -25,8 +25,8 @@ from signatures.roles import Role
 from signatures.sampling import Case, draw_typical
 from signatures.spec import PolicySignature
 
-#: The share of choices that may be other ones, and of its spread that a number may move (root mean square). Of 60
-#: public policies, as far as they are read, the worst were 0.2% and 3.0% (numbers 0.1%, 3.0%, choices 0.2%, 1.9%).
+#: The share of choices that may be other ones, and of its spread that a number may move (root mean square). Of 176
+#: public and genuine policies four do not keep int8's (two of them by 8.8% and 11.2%), all keep float16's.
 LIMITS: dict[Storage, float] = {"float16": 0.01, "int8": 0.05}
 _CASES = 4
 #: Below this share of its size a number counts as one that is always the same, which moves by no more than it.
