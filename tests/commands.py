@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -44,6 +45,14 @@ def export_model(*arguments: object) -> Ran:
     return Ran(status if isinstance(status, int) else 0 if status is None else 1, out.getvalue(), err.getvalue())
 
 
+def default_signals() -> None:
+    """For a child, before it begins: as a terminal starts one. A job in the background, and what nohup starts, has
+    signals ignored, and children inherit that.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def python(*arguments: object, environment: Mapping[str, str] | None = None, cwd: Path = ROOT) -> Ran:
     """``python ARGUMENTS`` in a process of its own, in the checkout unless another folder is given."""
     done = subprocess.run(
@@ -54,6 +63,7 @@ def python(*arguments: object, environment: Mapping[str, str] | None = None, cwd
         capture_output=True,
         encoding="utf-8",
         check=False,
+        preexec_fn=default_signals if os.name == "posix" else None,
     )
     return Ran(done.returncode, done.stdout, done.stderr)
 

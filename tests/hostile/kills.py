@@ -22,7 +22,7 @@ from pathlib import Path
 
 from converters.bundle.bundle import Bundle
 from fixtures import path as fixture
-from tests.commands import ROOT
+from tests.commands import ROOT, default_signals
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 #: Runtimes → one in so many runs.
@@ -99,7 +99,13 @@ class Kills:
         command = [sys.executable, "-m", "exporter", str(fixture("continuous")), "-o", str(out), "--verify", runtimes]
         env = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), _MARK: mark}
         return subprocess.Popen(
-            command, cwd=ROOT, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+            command,
+            cwd=ROOT,
+            env=env,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+            preexec_fn=default_signals,
         )
 
 

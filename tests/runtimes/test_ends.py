@@ -12,7 +12,7 @@ import pytest
 
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
-from tests.commands import ROOT
+from tests.commands import ROOT, default_signals
 from tests.runtimes.graph_models import info, node, placeholder, write_model
 from tests.runtimes.pipe import NEEDS_NODE
 
@@ -135,7 +135,11 @@ with RuntimePool({{"a": lambda: [sys.executable, "-c", never]}}) as pool:
 
 def test_an_interrupt_while_a_runtime_starts_is_not_waited_for(tmp_path: Path) -> None:
     """A job runner sends it to the command alone; the children are the command's to end."""
-    command = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(tmp_path / "up")], stderr=subprocess.DEVNULL)
+    command = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED, str(tmp_path / "up")],
+        stderr=subprocess.DEVNULL,
+        preexec_fn=default_signals,
+    )
     for _ in range(300):
         if (tmp_path / "up").exists():
             break
