@@ -26,7 +26,7 @@ NODES, WEIGHT = ("modelTopology", "node"), ("weightsManifest", 0, "weights", 0)
         (NODES, [node("out_2", "Identity", "elsewhere")], "the graph has no node 'elsewhere'"),
         (NODES, None, "model.json holds no graph"),
         ((*WEIGHT, "shape"), [1 << 20], "the weights are cut off"),
-        ((*WEIGHT, "quantization"), {"dtype": "float16"}, "the weights 'w1' are float16"),
+        ((*WEIGHT, "quantization"), {"dtype": "uint4"}, "the weights 'w1' are uint4"),
     ],
 )
 def test_what_is_no_model_of_ours_is_refused(
