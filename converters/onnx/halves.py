@@ -56,10 +56,11 @@ def _bodies(part: Any) -> Iterator[Any]:
 
 def _widen_tensor(tensor: Any, detached: Detached | None) -> None:
     whole = tensor.HasField("raw_data")
-    data = raw_of(tensor, detached) if whole else np.array(tensor.int32_data, "<i4").astype("<u2")
-    if data.nbytes % 2:
+    stored = raw_of(tensor, detached) if whole else np.array(tensor.int32_data, "<i4")
+    data = stored if whole else stored.astype("<u2")
+    if data.nbytes % 2 or (not whole and (data != stored).any()):
         raise DamagedFileError(
-            f"the tensor {tensor.name!r} holds {data.nbytes} bytes, which are no 16-bit numbers",
+            f"the tensor {tensor.name!r} holds {stored.nbytes} bytes, which are no 16-bit numbers",
             fix="export the model again",
         )
     raw = data.view("<u2")

@@ -217,7 +217,13 @@ def negative_dims(graph: Any) -> None:
     graph.initializer[0].dims[0] = -4
 
 
-DAMAGE = (dangling, twice, no_output, two_inputs, short_data, huge_dims, negative_dims)
+def large_halves(graph: Any) -> None:
+    graph.initializer[0].data_type = TensorProto.FLOAT16
+    graph.initializer[0].ClearField("raw_data")
+    graph.initializer[0].int32_data[:] = [1 << 16] * 8
+
+
+DAMAGE = (large_halves, dangling, twice, no_output, two_inputs, short_data, huge_dims, negative_dims)
 
 
 @pytest.mark.parametrize("change", DAMAGE, ids=lambda change: change.__name__)
