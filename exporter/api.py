@@ -11,8 +11,8 @@ from typing import Any
 from converters.source import ReadOptions
 from exporter.export.again import verify_folder
 from exporter.export.labels import Labels
-from exporter.export.options import compile_options, storage
-from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.export.options import ExportOptions, compile_options, storage
+from exporter.export.pipeline import ExportResult, export
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
 from exporter.verify.options import VerifyOptions

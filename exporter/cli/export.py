@@ -123,8 +123,8 @@ def export_command(
     This is the command that is meant where none is named.
     """
     from converters.fetch import address_of
-    from exporter.export.options import storage
-    from exporter.export.pipeline import ExportOptions, export
+    from exporter.export.options import ExportOptions, storage
+    from exporter.export.pipeline import export
     from exporter.fleet.sources import is_many
 
     if profile == "help":

@@ -17,7 +17,7 @@ from exporter.fleet.worker import Outcome, Wanted
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from exporter.export.pipeline import ExportOptions
+    from exporter.export.options import ExportOptions
     from exporter.reports.entry import Entry
 
 #: Sources whose failure is told; of more, the number.

@@ -83,7 +83,8 @@ def _bundle_of(place: Path) -> Iterator[Path]:
         yield found or place
         return
     from converters.folders import scratch_folder
-    from exporter.export.pipeline import ExportOptions, export
+    from exporter.export.options import ExportOptions
+    from exporter.export.pipeline import export
 
     with scratch_folder() as folder:
         results = list(export([place], ExportOptions(folder, ("bytes", "tfjs"), verify="none")))

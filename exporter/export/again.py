@@ -17,8 +17,9 @@ from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
 from converters.source import OriginalRun, ReadOptions
+from exporter.export.job import Job, tested_in
 from exporter.export.options import storage_of
-from exporter.export.pipeline import Job, Progress, consumer, joined, tested_in
+from exporter.export.pipeline import Progress, consumer, joined
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.inner_tensors import saved_graph

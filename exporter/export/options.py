@@ -1,14 +1,41 @@
-"""What a person says of how a source is understood, checked: the same for the command line and for Python."""
+"""What a person says of an export, checked: the same for the command line and for Python."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
 from typing import get_args
 
 from converters.graph.options import CompileOptions, NoiseMode
 from converters.graph.passes.weights import Storage
+from converters.source import ReadOptions
+from exporter.export.labels import Labels
+from exporter.verify.options import VerifyOptions
 from signatures.errors import UsageError
+from signatures.records import dataclass
 from signatures.roles import Role, parse_role
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What ``export-model`` may be told; see the command line for the meaning of each."""
+
+    out: Path = Path("exported")
+    #: None: the usual ones, or what the consumer of ``profile`` loads
+    targets: Sequence[str] | None = None
+    name: str | None = None
+    compile: CompileOptions = field(default_factory=CompileOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
+    #: None: 15, or the consumer's
+    opset: int | None = None
+    verify: str | Sequence[str] = "auto"
+    parity: VerifyOptions = field(default_factory=VerifyOptions)
+    labels: Labels | None = None
+    #: the consumer that the files are made for (``--for``)
+    profile: str | None = None
+    #: what weights are rounded to and kept in (``--dtype``, ``--quantize``)
+    weights: Storage = "float32"
 
 
 def _roles(given: Mapping[str, str | Role] | None, flag: str) -> dict[str, Role]:

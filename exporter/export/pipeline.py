@@ -12,62 +12,34 @@ from typing import TYPE_CHECKING, Any
 from converters.bundle import bundle
 from converters.fetch import shown
 from converters.folders import scratch_folder
-from converters.format import Artifact, Format, WriteOptions
+from converters.format import Artifact, Format
 from converters.formats import DEFAULTS, WRITTEN, written
-from converters.graph.options import CompileOptions
-from converters.graph.passes.weights import Storage, rounded
 from converters.policy import Policy
-from converters.source import ReadOptions, SourceModel
-from exporter.export.labels import Labels, check_labels, labelled, read_labels
+from exporter.export.job import Job, artefacts_of, tested_in, under_test
+from exporter.export.labels import check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
+from exporter.export.options import ExportOptions
+from exporter.export.rounding import check_weights, sizes_unrounded, smaller
 from exporter.export.sources import Source, read_source
 from exporter.remote.fetching import nearby
 from exporter.remote.sending import check_free, check_sendable, landing
 from exporter.verify.checks.size import check_budget
-from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import check_rules
-from exporter.version import __version__
-from signatures.contract import PARITY, Contract, Origin, parse, safe_name
+from signatures.contract import PARITY, Contract, safe_name
 from signatures.errors import (
     ExportModelError,
     RefusedError,
-    SignatureError,
-    TooLargeError,
     UsageError,
-    naming,
 )
-from signatures.fields import FieldError, printable
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.runtimes.pool import RuntimePool
     from converters.runtimes.registry import RuntimeInfo
     from converters.targets.profile import Profile
-    from exporter.verify.participants import PolicyUnderTest
     from exporter.verify.report import ParityReport
 
 Progress = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """What ``export-model`` may be told; see the command line for the meaning of each."""
-
-    out: Path = Path("exported")
-    #: None: the usual ones, or what the consumer of ``profile`` loads
-    targets: Sequence[str] | None = None
-    name: str | None = None
-    compile: CompileOptions = field(default_factory=CompileOptions)
-    read: ReadOptions = field(default_factory=ReadOptions)
-    #: None: 15, or the consumer's
-    opset: int | None = None
-    verify: str | Sequence[str] = "auto"
-    parity: VerifyOptions = field(default_factory=VerifyOptions)
-    labels: Labels | None = None
-    #: the consumer that the files are made for (``--for``)
-    profile: str | None = None
-    #: what weights are rounded to and kept in (``--dtype``, ``--quantize``)
-    weights: Storage = "float32"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,22 +94,6 @@ class ExportResult:
         return None if self.report is None else self.report.passed
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One policy to write, and where it comes from."""
-
-    source: Source
-    model: SourceModel
-    policy: Policy
-    profile: Profile | None = None
-    #: the policy under its own names, where ``policy`` has those of a consumer
-    own: Policy | None = None
-    #: why it has another name than its source's
-    note: str | None = None
-    #: the policy with its weights as they were, where those of ``policy`` are rounded
-    whole: Policy | None = None
-
-
 class Exporter:
     """Exports sources, one at a time, with options that were checked when it was made: what they choose is kept.
 
@@ -150,7 +106,7 @@ class Exporter:
         self._formats = _formats(options, wanted)
         if not self._formats:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
-        _check_weights(options, self._formats)
+        check_weights(options, self._formats)
         self._profile = wanted
         #: None where the writers of its formats give a policy the consumer's names
         self._dress = None if wanted is None or self._formats[0].key in wanted.own_names else wanted.dress
@@ -201,7 +157,7 @@ class Exporter:
             own = replace(policy, name=name)
             dressed = labelled(own if dress is None else dress(own), self._labels)
             job = Job(source, model, dressed, self._profile, None if dress is None else own, note)
-            jobs.append(job if options.weights == "float32" else _smaller(job, options.weights))
+            jobs.append(job if options.weights == "float32" else smaller(job, options.weights))
         return jobs
 
     def written(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
@@ -210,7 +166,7 @@ class Exporter:
         """
         for job in jobs:
             check_free(self.options.out, job.policy.name)
-        made = [(j, *_write(j, self._formats, self.options)) for j in jobs]
+        made = [(j, *artefacts_of(j, self._formats, self.options)) for j in jobs]
         for number, (job, contract, artifacts, notes) in enumerate(made, 1):
             result = self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
             yield replace(result, left_out=notes)
@@ -220,7 +176,7 @@ class Exporter:
     ) -> ExportResult:
         """The bundle of a policy, verified and put in its place."""
         options, policy = self.options, job.policy
-        whole_sizes = _whole_sizes(job, [a.format for a in artifacts], options)
+        whole_sizes = sizes_unrounded(job, [a.format for a in artifacts], options)
         with (
             landing(options.out) as (out, put),
             bundle.staged(out / policy.name, contract, artifacts) as stage,
@@ -231,7 +187,7 @@ class Exporter:
                 from exporter.verify.verification import verify
 
                 assert pool is not None, "runtimes run in processes"
-                tested = _tested(job, stage, artifacts, folder)
+                tested = under_test(job, stage, artifacts, folder)
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     plain = replace(job, policy=job.own, profile=None)
@@ -241,7 +197,7 @@ class Exporter:
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
 
-                    whole = _tested(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
+                    whole = under_test(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
                     rules = replace(options.parity, rules=(), golden=None, budget={})
                     own = verify(whole, self.runtimes, self._known, pool, rules, progress)
                     report = joined(report, own, "the policy with its weights as they were, by the numpy kernels")
@@ -347,147 +303,6 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
             fix="leave --opset out",
         )
     return [written(target) for target in targets]
-
-
-def _check_weights(options: ExportOptions, formats: Sequence[Format]) -> None:
-    """Raise UsageError where rounded weights are asked for and what is written cannot hold them."""
-    if options.weights == "float32":
-        return
-    flag = "--dtype float16" if options.weights == "float16" else "--quantize int8"
-    if options.profile is not None:
-        raise UsageError(
-            f"{flag} does not go with --for {options.profile}",
-            why="the importers of Unity and TensorFlowSharp were not shown to read weights in less than float32",
-            fix="leave one of them out",
-        )
-    wide = [f.key for f in formats if not f.narrow]
-    if wide:
-        raise UsageError(
-            f"{flag} does not go with --to {','.join(wide)}",
-            why=f"weights in {options.weights} are written to {', '.join(f.key for f in WRITTEN.values() if f.narrow)}",
-            fix="leave one of them out",
-        )
-
-
-def _smaller(job: Job, weights: Storage) -> Job:
-    """The policy with its weights rounded, which a note in its contract says."""
-    whole = job.policy
-    note = f"weights were rounded to {weights}; what is computed with them is float32"
-    signature = replace(whole.signature, notes=(*whole.signature.notes, note))
-    return replace(job, policy=replace(whole, graph=rounded(whole.graph, weights), signature=signature), whole=whole)
-
-
-def _whole_sizes(job: Job, formats: Sequence[Format], options: ExportOptions) -> dict[str, int]:
-    """What the formats would take with weights in float32; nothing where that is how they are written."""
-    if job.whole is None:
-        return {}
-    whole = replace(job, policy=job.whole, whole=None)
-    _, artifacts, _ = _write(whole, formats, replace(options, weights="float32", verify="none"))
-    return {a.format.key: a.size for a in artifacts}
-
-
-def _write(
-    job: Job, formats: Sequence[Format], options: ExportOptions
-) -> tuple[Contract, list[Artifact], tuple[str, ...]]:
-    """The contract, the artefacts, and why some of the usual formats are not among these."""
-    with naming(job.source.path):
-        contract = contract_of(
-            job.policy,
-            job.source,
-            job.model,
-            options.read,
-            None if job.profile is None else job.profile.name,
-            None if job.whole is None else options.weights,
-        )
-        if job.profile is None:
-            how = WriteOptions(contract.compact(), checked=options.verify != "none", weights=options.weights)
-            if options.opset is not None:
-                how = replace(how, opset=options.opset)
-            artifacts, notes = list[Artifact](), list[str]()
-            for form in formats:
-                try:
-                    artifacts.append(form.artifact(job.policy, how))
-                except TooLargeError as error:
-                    if options.targets is not None:
-                        raise
-                    notes.append(f"{form.key} was left out: {error.what}: {error.why}")
-            return contract, artifacts, tuple(notes)
-        how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
-        artifacts = [f.artifact(job.policy, how) for f in formats]
-        for artifact in artifacts:
-            if job.profile.check is not None:
-                job.profile.check(job.profile, artifact.files, job.policy.name)
-        return contract, artifacts, ()
-
-
-def contract_of(
-    policy: Policy,
-    source: Source,
-    model: SourceModel,
-    read: ReadOptions,
-    profile: str | None = None,
-    weights: str | None = None,
-) -> Contract:
-    """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
-    origin = Origin(
-        printable(source.path.name),
-        source.sha256,
-        None if model.name is None else printable(model.name),
-        read.step,
-        read.sensors,
-        read.goals,
-        read.activation,
-    )
-    made = {"name": "export-model", "version": __version__, "profile": profile, "weights": weights}
-    tool = {key: value for key, value in made.items() if value is not None}
-    contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
-    try:
-        parse(contract.to_dict())
-    except FieldError as error:
-        raise SignatureError(
-            "the policy cannot be described",
-            why=f"{error.field} {error.why}",
-            fix="give inputs and outputs other names where the model is made, or choose with --input and --output",
-        ) from error
-    return contract
-
-
-def _tested(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
-    from converters.frozen_graph.writer import frozen
-    from converters.saved_model.writer import signatures_of
-    from exporter.verify.participants import PolicyUnderTest
-
-    policy = job.policy
-    paths = {a.format.key: stage / a.main for a in artifacts}
-    reference = paths.get("bytes")
-    if reference is None:
-        # The numpy reference reads a .bytes; one is made for it where none was asked for.
-        scratch.mkdir(exist_ok=True)
-        reference = scratch / "reference.bytes"
-        frozen(policy).write(reference)
-    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    return PolicyUnderTest(
-        policy.name,
-        policy.signature,
-        policy.graph,
-        paths,
-        {a.format.key: a.size for a in artifacts},
-        reference,
-        job.model.original if job.own is None and job.whole is None else None,
-        policy.source,
-        keys,
-        None if job.profile is None else job.profile.name,
-        paths,
-    )
-
-
-def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
-    """A policy written to a folder that is thrown away."""
-    contract = contract_of(job.policy, job.source, job.model, ReadOptions())
-    artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats]
-    for artifact in artifacts:
-        artifact.write(folder)
-    return _tested(job, folder, artifacts, folder)
 
 
 def joined(

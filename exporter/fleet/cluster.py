@@ -24,7 +24,8 @@ from converters.fetch import address_of, shown
 from converters.runtimes.pool import RuntimePool
 from exporter.export.labels import read_labels
 from exporter.export.names import Claimed
-from exporter.export.pipeline import Exporter, ExportOptions
+from exporter.export.options import ExportOptions
+from exporter.export.pipeline import Exporter
 from exporter.fleet.turns import Turns
 from exporter.fleet.worker import Claim, Outcome, Wanted, exported
 from exporter.version import __version__

@@ -18,7 +18,8 @@ from typing import Any
 from converters.fetch import shown
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Names
-from exporter.export.pipeline import Exporter, ExportOptions
+from exporter.export.options import ExportOptions
+from exporter.export.pipeline import Exporter
 from exporter.fleet.ledger import Ledger
 from exporter.fleet.turns import Turns
 from exporter.fleet.worker import Claim, Outcome, Wanted, exported, work

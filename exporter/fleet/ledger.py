@@ -10,7 +10,7 @@ from typing import Any
 
 from converters.fetch import address_of, shown
 from exporter.export.labels import read_labels
-from exporter.export.pipeline import ExportOptions
+from exporter.export.options import ExportOptions
 from exporter.remote.fetching import version
 from exporter.remote.filesystem import remote
 from exporter.version import __version__

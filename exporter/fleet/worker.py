@@ -15,7 +15,8 @@ from converters.fetch import shown
 from converters.runtimes.child import end_with_parent
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claimed, Naming
-from exporter.export.pipeline import Exporter, ExportOptions, ExportResult, near
+from exporter.export.options import ExportOptions
+from exporter.export.pipeline import Exporter, ExportResult, near
 from exporter.fleet.ledger import Stamp, State, stamps, state
 from exporter.reports.entry import Entry, of_result
 from signatures.errors import ExportModelError, SourceError

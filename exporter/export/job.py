@@ -1,0 +1,144 @@
+"""One policy to write: its contract, its artefacts, and what verification is given of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from converters.format import Artifact, Format, WriteOptions
+from converters.policy import Policy
+from converters.source import ReadOptions, SourceModel
+from exporter.export.options import ExportOptions
+from exporter.export.sources import Source
+from exporter.version import __version__
+from signatures.contract import Contract, Origin, parse
+from signatures.errors import SignatureError, TooLargeError, naming
+from signatures.fields import FieldError, printable
+from signatures.records import dataclass
+
+if TYPE_CHECKING:
+    from converters.targets.profile import Profile
+    from exporter.verify.participants import PolicyUnderTest
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One policy to write, and where it comes from."""
+
+    source: Source
+    model: SourceModel
+    policy: Policy
+    profile: Profile | None = None
+    #: the policy under its own names, where ``policy`` has those of a consumer
+    own: Policy | None = None
+    #: why it has another name than its source's
+    note: str | None = None
+    #: the policy with its weights as they were, where those of ``policy`` are rounded
+    whole: Policy | None = None
+
+
+def artefacts_of(
+    job: Job, formats: Sequence[Format], options: ExportOptions
+) -> tuple[Contract, list[Artifact], tuple[str, ...]]:
+    """The contract, the artefacts, and why some of the usual formats are not among these."""
+    with naming(job.source.path):
+        contract = contract_of(
+            job.policy,
+            job.source,
+            job.model,
+            options.read,
+            None if job.profile is None else job.profile.name,
+            None if job.whole is None else options.weights,
+        )
+        if job.profile is None:
+            how = WriteOptions(contract.compact(), checked=options.verify != "none", weights=options.weights)
+            if options.opset is not None:
+                how = replace(how, opset=options.opset)
+            artifacts, notes = list[Artifact](), list[str]()
+            for form in formats:
+                try:
+                    artifacts.append(form.artifact(job.policy, how))
+                except TooLargeError as error:
+                    if options.targets is not None:
+                        raise
+                    notes.append(f"{form.key} was left out: {error.what}: {error.why}")
+            return contract, artifacts, tuple(notes)
+        how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
+        artifacts = [f.artifact(job.policy, how) for f in formats]
+        for artifact in artifacts:
+            if job.profile.check is not None:
+                job.profile.check(job.profile, artifact.files, job.policy.name)
+        return contract, artifacts, ()
+
+
+def contract_of(
+    policy: Policy,
+    source: Source,
+    model: SourceModel,
+    read: ReadOptions,
+    profile: str | None = None,
+    weights: str | None = None,
+) -> Contract:
+    """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
+    origin = Origin(
+        printable(source.path.name),
+        source.sha256,
+        None if model.name is None else printable(model.name),
+        read.step,
+        read.sensors,
+        read.goals,
+        read.activation,
+    )
+    made = {"name": "export-model", "version": __version__, "profile": profile, "weights": weights}
+    tool = {key: value for key, value in made.items() if value is not None}
+    contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
+    try:
+        parse(contract.to_dict())
+    except FieldError as error:
+        raise SignatureError(
+            "the policy cannot be described",
+            why=f"{error.field} {error.why}",
+            fix="give inputs and outputs other names where the model is made, or choose with --input and --output",
+        ) from error
+    return contract
+
+
+def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
+    """A policy whose artefacts lie in ``stage``; what else verification needs is put into ``scratch``."""
+    from converters.frozen_graph.writer import frozen
+    from converters.saved_model.writer import signatures_of
+    from exporter.verify.participants import PolicyUnderTest
+
+    policy = job.policy
+    paths = {a.format.key: stage / a.main for a in artifacts}
+    reference = paths.get("bytes")
+    if reference is None:
+        # The numpy reference reads a .bytes; one is made for it where none was asked for.
+        scratch.mkdir(exist_ok=True)
+        reference = scratch / "reference.bytes"
+        frozen(policy).write(reference)
+    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
+    return PolicyUnderTest(
+        policy.name,
+        policy.signature,
+        policy.graph,
+        paths,
+        {a.format.key: a.size for a in artifacts},
+        reference,
+        job.model.original if job.own is None and job.whole is None else None,
+        policy.source,
+        keys,
+        None if job.profile is None else job.profile.name,
+        paths,
+    )
+
+
+def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
+    """A policy written to a folder that is thrown away."""
+    contract = contract_of(job.policy, job.source, job.model, ReadOptions())
+    artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats]
+    for artifact in artifacts:
+        artifact.write(folder)
+    return under_test(job, folder, artifacts, folder)
