@@ -1,9 +1,9 @@
 """Inputs to try a policy on, drawn from the policy itself and seeded.
 
-Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, 30 to 300, 1e3, float32
-denormals, every two inputs at opposite extremes, all but one action masked, a memory far from zero), in the patterns
-that observations have (one number alone, zeros and ones …), images in 0..1, dim and bright, pixels at their ends,
-batches of 1 to 8, and a large odd one (a smaller one of large images).
+Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, 8 to 1e4, one number far
+from the others, float32 denormals, every two inputs at opposite extremes, each action masked, a memory far from zero),
+in the patterns that observations have (one number alone, zeros and ones …), images in 0..1, dim and bright, pixels at
+their ends, batches of 1 to 9, and a large odd one (a smaller one of large images).
 """
 
 from __future__ import annotations
@@ -23,8 +23,13 @@ BATCHES = (1, 2, 7)
 LARGE_BATCH = 259
 LARGE_BATCHES_OF_IMAGES = (67, 33, 17, 9)
 MAX_PIXELS = 1 << 21
-#: Values that are far from typical ones and near enough to be met: between eight deviations and 1e3.
-FAR = (30.0, 100.0, 300.0)
+#: How far extremes are, in deviations, and what is beyond them, as it is: from … to …, each number drawn in between.
+EXTREMES = ((5.0, 5.0), (2.5, 4.0), (5.5, 8.0))
+FAR = ((8.0, 30.0), (30.0, 100.0), (100.0, 300.0), (300.0, 1e3), (1e3, 1e4))
+#: The inputs that are far: float32 alone may make a difference there.
+FAR_CASES = ("opposite extremes", "8 to 1e4", "one number far away")
+#: Its first two rows together forbid every action, but for the only one of a branch.
+ONE_ALLOWED = "all but one action masked"
 #: What a free axis behind the batch is tried with (image sides, number of entities).
 _FREE_AXIS = 8
 
@@ -65,20 +70,24 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     for name, style in (*edges, ("denormals", _denormals)):
         cases.append(_case(signature, rng, name, 2, style))
     if any(s.role is Role.MASKS for s in signature.inputs):
-        cases.append(_case(signature, rng, "all but one action masked", 7, _typical, masks=_one_allowed))
+        cases.append(_case(signature, rng, ONE_ALLOWED, 7, _typical, masks=_one_allowed))
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
     large = _large_batch(signature)
     if any(s.role is Role.VISUAL for s in signature.inputs):
         cases.append(_case(signature, rng, "pixels at their ends", 3, _pixel_ends))
         cases.append(_case(signature, rng, f"typical, batch {large}", large, _light))
         if any(_is_free(s) for s in signature.inputs):
-            cases.append(_case(signature, rng, "30 to 300", len(FAR), _far(signature, few=True)))
+            pattern = len(_opposed(signature))
+            if pattern * _pixels(signature) <= MAX_PIXELS:
+                cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature, EXTREMES[:1])))
+            cases.append(_case(signature, rng, "8 to 1e4", len(FAR), _far(signature, few=True)))
         return cases
     cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
     if any(_is_free(s) for s in signature.inputs):
         pattern = len(_opposed(signature))
-        cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature)))
-        cases.append(_case(signature, rng, "30 to 300", pattern * len(FAR), _far(signature)))
+        cases.append(_case(signature, rng, "opposite extremes", pattern * len(EXTREMES), _opposite(signature)))
+        cases.append(_case(signature, rng, "8 to 1e4", pattern * len(FAR), _far(signature)))
+        cases.append(_case(signature, rng, "one number far away", _FEW_FAR, _one_far))
     cases += [_case(signature, rng, name, batch, style) for name, batch, style in _PATTERNS]
     return cases
 
@@ -222,6 +231,25 @@ def _near_zero(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...
     return np.asarray(0.01 * rng.standard_normal(shape))
 
 
+def _unit(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    return rng.random(shape)
+
+
+def _one_far(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """Typical but for one number of each row: where all are far away, what saturates hides what is wrong."""
+    made = _typical(rng, spec, shape).reshape(shape[0] if shape else 1, -1)
+    if made.size:
+        rows = np.arange(len(made))
+        far = rng.choice([-1.0, 1.0], len(rows)) * _between(rng, FAR[0][0], FAR[3][1], rows.shape)
+        made[rows, rng.permutation(np.resize(np.arange(made.shape[1]), len(rows)))] = far
+    return made.reshape(shape)
+
+
+def _between(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers of which each order of magnitude has as many."""
+    return np.asarray(np.exp(rng.uniform(math.log(low), math.log(high), shape)))
+
+
 def _whole(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     return rng.integers(-9, 10, shape).astype(np.float64)
 
@@ -233,7 +261,10 @@ _PATTERNS: tuple[tuple[str, int, Style], ...] = (
     ("all numbers equal", 5, _equal),
     ("near zero", 6, _near_zero),
     ("whole numbers", 8, _whole),
+    ("from zero to one", 9, _unit),
 )
+#: Rows of which each has one number far away.
+_FEW_FAR = 24
 
 #: A memory far from zero, in its standard deviations: what an LSTM's cell may reach, soon and after long.
 _MEMORIES: dict[Style, float] = {_clip_edges: 5.0, _beyond: 5.0, _whole: 50.0}
@@ -263,11 +294,15 @@ def _opposed(signature: PolicySignature) -> np.ndarray:
 
 
 def _large_batch(signature: PolicySignature) -> int:
-    pixels = sum(_numbers(s.shape) for s in signature.inputs if s.role is Role.VISUAL)
+    pixels = _pixels(signature)
     if not pixels:
         return LARGE_BATCH
     fitting = (n for n in LARGE_BATCHES_OF_IMAGES if n * pixels <= MAX_PIXELS)
     return next(fitting, LARGE_BATCHES_OF_IMAGES[-1])
+
+
+def _pixels(signature: PolicySignature) -> int:
+    return sum(_numbers(s.shape) for s in signature.inputs if s.role is Role.VISUAL)
 
 
 def _numbers(shape: Sequence[int | None]) -> int:
@@ -282,24 +317,30 @@ def _signs(signature: PolicySignature, spec: TensorSpec, shape: tuple[int, ...])
     return own[np.arange(shape[0] if shape else 1) % len(own)].reshape(shape)
 
 
-def _opposite(signature: PolicySignature) -> Style:
+def _opposite(signature: PolicySignature, strata: Sequence[tuple[float, float]] = EXTREMES) -> Style:
     def style(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
         mean, std = _statistics(spec)
-        return np.asarray(mean + 5 * std * _signs(signature, spec, shape))
+        return np.asarray(mean + std * _signs(signature, spec, shape) * _sizes(rng, strata, shape))
 
     return style
 
 
 def _far(signature: PolicySignature, *, few: bool = False) -> Style:
-    """The numbers of ``FAR`` with the signs of ``_opposed``, or with ``few`` a row of each, signs drawn."""
+    """The sizes of ``FAR`` with the signs of ``_opposed``, or with ``few`` a row of each, signs drawn."""
 
     def style(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
         signs = rng.choice([-1.0, 1.0], shape) if few else _signs(signature, spec, shape)
-        rows = shape[0] if shape else 1
-        sizes = np.asarray(FAR)[np.arange(rows) * len(FAR) // rows]
-        return np.asarray(signs * sizes.reshape(shape[:1] + (1,) * len(shape[1:])))
+        return np.asarray(signs * _sizes(rng, FAR, shape))
 
     return style
+
+
+def _sizes(rng: np.random.Generator, strata: Sequence[tuple[float, float]], shape: tuple[int, ...]) -> np.ndarray:
+    """As many rows of one stratum as of the next, in their order."""
+    rows = shape[0] if shape else 1
+    which = np.arange(rows) * len(strata) // rows
+    low, high = (np.asarray(strata)[which, i].reshape(-1, *(1,) * len(shape[1:])) for i in (0, 1))
+    return np.asarray(low * (high / low) ** rng.random(shape or (1,))).reshape(shape)
 
 
 def _all_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
@@ -307,7 +348,8 @@ def _all_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) 
 
 
 def _one_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
-    parts = [np.eye(size)[rng.integers(0, size, batch)] for size in branches]
+    """Of each branch another one in the next row."""
+    parts = [np.eye(size)[(rng.integers(0, size) + np.arange(batch)) % size] for size in branches]
     return np.concatenate(parts, axis=1)
 
 

@@ -12,6 +12,8 @@ FALSE_ALARM = 1e-6
 _MIN_EXPECTED = 5.0
 #: Groups of classes by how likely they are.
 _GROUPS = 8
+#: Draws of which fewer than this share repeat another are as good as independent.
+_SHARE = 0.1
 
 
 def chi_square_survival(statistic: float, freedom: int) -> float:
@@ -118,3 +120,47 @@ def _ahead(a: np.ndarray, b: np.ndarray, atol: float, rtol: float) -> int:
     """How many more of sorted ``a`` than of sorted ``b`` are at most x, at worst, b's being given the tolerance."""
     below = np.searchsorted(b, a + atol + rtol * np.abs(a), side="right")
     return int((np.arange(1, a.size + 1) - below).max(initial=0))
+
+
+def dependent(deviations: np.ndarray) -> int:
+    """How many draws apart two are that tell something of each other, 0 where all are independent.
+
+    ``deviations`` [inputs, draws, …] are what was drawn less what is expected. The products of two at a distance are
+    uncorrelated and at most 3, so Bernstein's inequality says how far their sum may be from 0.
+    """
+    count = deviations.shape[1]
+    flat = deviations.reshape(*deviations.shape[:2], -1)
+    spectrum = np.fft.rfft(flat, 2 * count, axis=1)
+    together = np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=(0, 2)), 2 * count)[:count]
+    covariance = np.einsum("nic,nid->ncd", flat, flat) / max(1, count)
+    pairs = np.arange(count, 0, -1)
+    variance = pairs * float(np.square(covariance).sum())
+    sums = np.abs(together)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        exponents = np.where(sums > 0, sums**2 / (2 * (variance + sums)), 0.0)
+    wrong = (exponents > math.log(2 * count / FALSE_ALARM)) & (sums > _SHARE * together[0])
+    return int(np.flatnonzero(wrong[1:])[0]) + 1 if wrong[1:].any() else 0
+
+
+def related(reference: np.ndarray, draws: np.ndarray) -> bool:
+    """Whether the columns of two samples [n, columns] hang together by their ranks otherwise than by chance."""
+    if reference.shape[1] < 2 or not np.isfinite(draws).all():
+        return False
+    count = len(draws)
+    one, other = (np.einsum("ni,nj->ij", r, r) for r in (ranks(reference), ranks(draws)))
+    off = np.abs(one - other)
+    # a product of two ranks is at most 3, its square 1.8 on average
+    exponents = off**2 / (2 * (2 * 1.8 * count + 2 * off))
+    return bool((exponents > math.log(off.size / FALSE_ALARM)).any())
+
+
+def ranks(values: np.ndarray) -> np.ndarray:
+    """The place of each value in its column [n, columns], centred, of variance 1 (0 where all are equal)."""
+    made = np.empty(values.shape)
+    for column, each in enumerate(values.T):
+        _, place, counts = np.unique(each, return_inverse=True, return_counts=True)
+        middle = np.cumsum(counts) - (counts - 1) / 2
+        made[:, column] = middle[place.reshape(-1)]
+    made -= made.mean(axis=0)
+    spread = made.std(axis=0)
+    return np.asarray(np.divide(made, spread, out=np.zeros_like(made), where=spread > 0))

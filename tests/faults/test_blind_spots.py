@@ -20,6 +20,7 @@ from converters.runtimes.registry import RuntimeInfo
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify import work
+from exporter.verify.checks.densities import _joint
 from exporter.verify.checks.draws import least_likely, with_zeros
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
@@ -128,6 +129,11 @@ REGIONS = {
     "near zero": lambda x: (np.abs(x).max(1) < 0.1) & (np.abs(x).max(1) > 1e-6),
     "large observations": lambda x: (np.abs(x) > 12).any(1) & (np.abs(x) < 900).all(1),
     "opposite extremes": lambda x: (x[:, 0] > 4) & (x[:, 5] < -4),
+    "extremes before the clip": lambda x: (x[:, 0] > 2.5) & (x[:, 0] < 4.5) & (x[:, 5] < -2.5) & (x[:, 5] > -4.5),
+    "one large number of some": lambda x: (x[:, 3] > 120) & (x[:, 3] < 280),
+    "one large number alone": lambda x: (x[:, 3] > 12) & (np.sort(np.abs(x), 1)[:, -2] < 5),
+    "beyond two thousand": lambda x: (x > 2000).any(1),
+    "from zero to one": lambda x: ((x > 0) & (x < 1)).all(1),
     "far and opposite": lambda x: (x[:, 7] < -200) & (x[:, 6] > 200) & (np.abs(x) < 900).all(1),
 }
 
@@ -242,6 +248,48 @@ def test_branches_that_are_drawn_from_one_seed_are_seen() -> None:
     p_value, branch, _ = least_likely(np.stack([once, once], axis=2), both, (3, 3))
     assert p_value < 1e-6
     assert branch == 1
+
+
+#: Classes [rows, branches] → those that a sampler gives that does not draw each row by itself.
+DEPENDENT: dict[str, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
+    "in pairs": lambda a: np.repeat(a[::2], 2, axis=0)[: len(a)],
+    "twice over": lambda a: np.resize(a[: (len(a) + 1) // 2], a.shape),
+    "every fourth again": lambda a: np.where(np.arange(len(a))[:, None] % 4 == 3, np.roll(a, 1, axis=0), a),
+}
+
+
+@pytest.mark.parametrize("kind", DEPENDENT)
+def test_draws_that_hang_on_each_other_are_met(kind: str, tmp_path: Path, processes: RuntimePool) -> None:
+    def spoil(feeds: Feeds, answers: Arrays) -> Arrays:
+        return {n: DEPENDENT[kind](a) if n == "action" else a for n, a in answers.items()}
+
+    report = verified("sampled", tmp_path, processes, spoil)
+    assert [f.output for f in report.failures] == ["action"]
+    assert "not independent" in report.failures[0].reason
+
+
+def test_numbers_that_hang_on_each_other_are_seen() -> None:
+    rng = np.random.default_rng(4)
+    right, other = rng.standard_normal((2, 4096, 3)).clip(-1, 2)
+    assert _joint(right, other) is None
+    for spoiled in (np.repeat(other[::2], 2, axis=0), np.resize(other[:2048], other.shape), other[:, [0, 0, 2]]):
+        assert _joint(right, spoiled) is not None
+
+
+@pytest.mark.parametrize("action", [1, 4, 8])
+def test_an_action_whose_mask_the_sampler_ignores_is_met(action: int, tmp_path: Path, processes: RuntimePool) -> None:
+    """Only what is drawn is wrong: the probabilities know the mask."""
+
+    def ignored(model: LoadedModel, feeds: Feeds, fetch: Any) -> Arrays:
+        answers = LoadedModel.run(model, feeds, fetch)
+        if "action" in answers:
+            masks = np.array(feeds["action_masks"])
+            masks[:, action] = 1
+            answers = {**answers, **LoadedModel.run(model, {**feeds, "action_masks": masks}, ["action"])}
+        return answers
+
+    report = verified("sampled", tmp_path, processes, honest, running=ignored)
+    assert "action" in {f.output for f in report.failures}
 
 
 def test_classes_of_another_dtype_are_met(tmp_path: Path, processes: RuntimePool) -> None:

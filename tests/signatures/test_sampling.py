@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from signatures.roles import Role
-from signatures.sampling import BATCHES, LARGE_BATCH, Case, draw_cases, draw_rollout
+from signatures.sampling import BATCHES, EXTREMES, FAR, LARGE_BATCH, Case, draw_cases, draw_rollout
 from signatures.spec import Memory, PolicySignature, TensorSpec
 
 ACTION = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
@@ -66,7 +66,8 @@ def test_every_batch_size_is_tried() -> None:
     assert [c.batch for c in typical] == [b for b in BATCHES for _ in range(3)]
     assert [c.name for c in cases[len(typical) :]] == [
         *("zeros", "clip edges", "beyond the clip", "1e3", "denormals"),
-        *("all but one action masked", "random masks", "pixels at their ends", "typical, batch 67", "30 to 300"),
+        *("all but one action masked", "random masks", "pixels at their ends", "typical, batch 67"),
+        *("opposite extremes", "8 to 1e4"),
     ]
     assert len({c.name for c in cases}) == len(cases)
 
@@ -93,13 +94,15 @@ def test_every_two_numbers_are_at_opposite_extremes_of_two_inputs_too() -> None:
     cases = {c.name: c for c in draw_cases(two)}
     fed = cases["opposite extremes"].feeds
     rows = np.concatenate([(fed["state"] - 1) / 2, fed["state_1"]], axis=1)
-    assert (np.abs(rows) == 5).all()
-    for i in range(11):
-        for j in range(11):
-            assert ((rows[:, i] > 0) & (rows[:, j] < 0)).any() or i == j
-    far = np.concatenate([cases["30 to 300"].feeds[s.name] for s in two.inputs], axis=1)
-    assert {*np.unique(np.abs(far))} == {30, 100, 300}
-    assert all(((far[:, i] == a) & (far[:, j] == -a)).any() for a in (30, 300) for i in (0, 5) for j in (3, 10))
+    for low, high in EXTREMES:
+        here = rows[((low - 1e-5 <= np.abs(rows)) & (np.abs(rows) <= high + 1e-5)).all(axis=1)]
+        assert all(((here[:, i] > 0) & (here[:, j] < 0)).any() for i in range(11) for j in range(11) if i != j)
+    far = np.concatenate([cases["8 to 1e4"].feeds[s.name] for s in two.inputs], axis=1)
+    for low, high in FAR:
+        here = far[((low <= np.abs(far)) & (np.abs(far) <= high)).all(axis=1)]
+        assert all(((here[:, i] > 0) & (here[:, j] < 0)).any() for i in range(11) for j in range(11) if i != j)
+    alone = np.abs(np.concatenate([cases["one number far away"].feeds[s.name] for s in two.inputs], axis=1)) > 8
+    assert alone.any(axis=0).all()
 
 
 def test_the_memory_is_tried_far_from_zero() -> None:
@@ -191,6 +194,7 @@ def test_masks_without_known_branches_are_one_branch() -> None:
     odd = signature(spec("m", Role.MASKS, None, 5), branches=(2, 2))
     case = next(c for c in draw_cases(odd) if c.name == "all but one action masked")
     assert (case.feeds["m"].sum(axis=1) == 1).all()
+    assert not case.feeds["m"][:2].all(axis=0).any()
 
 
 # ------------------------------------------------------------------ rollouts

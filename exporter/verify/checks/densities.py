@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.checks.draws import DRAWS, likely
+from exporter.verify.checks.draws import DEPENDENT, DRAWS, likely
 from exporter.verify.checks.seeds import REPEATED, repeated
-from exporter.verify.difference import wrong
+from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant
-from exporter.verify.statistics import same_distribution
+from exporter.verify.statistics import dependent, ranks, related, same_distribution
 from exporter.verify.trial import Trial
 from signatures.roles import Role
 from signatures.sampling import Case
@@ -51,10 +51,23 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
         if name in alike:
             yield trial.finding(Draws, participant, name, wrong(REPEATED), case.name)
             continue
+        one, other = (s[name].reshape(len(s[name]), -1) for s in samples)
+        if one.shape == other.shape and (difference := _joint(one, other)) is not None:
+            yield trial.finding(Draws, participant, name, difference, case.name)
+            continue
         tolerance = trial.tolerance(name, participant)
         columns = (s[name].reshape(len(s[name]), -1).T for s in samples)
         p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in zip(*columns, strict=True)]
         yield trial.finding(Draws, participant, name, likely(min(p_values, default=1.0)), case.name)
+
+
+def _joint(reference: np.ndarray, drawn: np.ndarray) -> Difference | None:
+    """What is wrong with numbers [draws, columns] together, whatever each is by itself."""
+    if np.isfinite(drawn).all() and (apart := dependent(ranks(drawn).T[:, :, None])):
+        return wrong(DEPENDENT.format(apart))
+    if related(reference, drawn):
+        return wrong("its numbers hang together otherwise than the reference's: one draw serves several")
+    return None
 
 
 def _rows(trial: Trial, case: Case, count: int, run: int = 0) -> dict[str, np.ndarray]:

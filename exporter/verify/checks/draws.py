@@ -11,17 +11,19 @@ from exporter.verify.checks.seeds import REPEATED, repeated
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Feeds, Participant, Run
-from exporter.verify.statistics import FALSE_ALARM, fit, fit_all
+from exporter.verify.statistics import FALSE_ALARM, dependent, fit, fit_all
 from exporter.verify.trial import Trial
 from signatures.roles import Role
+from signatures.sampling import ONE_ALLOWED
 
 #: Draws for one input; all draws together, where a run takes long.
 DRAWS = 512
 FEW = 2 * DRAWS
 #: Draws that two starts are compared by, where a run takes long.
 STARTS = 48
+DEPENDENT = "its draws are not independent: rows {} apart draw alike"
 #: Where float32 has few digits left, a runtime's probabilities may be others within rounding.
-_LEFT_OUT = frozenset(("1e3", "denormals"))
+_LEFT_OUT = frozenset(("1e3", "denormals", "one number far away"))
 #: How often a runtime's uniform number is exactly 0, which draws the first class that has any probability at all.
 #: TensorFlow.js' WebGL shader makes numbers of 12 bits (measured on 4.22: 36 of 153,600, 2^-12 is 37.5 of them).
 _ZEROS = {"tfjs-webgl": 2.0**-12}
@@ -37,12 +39,17 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     if action not in trial.reference.drawn or any(scores not in e for e in trial.expected):
         return
     made = zip(trial.cases[: len(trial.cases) - len(trial.golden.cases)], trial.expected, strict=False)
-    known = [(c, e[scores][0]) for c, e in made if c.name not in _LEFT_OUT and not np.isnan(e[scores][0]).any()]
+    known = [
+        (case, row, expected[scores][row])
+        for case, expected in made
+        for row in range(2 if case.name == ONE_ALLOWED else 1)
+        if case.name not in _LEFT_OUT and not np.isnan(expected[scores][row]).any()
+    ]
     if not known:
         return
-    cases = [case for case, _ in known]
-    rows = [{name: array[:1] for name, array in case.feeds.items()} for case in cases]
-    log_probs = np.stack([scores for _, scores in known])
+    cases = [case for case, _, _ in known]
+    rows = [{name: array[row : row + 1] for name, array in case.feeds.items()} for case, row, _ in known]
+    log_probs = np.stack([scores for _, _, scores in known])
     if participant.runtime in _ZEROS:
         log_probs = with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
     for branch, row in _started_alike(trial, participant, action, rows, log_probs).items():
@@ -52,6 +59,8 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     drawn = _drawn(trial, participant, action, rows)
     p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
     difference = likely(p_value)
+    if difference.passed and (apart := repeats(drawn, log_probs, trial.signature.branches)):
+        difference = wrong(DEPENDENT.format(apart))
     begins = trial.bisected(participant, action, difference, rows[worst], branch)
     yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
 
@@ -145,6 +154,18 @@ def least_likely(drawn: np.ndarray, log_probs: np.ndarray, branches: Sequence[in
     if wrong_alone:  # what is wrong by itself is wrong beside another, too
         _, branch, worst = min(wrong_alone)
     return min(1.0, p_value * count), branch, worst
+
+
+def repeats(drawn: np.ndarray, log_probs: np.ndarray, branches: Sequence[int]) -> int:
+    """How many rows are between draws that tell something of each other; 0 where none do."""
+    parts = np.split(log_probs, np.cumsum(branches)[:-1], axis=1)
+    for branch, part in enumerate(parts):
+        probs = np.exp(part.astype(np.float64))
+        probs /= probs.sum(axis=1, keepdims=True)
+        found = dependent(np.eye(part.shape[1])[drawn[:, :, branch].astype(int)] - probs[:, None])
+        if found:
+            return found
+    return 0
 
 
 def likely(p_value: float) -> Difference:
