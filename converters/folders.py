@@ -16,7 +16,6 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 #: The file that says whose a folder is, and what it says.
 MARKER, OURS = "stage.txt", b"export-model writes here, and removes this folder when it is done\n"
@@ -63,9 +62,7 @@ class OwnFolder:
     def __enter__(self) -> Path:
         return self.path
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 

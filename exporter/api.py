@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from exporter.export.options import ExportOptions, compile_options, storage
 from exporter.export.pipeline import ExportResult, export
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
+from exporter.remote.fetching import nearby
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
 from signatures.errors import ParityError, UsageError
@@ -165,9 +166,9 @@ def inspect_model(
             print(found.policy.name, found.policy.signature.inputs, found.targets)
     """
     options = compile_options("canonical", "lift", False, brain, inputs, outputs, values)
-    return inspect_source(
-        source, options, ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation)
-    )
+    read = ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation)
+    with nearby(Path(source)) as here:
+        return inspect_source(here, options, read)
 
 
 def verify_bundle(
@@ -192,13 +193,14 @@ def verify_bundle(
         report = verify_bundle("out/3DBall", source="3DBall.bytes", runtimes=["onnxruntime"])
         print(report.verdict, report.failures)
     """
-    return verify_folder(
-        Path(bundle),
-        source=None if source is None else Path(source),
-        step=step,
-        trust_source=trust_source,
-        runtimes=runtimes,
-        options=options,
-        allow_unverified=allow_unverified,
-        progress=_LOG.info,
-    )
+    with ExitStack() as fetched:
+        return verify_folder(
+            fetched.enter_context(nearby(Path(bundle))),
+            source=None if source is None else fetched.enter_context(nearby(Path(source))),
+            step=step,
+            trust_source=trust_source,
+            runtimes=runtimes,
+            options=options,
+            allow_unverified=allow_unverified,
+            progress=_LOG.info,
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import sys
 import textwrap
@@ -75,6 +76,11 @@ def paragraph(text: str, first: str = "", rest: str = "") -> str:
     return textwrap.fill(
         text, width, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
     )
+
+
+def typed(*words: object) -> str:
+    """A call of this program as a shell takes it: what has spaces or quotes is quoted."""
+    return shlex.join(["export-model", *map(str, words)])
 
 
 def hint(command: str, why: str) -> str:

@@ -11,6 +11,7 @@
     ├── GraphError              2  a node of the graph is wrong or cannot be converted
     │   └── UnsupportedOpError  2  an op that the op table does not hold
     ├── SignatureError          2  inputs and outputs cannot be given their roles
+    ├── TooLargeError           2  a format cannot hold a policy of that size
     ├── ProfileError            2  a consumer (--for) cannot hold the policy
     ├── BundleError             2  a bundle is missing, incomplete or has been changed
     ├── ParityError             1  two runtimes disagree
@@ -22,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from operator import index
 from typing import Any
 
 from signatures.fields import printable
@@ -82,6 +84,20 @@ class UsageError(ExportModelError):
     """The command line or the call is wrong: an unknown target, a flag that contradicts another."""
 
 
+def whole(name: str, value: object, least: int, most: int | None = None) -> int:
+    """A number that a caller gave, as an int; numpy's are whole numbers too. Raises UsageError."""
+    try:
+        number = index(value)  # type: ignore[arg-type]  # it is what refuses others
+    except TypeError:
+        number = least - 1
+    if isinstance(value, bool) or number < least or (most is not None and number > most):
+        fix = (
+            f"give a whole number of {least} or more" if most is None else f"give a whole number from {least} to {most}"
+        )
+        raise UsageError(f"{name} is {value}", fix=fix)
+    return number
+
+
 class SourceError(ExportModelError):
     """The source cannot be read."""
 
@@ -98,11 +114,14 @@ class RefusedError(ExportModelError):
     """Of several sources, some could not be exported; the others were. ``errors`` has one for each."""
 
     def __init__(self, errors: Sequence[ExportModelError], count: int) -> None:
-        self.errors = tuple(errors)
+        self.errors, self._count = tuple(errors), count
         super().__init__(
             f"{len(errors)} of {count} sources could not be exported; the others were",
             why="\n".join(e.message for e in errors),
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.errors, self._count)
 
     def to_dict(self) -> dict[str, Any]:
         """As the base, with the errors."""
@@ -116,17 +135,9 @@ class GraphError(ExportModelError):
 class UnsupportedOpError(GraphError):
     """Ops that no entry of the op table covers. ``issues`` names every node, not only the first."""
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        issues: Sequence[tuple[str, str]] = (),
-        where: str | None = None,
-        why: str | None = None,
-        fix: str | None = None,
-    ) -> None:
+    def __init__(self, what: str, *, issues: Sequence[tuple[str, str]] = (), **parts: str | None) -> None:
         self.issues = tuple(issues)
-        super().__init__(what, where=where, why=why, fix=fix)
+        super().__init__(what, **parts)
 
     def to_dict(self) -> dict[str, Any]:
         """As the base, with the list of (node, op)."""
@@ -154,11 +165,9 @@ class ParityError(ExportModelError):
 
     exit_status = 1
 
-    def __init__(
-        self, what: str, *, report: Any = None, where: str | None = None, why: str | None = None, fix: str | None = None
-    ) -> None:
+    def __init__(self, what: str, *, report: Any = None, **parts: str | None) -> None:
         self.report = report
-        super().__init__(what, where=where, why=why, fix=fix)
+        super().__init__(what, **parts)
 
 
 class RuntimeUnavailableError(ExportModelError):

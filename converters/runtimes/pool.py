@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 
 from converters.format import Format
 from converters.runtimes.process import RuntimeProcess
@@ -93,9 +93,7 @@ class RuntimePool:
     def __enter__(self) -> RuntimePool:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for process in self._processes.values():
             process.hang_up()
         for process in self._processes.values():

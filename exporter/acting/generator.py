@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from signatures.errors import UsageError
+from signatures.errors import UsageError, whole
 
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
@@ -27,8 +27,7 @@ class Generator:
     """Uniform and normal draws, numbered from 0: the counter is a draw's number with the seed's upper half."""
 
     def __init__(self, seed: int) -> None:
-        if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-            raise UsageError(f"the seed is {seed}", fix=f"give a whole number from 0 to {MAX_SEED}")
+        seed = whole("the seed", seed, 0, MAX_SEED)
         self._key, self._upper = seed & 0xFFFFFFFF, seed >> 32
         self._drawn = 0
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,15 +53,14 @@ def compare_command(
     from converters.fetch import shown
     from converters.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
-    from exporter.remote.fetching import nearby
     from exporter.reports.entry import Entry
 
     console.prepare()
     read: list[Policy] = []
-    with ExitStack() as fetched, console.progress() as progress:
+    with console.progress() as progress:
         report = compare_artefacts(
-            fetched.enter_context(nearby(reference)),
-            [fetched.enter_context(nearby(candidate)) for candidate in candidates],
+            reference,
+            candidates,
             names=pairs(mapped, "--map"),
             runtimes=runtimes,
             options=options,

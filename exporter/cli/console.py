@@ -72,12 +72,10 @@ class Console:
         for number, rule in enumerate(self.rules(), 1):
             if any(rule.covers(r.policy, c.format, c.runtime, c.output) for r in reports for c in r.comparisons):
                 continue
-            parts = {n: getattr(rule, n) for n in ("policy", "format", "runtime", "output")}
-            said = ", ".join(f"{n} {v!r}" for n, v in parts.items() if v is not None)
             raise UsageError(
                 f"--tolerances: entry {number} covers no comparison",
                 where=str(self.tolerances),
-                why=f"it is for {said}",
+                why=f"it is for {rule.names}",
                 fix="check its names against the report, or take it out",
             )
 
@@ -200,10 +198,11 @@ class Console:
             last = results[-1]
             files = ", ".join(sorted(p.name for p in last.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
             from converters.targets.profiles import profile as known
+            from exporter.tables import typed
 
             wanted = known(profile)
             say(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
-            say(f"next: export-model snippets {last.folder} --for {wanted.name}    (what to set there)")
+            say(f"next: {typed('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
             say("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
@@ -217,7 +216,7 @@ class Console:
 
 def _next(results: Sequence[ExportResult]) -> str:
     """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
-    from exporter.tables import hint
+    from exporter.tables import hint, typed
 
     last = results[-1]
     if len(results) > 1:
@@ -225,16 +224,16 @@ def _next(results: Sequence[ExportResult]) -> str:
 
         last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), last)
     if last.report is None:
-        return hint(f"export-model verify {last.folder}", "nothing was compared yet")
+        return hint(typed("verify", last.folder), "nothing was compared yet")
     if last.report.passed is None:
         from exporter.reports.summary import to_verify
 
         install = to_verify(last.report)
         if install is not None:
-            return hint(install, f"then: export-model verify {last.folder}")
+            return hint(install, f"then: {typed('verify', last.folder)}")
     if {"tfjs", "bytes"} <= {*last.sizes}:
-        return hint(f"export-model serve {last.folder}", "see it act, in a browser")
-    return hint(f"export-model snippets {last.folder}", "code for Python, JavaScript, C#, Unity, TF Serving")
+        return hint(typed("serve", last.folder), "see it act, in a browser")
+    return hint(typed("snippets", last.folder), "code for Python, JavaScript, C#, Unity, TF Serving")
 
 
 def reporting(command: Callable[..., Any]) -> Callable[..., Any]:

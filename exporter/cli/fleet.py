@@ -42,8 +42,15 @@ def run_fleet(
     entries: list[Entry] = []
     answers: list[Any] = []
     refused: list[Any] = []
+    count = 1 if jobs is None else jobs
     outcomes = export_fleet(
-        paths, options, jobs=jobs or 1, cluster=cluster, again=again, fail_fast=fail_fast, wanted=wanted
+        paths,
+        options,
+        jobs=count,
+        cluster=cluster,
+        again=again,
+        fail_fast=fail_fast,
+        wanted=wanted,
     )
     with console.progress_bar(len(paths)) as bar:
         for outcome in outcomes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,6 +75,7 @@ def inspect_command(
     from converters.fetch import shown
     from converters.graph.options import CompileOptions
     from exporter.remote.fetching import nearby
+    from exporter.tables import typed
 
     if len(sources) > 1 and (logdir is not None or svg is not None):
         raise UsageError("--logdir and --svg are for one source", fix="name one")
@@ -113,7 +113,7 @@ def inspect_command(
     if as_json:
         say_json(found[0] if len(sources) == 1 else {"sources": found})
     elif not releases and status == 0:
-        say(f"next: {shlex.join(['export-model', *map(shown, sources), *_given_for_both(), '-o', 'exported'])}")
+        say(f"next: {typed(*map(shown, sources), *_given_for_both(), '-o', 'exported')}")
     if status:
         sys.exit(status)
 

@@ -31,12 +31,13 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
 def one_bundle(place: Path, command: str) -> Path | None:
     """The bundle at ``place``, or the only one in that folder; None where there is none. Raises UsageError."""
     from converters.bundle.bundle import bundles_in
+    from exporter.tables import typed
 
     found = bundles_in(place)
     if len(found) > 1:
         names = ", ".join(p.name for p in found)
         raise UsageError(
-            f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: export-model {command} {found[0]}"
+            f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: {typed(command, found[0])}"
         )
     return found[0] if found else None
 

@@ -85,6 +85,7 @@ def _bundle_of(place: Path) -> Iterator[Path]:
     from converters.folders import scratch_folder
     from exporter.export.options import ExportOptions
     from exporter.export.pipeline import export
+    from exporter.tables import typed
 
     with scratch_folder() as folder:
         results = list(export([place], ExportOptions(folder, ("bytes", "tfjs"), verify="none")))
@@ -92,7 +93,8 @@ def _bundle_of(place: Path) -> Iterator[Path]:
             raise UsageError(
                 f"{place} holds {len(results)} policies",
                 why=", ".join(r.policy.name for r in results),
-                fix=f"export-model {place} -o exported    (then: export-model serve exported/{results[0].policy.name})",
+                fix=f"{typed(place, '-o', 'exported')}    "
+                f"(then: {typed('serve', Path('exported', results[0].policy.name))})",
             )
-        say(f"exported for this page alone, not compared; to keep it: export-model {place} -o exported", err=True)
+        say(f"exported for this page alone, not compared; to keep it: {typed(place, '-o', 'exported')}", err=True)
         yield results[0].folder

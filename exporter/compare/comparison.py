@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.source import OriginalRun, ReadOptions
 from exporter.export.sources import read_source
+from exporter.remote.fetching import nearby
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
@@ -120,30 +121,33 @@ def compare_artefacts(
         report = compare_artefacts("3DBall.bytes", "theirs.onnx", names={"action": "Identity"})
         assert report.passed, report.failures
     """
-    reference = Path(reference)
-    given = [candidates] if isinstance(candidates, Path | str) else candidates
-    policy, source = _reference(reference, understanding, read)
-    if understood is not None:
-        understood(policy)
-    artefacts = [(path, *found) for path in map(Path, given) for found in ports_of(path)]
-    if not artefacts:
-        raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
-    aliases = _mapped(_aliases(policy, reference), names or {}, [p for *_, p in artefacts])
-    made = _made_here(reference, policy)
-    labels = _labels(artefacts)
-    matched = [
-        _match(label, kind, ports, policy, aliases, made)
-        for label, (_, kind, ports) in zip(labels, artefacts, strict=True)
-    ]
-    used, known = chosen_runtimes(runtimes, [m.format for m in matched])
-    if options is not None:
-        check_budget(options.budget, {m.label: 0 for m in matched})
-        outputs = {policy.name: [s.name for s in policy.signature.outputs]}
-        check_rules(options.rules, outputs, {m.format.key: m.format.runtimes for m in matched}, used)
-    with scratch_folder() as folder, _opened(pool) as pool:
-        reference_file = Path(folder, "reference.bytes")
+    with ExitStack() as opened:
+        given = [candidates] if isinstance(candidates, Path | str) else candidates
+        reference = opened.enter_context(nearby(Path(reference)))
+        near = [opened.enter_context(nearby(Path(path))) for path in given]
+        policy, source = _reference(reference, understanding, read)
+        if understood is not None:
+            understood(policy)
+        artefacts = [(path, *found) for path in near for found in ports_of(path)]
+        if not artefacts:
+            raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
+        aliases = _mapped(_aliases(policy, reference), names or {}, [p for *_, p in artefacts])
+        made = _made_here(reference, policy)
+        labels = _labels(artefacts)
+        matched = [
+            _match(label, kind, ports, policy, aliases, made)
+            for label, (_, kind, ports) in zip(labels, artefacts, strict=True)
+        ]
+        used, known = chosen_runtimes(runtimes, [m.format for m in matched])
+        if options is not None:
+            check_budget(options.budget, {m.label: 0 for m in matched})
+            outputs = {policy.name: [s.name for s in policy.signature.outputs]}
+            check_rules(options.rules, outputs, {m.format.key: m.format.runtimes for m in matched}, used)
+        folder = Path(opened.enter_context(scratch_folder()))
+        pool = opened.enter_context(RuntimePool()) if pool is None else pool
+        reference_file = folder / "reference.bytes"
         frozen(policy).write(reference_file)
-        copies = [_vetted(m, Path(folder, str(number))) for number, m in enumerate(matched)]
+        copies = [_vetted(m, folder / str(number)) for number, m in enumerate(matched)]
         tested = PolicyUnderTest(
             policy.name,
             policy.signature,
@@ -169,11 +173,6 @@ def compare_artefacts(
             fix="export-model runtimes lists the runtimes and how to install each; or --allow-unverified",
         )
     return report
-
-
-def _opened(pool: RuntimePool | None) -> AbstractContextManager[RuntimePool]:
-    """A pool that is given stays open."""
-    return RuntimePool() if pool is None else nullcontext(pool)
 
 
 def _reference(

@@ -116,8 +116,7 @@ class Exporter:
             from converters.runtimes.pool import chosen_runtimes  # a cold start without verification needs none of it
 
             self.runtimes, self._known = chosen_runtimes(options.verify, self._formats)
-        if self.runtimes:
-            check_budget(options.parity.budget, {f.key: 0 for f in self._formats})
+        _check_parity(options, self._formats)
         check_sendable(options.out)
         self._labels = read_labels(options.labels)
 
@@ -269,6 +268,20 @@ def consumer(name: str) -> Profile:
     from converters.targets.profiles import profile  # most exports are for no consumer in particular
 
     return profile(name)
+
+
+def _check_parity(options: ExportOptions, formats: Sequence[Format]) -> None:
+    """What decides whether a policy passed is there, and is asked. Raises UsageError."""
+    parity = options.parity
+    deciding = {"--golden": parity.golden, "--max-size": parity.budget, "--tolerances": parity.rules}
+    given = [flag for flag, value in deciding.items() if value]
+    if options.verify == "none" and given:
+        raise UsageError(f"{given[0]} needs a verification", why="--verify none was given", fix="leave one of them out")
+    check_budget(parity.budget, {f.key: 0 for f in formats})
+    if parity.golden is not None:
+        from exporter.verify.golden import recorded
+
+        recorded(Path(parity.golden))
 
 
 def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from converters.fetch import shown
@@ -47,7 +46,7 @@ def export_fleet(
     RuntimeUnavailableError before the first source is read; what becomes of a source is in its Outcome.
     """
     if jobs < 1:
-        raise UsageError(f"--jobs {jobs}", fix="give a number from 1 on")
+        raise UsageError(f"--jobs {jobs}", fix="give 1 or more")
     if options.name is not None and len(paths) > 1:
         raise UsageError("--name goes with a single policy", fix="export one source, or leave --name out")
     wanted = wanted or Wanted()
@@ -186,9 +185,7 @@ class _Crew:
     def __enter__(self) -> _Crew:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for worker in self.workers:
             worker.process.terminate()
         for worker in (*self.workers, *self.ending):

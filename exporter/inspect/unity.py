@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,12 @@ from converters.targets.unity.checker import ModeVerdict, UnityVerdict, check_fi
 from converters.targets.unity.consumers import CONSUMERS, consumer
 from converters.targets.unity.findings import Finding, Thrown
 from converters.targets.unity.settings import Brain, parse_actions, parse_sensors, read_brain
+from exporter.tables import paragraph
 from signatures.errors import UsageError
 from signatures.fields import printable
 
 _MODES = {"stochastic": "Deterministic Inference off", "deterministic": "Deterministic Inference on"}
 _READ = (".onnx", ".nn")
-_WIDTH = 110
 
 
 def check_for_unity(
@@ -94,10 +93,10 @@ def _verdict_text(verdict: UnityVerdict) -> str:
             lines += _mode_lines("" if same else f", {_MODES[mode]}", found)
     if verdict.misread:
         lines.append(f"  what {verdict.consumer.runtime} reads wrongly:")
-        lines += [line for finding in verdict.misread for line in _finding_lines(finding, "misread")]
+        lines += [line for finding in verdict.misread for line in _told("misread", finding)]
     if verdict.overlooked:
         lines.append("  what Unity does not say:")
-        lines += [line for finding in verdict.overlooked for line in _finding_lines(finding, "in play")]
+        lines += [line for finding in verdict.overlooked for line in _told("in play", finding)]
     return "\n".join(lines)
 
 
@@ -116,40 +115,25 @@ def _mode_lines(title: str, found: ModeVerdict) -> list[str]:
         lines += _thrown_lines(found.load)
     if found.check_throws is not None and found.check_throws == found.load:
         return [*lines, f"  the Inspector{title}: the same exception in place of a list"]
-    listed = [line for finding in found.checks for line in _finding_lines(finding, finding.severity.value)]
+    listed = [line for finding in found.checks for line in _told(finding.severity.value, finding)]
     if found.check_throws is not None:
         listed = _thrown_lines(found.check_throws)
     return [*lines, f"  the Inspector{title}: {'' if listed else 'nothing to say'}".rstrip(), *listed]
 
 
-def _finding_lines(finding: Finding, kind: str) -> list[str]:
-    return [
-        *_wrapped(f"{kind}: ", finding.message),
-        *_wrapped("  where: ", finding.where),
-        *_wrapped("  fix: ", finding.fix),
-    ]
+def _told(kind: str, said: Finding | Thrown) -> list[str]:
+    """A finding or an exception: what, where and what to do."""
+    lines = []
+    for head, text in ((f"{kind}: ", said.message), ("  where: ", said.where), ("  fix: ", said.fix)):
+        for number, part in enumerate(text.rstrip("\n").split("\n")):
+            if part.strip():
+                indent = " " * 4 + (head if number == 0 else " " * 4)
+                lines += paragraph(part, indent, " " * 8).split("\n")
+    return lines
 
 
 def _thrown_lines(thrown: Thrown) -> list[str]:
-    return [
-        *_wrapped(f"throws {thrown.exception}: ", thrown.message),
-        *_wrapped("  where: ", thrown.where),
-        *_wrapped("  fix: ", thrown.fix),
-    ]
-
-
-def _wrapped(head: str, text: str) -> list[str]:
-    lines = []
-    for number, part in enumerate(text.rstrip("\n").split("\n")):
-        lines += textwrap.wrap(
-            (head if number == 0 else " " * 4) + printable(part),
-            _WIDTH,
-            initial_indent="    ",
-            subsequent_indent=" " * 8,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-    return lines
+    return _told(f"throws {thrown.exception}", thrown)
 
 
 def _agent_text(brain: Brain) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -13,7 +12,7 @@ from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
 from exporter.reports.matrix import Cell, matrix
-from exporter.tables import size_text
+from exporter.tables import size_text, typed
 from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
 
@@ -81,7 +80,7 @@ def again(entry: Entry) -> Markup | None:
     ran = [name for name, state in report.runtimes.items() if state["status"] == "ran" and name != "numpy"]
     chosen = ["--runtimes", ",".join(ran)] if ran else ["--allow-unverified"]
     numbers = ["--seed", str(report.seed), "--samples", str(report.samples), "--steps", str(entry.steps)]
-    line = shlex.join(["export-model", *entry.command, *chosen, *numbers])
+    line = typed(*entry.command, *chosen, *numbers)
     return el("p", "The same again: ", el("code", line), class_="soft again")
 
 

@@ -77,9 +77,17 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
     return Golden(tuple(cases), tuple(answers), frozenset(noiseless))
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
+def recorded(path: Path) -> bytes:
+    """The content of a recording. Raises UsageError where it cannot be read."""
     try:
-        data = read_bytes(path)
+        return read_bytes(path)
+    except SourceError as error:
+        raise UsageError(f"--golden: {error.what}", where=str(path), why=error.why, fix=error.fix) from error
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    data = recorded(path)
+    try:
         with opened(data) as archive:
             names = archive.namelist()
             odd = next((name for name in names if not name.endswith(".npy")), None)
@@ -89,8 +97,6 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             if whole > MAX_UNPACKED_FREE + MAX_UNPACKED_FACTOR * len(data):
                 raise ValueError(f"its {len(data)} bytes unpack to {whole}")
             return {name.removesuffix(".npy"): read_array(entry_of(archive, name, whole)) for name in names}
-    except SourceError as error:
-        raise UsageError(f"--golden: {error.what}", where=str(path), why=error.why, fix=error.fix) from error
     except (*ZIP_ERRORS, TypeError, RecursionError) as error:
         raise UsageError(
             "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"

@@ -8,7 +8,7 @@ from dataclasses import field
 from pathlib import Path
 
 from exporter.verify.tolerances import Tolerance, ToleranceRule
-from signatures.errors import UsageError
+from signatures.errors import UsageError, whole
 from signatures.records import dataclass
 
 
@@ -29,8 +29,7 @@ class VerifyOptions:
 
     def __post_init__(self) -> None:
         for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):
-            if value < least:
-                raise UsageError(f"{name} is {value}", fix=f"give {least} or more")
+            object.__setattr__(self, name, whole(name, value, least))
         for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
             if not math.isfinite(bound) or bound < 0:
                 raise UsageError(f"{name} is {bound}", fix="give a number that is not negative")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,6 +96,11 @@ def test_near_seeds_are_far_apart() -> None:
     first = np.array([Generator(seed).uniform((1,))[0] for seed in seeds])
     assert len(set(first)) == len(first)
     assert fit((first * 16).astype(int), np.log(np.full(16, 1 / 16, np.float32))) >= FALSE_ALARM
+
+
+def test_a_seed_of_numpy_is_a_seed() -> None:
+    seed: Any = np.int64(5)
+    np.testing.assert_array_equal(Generator(seed).uniform((3,)), Generator(5).uniform((3,)))
 
 
 @pytest.mark.parametrize("seed", [-1, MAX_SEED + 1, 1.5])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from converters.pieces import Pieces
@@ -62,6 +65,9 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--verify", "onnxruntime,torch"], ["there is no runtime 'torch'"]),
         (["--seed", "-1"], ["seed is -1"]),
         (["--atol", "nan"], ["atol is nan"]),
+        (["--golden", "nowhere.npz"], ["--golden needs a verification", "--verify none"]),
+        (["--max-size", "bytes=1B"], ["--max-size needs a verification"]),
+        (["--jobs", "0"], ["--jobs 0", "give 1 or more"]),
         (["--rtol", "inf"], ["rtol is inf"]),
         (["--atol", "-1e-5"], ["atol is -1e-05"]),
     ],
@@ -137,10 +143,17 @@ def test_the_python_interface_refuses_the_same(call: dict[str, object], words: s
         export_by_python(BALL, out, **{"verify": "none", **call})
 
 
-@pytest.mark.parametrize("options", [{"seed": -1}, {"samples": 0}, {"steps": 0}])
-def test_options_of_verification_have_bounds(options: dict[str, int]) -> None:
+@pytest.mark.parametrize("options", [{"seed": -1}, {"samples": 0}, {"steps": 0}, {"samples": 2.5}, {"steps": "4"}])
+def test_options_of_verification_are_whole_numbers_within_bounds(options: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="or more"):
         VerifyOptions(**options)
+    assert VerifyOptions(seed=np.int64(3)).seed == 3  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("flags", [(), ("--again",)])
+def test_a_recording_that_is_not_there_is_said_before_anything_is_read(flags: tuple[str, ...], out: Path) -> None:
+    ran = export_model(BALL, "-o", out, "--golden", "nowhere.npz", "--verify", "onnxruntime", *flags)
+    is_refused(ran, "nowhere.npz: --golden", "no such file")
 
 
 def test_tolerances_are_finite_and_not_negative() -> None:
@@ -247,6 +260,7 @@ def test_a_source_that_is_refused_does_not_stop_the_others(ball: Path, tmp_path:
     with pytest.raises(RefusedError, match="2 of 3 sources") as caught:
         export_by_python([bad, ball, gone], tmp_path / "out", verify="none")
     assert len(caught.value.errors) == 2
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
 AS_NOBODY = """

@@ -128,12 +128,13 @@ def test_the_module_is_the_command() -> None:
 
 
 def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) -> None:
-    ran = export_model(BALL, "-o", tmp_path, *UNVERIFIED)
+    out = tmp_path / "a folder"
+    ran = export_model(BALL, "-o", out, *UNVERIFIED)
     lines = ran.out.splitlines()
     assert ran.err == ""
     assert lines[0].startswith("continuous: ")
-    assert lines[0].endswith(f" -> {tmp_path / 'continuous'}")
-    assert lines[-1].startswith(f"next: export-model verify {tmp_path / 'continuous'}")
+    assert lines[0].endswith(f" -> {out / 'continuous'}")
+    assert lines[-1].startswith(f"next: export-model verify '{out / 'continuous'}'")
     assert "NOT VERIFIED: --verify none" in lines
     assert [line.split()[0] for line in lines[3:7]] == list(DEFAULTS)
 

@@ -16,7 +16,7 @@ import pytest
 
 from converters import fetch
 from converters.fetch import address_of
-from exporter import export_model
+from exporter import compare_artefacts, export_model, inspect_model, verify_bundle
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
@@ -64,6 +64,20 @@ def test_what_is_written_is_what_files_give(memory: Any, tmp_path: Path) -> None
     sent = {path.removeprefix("/out/"): memory.cat(path) for path in memory.find("/out")}
     assert sent == local
     assert {name.split("/")[0] for name in sent} == {"continuous", "discrete", "b-continuous"}
+
+
+def test_every_job_of_python_takes_addresses(memory: Any) -> None:
+    (policy,) = inspect_model("memory://runs/a/continuous.bytes").policies
+    assert policy.policy.name == "continuous"
+    run(["memory://runs/a/continuous.bytes"], "memory://out")
+    again = verify_bundle(
+        "memory://out/continuous", source="memory://runs/a/continuous.bytes", runtimes=["onnxruntime"]
+    )
+    assert again.passed, again.failures
+    report = compare_artefacts(
+        "memory://runs/a/continuous.bytes", "memory://out/continuous/continuous.onnx", runtimes=["onnxruntime"]
+    )
+    assert report.passed, report.failures
 
 
 def test_policy_json_is_sent_last_and_goes_first(memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,10 +35,12 @@ def test_an_accepted_policy_has_status_0_and_nothing_to_say(tmp_path: Path) -> N
     assert "the agent (assumed from the file): actions 2 continuous; sensors VectorSensor_size5 5" in result.output
 
 
-def test_a_message_is_shown_with_its_place_and_what_mends_it(tmp_path: Path) -> None:
+def test_a_message_is_shown_with_its_place_and_what_mends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     result = run(Draft().write(tmp_path), "--unity", "r20", "--sensors", "7", "--actions", "continuous:2")
     assert result.exit_code == 1
-    assert "was expecting\n        [?x5] for the VectorSensor_size7 Sensor." in result.output
+    assert "was expecting [?x5] for the VectorSensor_size7 Sensor." in " ".join(result.output.split())
+    assert max(map(len, result.output.splitlines()[2:])) <= 80
     assert "where: input obs_0" in result.output and "fix: the sensor gives 7" in result.output
 
 
