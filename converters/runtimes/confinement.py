@@ -7,8 +7,9 @@ no core is dumped, files and their number are bounded. Memory is bounded while a
 (converters/runtimes/process.py), because what is fair depends on it. All of it is Linux; elsewhere, and where a kernel
 lacks a part, that part is not in force, and ``export-model runtimes`` says so.
 
-This file is a program, too: ``python confinement.py FOLDER PARENT COMMAND…`` gives up the same and becomes the command.
-It imports the standard library only. On Linux the process is killed when PARENT is (0: it is not, but looks by itself).
+A child in Python calls ``begin`` before anything else. For others this file is a program:
+``python confinement.py FOLDER PARENT COMMAND…`` gives up the same and becomes the
+command. It imports the standard library only.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ MAX_FILE = 1 << 30
 MAX_OPEN = 1024
 #: Seconds of computing in all of a process's life: a request has a time of its own, this ends what slips through.
 MAX_CPU = 4 * 3600
+#: The variable that tells a command with which parent the kernel kills it: it need not look by itself (js/serve.mjs).
+KILLED_WITH = "EXPORT_MODEL_KILLED_WITH"
 
 # landlock.h: system calls (the same on all machines since they are new), rights, rules.
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
@@ -64,6 +67,15 @@ def in_force() -> dict[str, bool]:
         "memory": linux,
         "processor": sys.platform != "win32",
     }
+
+
+def begin(scratch: str, parent: int) -> None:
+    """The first act of a child: confined to ``scratch``, it is killed with ``parent`` (0: it looks by itself)."""
+    if parent and sys.platform == "linux":
+        _libc().prctl(_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:  # it was killed before this line
+            os._exit(1)
+    confine(scratch)
 
 
 def confine(scratch: str | None) -> None:
@@ -152,11 +164,8 @@ def _seccomp() -> None:
 def main(arguments: Sequence[str]) -> None:
     """``FOLDER PARENT COMMAND…``: confined to the folder, become the command."""
     scratch, parent, *command = arguments
-    if int(parent) and sys.platform == "linux":
-        _libc().prctl(_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
-        if os.getppid() != int(parent):  # it was killed before this line
-            os._exit(1)
-    confine(scratch)
+    begin(scratch, int(parent))
+    os.environ[KILLED_WITH] = parent if sys.platform == "linux" else "0"
     os.execvp(command[0], command)
 
 

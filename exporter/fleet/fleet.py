@@ -7,7 +7,9 @@ sources, and names are given in the order of the sources.
 from __future__ import annotations
 
 import multiprocessing
+import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -26,6 +28,7 @@ from signatures.errors import SourceError, UsageError
 
 #: How long a worker may take to clean up when it is told to end.
 _GRACE_SECONDS = 10.0
+_SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def export_fleet(
@@ -82,6 +85,20 @@ def _here(exporter: Exporter, paths: Sequence[Path], names: Names, wanted: Wante
     with RuntimePool() as pool:
         for path in paths:
             yield exported(exporter, path, names, pool, wanted)
+
+
+@contextmanager
+def _no_modules_of_this_folder() -> Iterator[None]:
+    """What multiprocessing starts is ``python -c``, which looks first where the user stands: at a stranger's, maybe."""
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
 
 
 @dataclass
@@ -169,7 +186,8 @@ class _Crew:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, self.options, self.wanted), daemon=False)
-        process.start()
+        with _no_modules_of_this_folder():
+            process.start()
         theirs.close()
         worker = _Worker(process, ours, index)
         self.workers.append(worker)

@@ -37,15 +37,17 @@ RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}], confined=False).load(sy
 """
 #: A parent whose child multiplies matrices that take TensorFlow.js minutes.
 MULTIPLYING = f"""
-import sys
+import sys, threading
 import numpy as np
 sys.path.insert(0, {str(ROOT)!r})
 from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import RUNTIMES
-process = RuntimeProcess("tfjs-cpu", next(r for r in RUNTIMES if r.name == "tfjs-cpu").command())
-model = process.load(sys.argv[2])
-open(sys.argv[1], "w").write(str(process._process.pid))
-model.run({{"x": np.ones((4000, 4000), np.float32)}}, ["y"])
+def multiply():
+    process = RuntimeProcess("tfjs-cpu", next(r for r in RUNTIMES if r.name == "tfjs-cpu").command())
+    model = process.load(sys.argv[2])
+    open(sys.argv[1], "w").write(str(process._process.pid))
+    model.run({{"x": np.ones((4000, 4000), np.float32)}}, ["y"])
+multiply() if sys.argv[3] == "main" else threading.Thread(target=multiply).start()
 """
 
 
@@ -87,11 +89,13 @@ def test_a_python_child_ends_with_its_parent_in_the_middle_of_a_request(tmp_path
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
 @NEEDS_NODE[0]
 @NEEDS_NODE[1]
-def test_a_node_child_ends_with_its_parent_in_the_middle_of_a_request(tmp_path: Path) -> None:
+@pytest.mark.parametrize("thread", ["main", "other"])
+def test_a_node_child_ends_with_its_parent_in_the_middle_of_a_request(tmp_path: Path, thread: str) -> None:
+    """The kernel kills it with the main thread's process; where another thread started it, it looks by itself."""
     nodes = [placeholder("x", "float32", [None, 4000]), node("y", "MatMul", "x", "x", T={"type": "DT_FLOAT"})]
     signature = ({"x": info("x:0", "float32", [None, 4000])}, {"y": info("y:0", "float32", [None, 4000])})
     model = write_model(tmp_path / "model", nodes, {}, *signature)
-    assert gone(killed_while_busy(tmp_path, MULTIPLYING, str(model)))
+    assert gone(killed_while_busy(tmp_path, MULTIPLYING, str(model), thread))
 
 
 def python(program: str) -> RuntimeProcess:

@@ -169,7 +169,7 @@ def test_install_keeps_the_two_libraries_of_the_wheel(cache: Path, pip: Path, tm
     assert is_whole(folder)
     assert [p.name for p in cache.iterdir()] == ["tf-1.4.0"]
     arguments = (tmp_path / "arguments").read_text().split()
-    assert arguments[:3] == ["-m", "pip", "download"]
+    assert arguments[:3] == ["-P", "-m", "pip"]
     assert arguments[-1] == "tensorflow==1.4.0"
     assert {"--no-deps", "--only-binary=:all:"} <= set(arguments)
     assert said == ["fetching TensorFlow 1.4.0 with pip (41 MB)", f"TensorFlow 1.4.0 is in {folder}"]

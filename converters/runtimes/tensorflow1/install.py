@@ -71,7 +71,7 @@ def _fill(folder: Path, release: Release) -> None:
 
 def _download(release: Release, folder: Path) -> Path:
     """The wheel, from the index that pip is set to; its hash is checked here, whatever pip does."""
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+    command = [sys.executable, "-P", "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
     command += ["--disable-pip-version-check", "--python-version", "3.6", "--platform", "manylinux1_x86_64"]
     command += ["--dest", str(folder), f"tensorflow=={release.version}"]
     done = subprocess.run(
