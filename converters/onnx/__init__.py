@@ -36,7 +36,7 @@ def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
 
 
 def _held(path: Path) -> Any:
-    from converters.onnx.source import held
+    from converters.onnx.ports import held
 
     return held(path)
 

@@ -9,6 +9,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
+import numpy as np
+
+from converters.graph.types import FLOAT32
+from converters.onnx import messages
+
 _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
 _NORMAL = ("RandomNormal", "RandomNormalLike")
 
@@ -18,8 +23,6 @@ def lifted(model: Any, draws: Collection[str]) -> Any:
 
     A sampler of N(mean, scale²) becomes the input times ``scale`` plus ``mean``.
     """
-    import onnx.helper
-
     wanted = frozenset(draws)
     graph = model.graph
     nodes: list[Any] = []
@@ -29,14 +32,14 @@ def lifted(model: Any, draws: Collection[str]) -> Any:
             nodes.append(node)
             continue
         (name,) = node.output
-        graph.input.append(onnx.helper.make_tensor_value_info(name, _FLOAT, None))
+        graph.input.append(messages.value_info(name, FLOAT32, None))
         numbers = {a.name: a.f for a in node.attribute if a.type == _FLOAT}
         moved = name
         for key, op, plain in (("scale", "Mul", 1.0), ("mean", "Add", 0.0)):
             if numbers.get(key, plain) != plain:
-                value = onnx.helper.make_tensor(f"{name}/{key}", _FLOAT, [], [numbers[key]])
+                value = messages.tensor(np.array(numbers[key], FLOAT32), f"{name}/{key}")
                 graph.initializer.append(value)
-                nodes.append(onnx.helper.make_node(op, [moved, value.name], [f"{name}/{op}"]))
+                nodes.append(messages.node(op, [moved, value.name], [f"{name}/{op}"]))
                 moved = f"{name}/{op}"
         if moved != name:
             _rename_reads(graph.node, name, moved)
@@ -64,10 +67,7 @@ def _rename_reads(nodes: Iterable[Any], old: str, new: str) -> None:
 
 def cut(model: Any, fetch: Sequence[str]) -> Any:
     """The part of a model that makes the values in ``fetch``, with these as its outputs."""
-    import onnx
-    import onnx.helper
-
-    part = onnx.ModelProto()
+    part = type(model)()
     part.CopyFrom(model)
     graph = part.graph
     makers = {output: index for index, node in enumerate(graph.node) for output in node.output if output}
@@ -86,10 +86,12 @@ def cut(model: Any, fetch: Sequence[str]) -> Any:
     nodes = [n for i, n in enumerate(graph.node) if i in kept]
     inputs = [v for v in graph.input if v.name in needed]
     constants = [t for t in graph.initializer if t.name in needed]
-    outputs = [onnx.ValueInfoProto(name=name) for name in dict.fromkeys(fetch)]
     types = {v.name: v for v in (*graph.output, *graph.value_info) if v.HasField("type")}
-    outputs = [types.get(o.name, o) for o in outputs]
-    fresh = onnx.helper.make_graph(nodes, graph.name or "graph", inputs, outputs, constants)
+    fresh = type(graph)(name=graph.name or "graph", node=nodes, input=inputs, initializer=constants)
+    for name in dict.fromkeys(fetch):
+        fresh.output.add(name=name)
+        if name in types:
+            fresh.output[-1].CopyFrom(types[name])
     part.graph.CopyFrom(fresh)
     return part
 

@@ -11,6 +11,7 @@ from typing import Any
 from converters.graph.builder import MAX_NODES
 from converters.onnx.importer.node import STANDARD
 from converters.onnx.importer.table import TABLE
+from converters.onnx.messages import packaged
 from signatures.errors import DamagedFileError, UnsupportedOpError
 from signatures.records import dataclass
 
@@ -29,9 +30,10 @@ _ATTRIBUTE = 64
 
 def inlined(model: Any) -> Any:
     """The model without functions: its own, and those of ONNX's ops that are defined by others and not in the table."""
-    import onnx.inliner
-
     if model.functions:
+        import onnx.inliner
+
+        model = packaged(model)
         functions = {_identity(f, f.name): f for f in model.functions}
         called = _Unfolding(functions, int(model.ByteSize())).check(model.graph)
         bodies = (model.graph, *(functions[name] for name in called))
@@ -48,6 +50,9 @@ def inlined(model: Any) -> Any:
     defined = _defined(model)
     if not defined:
         return model
+    import onnx.inliner
+
+    model = packaged(model)
     everything = all_nodes(model.graph)
     nodes = [n for n in everything if n.domain in STANDARD and n.op_type in defined]
     typed = [n for n in nodes if defined[n.op_type].has_context_dependent_function]
@@ -68,12 +73,14 @@ def inlined(model: Any) -> Any:
 
 def _defined(model: Any) -> dict[str, Any]:
     """Op → schema, of the model's ops that are in no table here and that ONNX defines by others."""
+    known, version = {kind for domain, kind in TABLE if not domain}, opsets_of(model)[""]
+    unknown = {n.op_type for n in all_nodes(model.graph) if n.domain in STANDARD} - known
+    if not unknown:
+        return {}
     import onnx.defs
 
-    known, version = {kind for domain, kind in TABLE if not domain}, opsets_of(model)[""]
-    used = {n.op_type for n in all_nodes(model.graph) if n.domain in STANDARD}
     found = {}
-    for kind in sorted(used - known):
+    for kind in sorted(unknown):
         with suppress(onnx.defs.SchemaError):
             schema: Any = onnx.defs.get_schema(kind, min(version, _INT32))
             if schema.has_function or schema.has_context_dependent_function:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.detached import Detached
+from converters.fetch import read_bytes
 from converters.folders import scratch_folder
 from converters.inner import Feeds, InnerTensors, Loaded, View
 from converters.onnx.files import files_of
@@ -20,10 +21,8 @@ from converters.runtimes.process import unloading
 @contextmanager
 def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     """Those of a model, in the same runtime; its values are found by the map that the writer left in it."""
-    import onnx
-
     detached = Detached()
-    model = decoded(loaded.path.read_bytes(), detached)
+    model = decoded(read_bytes(loaded.path), detached)
     load_external([model.graph], loaded.path.parent, detached)
     graph = model.graph
     names = loads({p.key: p.value for p in model.metadata_props}.get(TENSORS_KEY, ""))
@@ -40,10 +39,12 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         values.update({name: feeds[name] for name in fetch if name in fed})
         wanted = [name for name in fetch if name in made]
         if wanted:
-            open_model = onnx.ModelProto()
+            open_model = type(model)()
             open_model.CopyFrom(model)
             known = {o.name for o in graph.output}
-            open_model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in wanted if n not in known)
+            for name in wanted:
+                if name not in known:
+                    open_model.graph.output.add(name=name)
             for name, data in files_of(open_model, detached, file.name).items():
                 data.write(file.with_name(name))
             opened = loaded.pool.process(loaded.runtime).load(str(file), kind="graph")
@@ -58,7 +59,5 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
 
 def origins(path: Path) -> Mapping[str, str]:
     """Tensor of the graph → tensor of the source, where they are called differently, as our .onnx notes it."""
-    import onnx
-
-    model = onnx.ModelProto.FromString(path.read_bytes())
+    model = decoded(read_bytes(path), Detached())
     return loads(next((p.value for p in model.metadata_props if p.key == TENSORS_KEY), "")).sources

@@ -1,6 +1,8 @@
-"""The messages of an ONNX model, as far as they are written: onnx.proto of ONNX 1.16 has the numbers.
+"""The messages of an ONNX model, as far as they are read and written: onnx.proto of ONNX 1.16 has the numbers.
 
-The package ``onnx`` costs a cold start as much as numpy does; it is imported where its checker is asked.
+What is not listed acts on no value (documentation, annotations, a trainer's graphs) and is dropped from what is read.
+The package ``onnx`` costs a cold start as much as numpy does; it is imported where its checker, its inliner or its
+shape inference is asked.
 """
 
 from __future__ import annotations
@@ -14,37 +16,58 @@ import numpy as np
 
 from converters.messages import message_classes
 
+#: The key of the metadata that hold a contract of ours.
+CONTRACT_KEY = "export_model_contract"
 _CLASSES = message_classes(
     "export_model_onnx",
     {
         "Dimension": "1 dim_value int64, 2 dim_param string",
         "TensorShapeProto": "1 dim Dimension*",
         "Tensor": "1 elem_type int32, 2 shape TensorShapeProto",
-        "TypeProto": "1 tensor_type Tensor",
+        "Sequence": "1 elem_type TypeProto",
+        "Map": "1 key_type int32, 2 value_type TypeProto",
+        "TypeProto": (
+            "1 tensor_type Tensor, 4 sequence_type Sequence, 5 map_type Map, 8 sparse_tensor_type Tensor, "
+            "9 optional_type Sequence"
+        ),
         "ValueInfoProto": "1 name string, 2 type TypeProto",
         "TensorProto": (
-            "1 dims int64*, 2 data_type int32, 8 name string, 9 raw_data bytes, "
+            "1 dims int64*, 2 data_type int32, 4 float_data float*, 5 int32_data int32*, 6 string_data bytes*, "
+            "7 int64_data int64*, 8 name string, 9 raw_data bytes, 10 double_data double*, 11 uint64_data uint64*, "
             "13 external_data StringStringEntryProto*, 14 data_location int32"
         ),
+        "SparseTensorProto": "1 values TensorProto, 2 indices TensorProto, 3 dims int64*",
         "AttributeProto": (
-            "1 name string, 2 f float, 3 i int64, 4 s bytes, 5 t TensorProto, 7 floats float*, 8 ints int64*, "
-            "9 strings bytes*, 20 type int32"
+            "1 name string, 2 f float, 3 i int64, 4 s bytes, 5 t TensorProto, 6 g GraphProto, 7 floats float*, "
+            "8 ints int64*, 9 strings bytes*, 10 tensors TensorProto*, 11 graphs GraphProto*, 14 tp TypeProto, "
+            "15 type_protos TypeProto*, 20 type int32, 21 ref_attr_name string, 22 sparse_tensor SparseTensorProto, "
+            "23 sparse_tensors SparseTensorProto*"
         ),
-        "NodeProto": "1 input string*, 2 output string*, 3 name string, 4 op_type string, 5 attribute AttributeProto*",
+        "NodeProto": (
+            "1 input string*, 2 output string*, 3 name string, 4 op_type string, 5 attribute AttributeProto*, "
+            "7 domain string, 8 overload string"
+        ),
         "GraphProto": (
             "1 node NodeProto*, 2 name string, 5 initializer TensorProto*, 11 input ValueInfoProto*, "
-            "12 output ValueInfoProto*"
+            "12 output ValueInfoProto*, 13 value_info ValueInfoProto*, 15 sparse_initializer SparseTensorProto*"
+        ),
+        "FunctionProto": (
+            "1 name string, 4 input string*, 5 output string*, 6 attribute string*, 7 node NodeProto*, "
+            "9 opset_import OperatorSetIdProto*, 10 domain string, 11 attribute_proto AttributeProto*, "
+            "12 value_info ValueInfoProto*, 13 overload string"
         ),
         "OperatorSetIdProto": "1 domain string, 2 version int64",
         "StringStringEntryProto": "1 key string, 2 value string",
         "ModelProto": (
-            "1 ir_version int64, 2 producer_name string, 7 graph GraphProto, 8 opset_import OperatorSetIdProto*, "
-            "14 metadata_props StringStringEntryProto*"
+            "1 ir_version int64, 2 producer_name string, 3 producer_version string, 7 graph GraphProto, "
+            "8 opset_import OperatorSetIdProto*, 14 metadata_props StringStringEntryProto*, "
+            "25 functions FunctionProto*"
         ),
     },
-    {},
+    {"Dimension": "value", "TypeProto": "value"},
     "proto2",
 )
+ModelProto = _CLASSES["ModelProto"]
 #: numpy dtype → TensorProto.DataType
 _DATA_TYPES = {
     np.dtype(kind): number
@@ -112,10 +135,12 @@ def _attribute(name: str, value: Any) -> Any:
     return made
 
 
-def value_info(name: str, dtype: np.dtype, dims: Sequence[int | str]) -> Any:
-    """A ValueInfoProto: an axis is a size, or the name of one that is not known."""
+def value_info(name: str, dtype: np.dtype, dims: Sequence[int | str] | None) -> Any:
+    """A ValueInfoProto: an axis is a size, or the name of one that is not known; None: any number of them."""
     made = _CLASSES["ValueInfoProto"](name=name)
     made.type.tensor_type.elem_type = _DATA_TYPES[dtype]
+    if dims is None:
+        return made
     made.type.tensor_type.shape.SetInParent()  # a scalar has a shape of no axes
     for dim in dims:
         made.type.tensor_type.shape.dim.add(**{"dim_param" if isinstance(dim, str) else "dim_value": dim})
@@ -135,7 +160,7 @@ def model(
     props: Mapping[str, str],
 ) -> Any:
     """A ModelProto of ONNX's own ops."""
-    made = _CLASSES["ModelProto"](ir_version=ir_version, producer_name=producer)
+    made = ModelProto(ir_version=ir_version, producer_name=producer)
     made.opset_import.add(domain="", version=opset)
     for key, value in props.items():
         made.metadata_props.add(key=key, value=value)
@@ -146,3 +171,10 @@ def model(
     graph.input.extend(inputs)
     graph.output.extend(outputs)
     return made
+
+
+def packaged(model: Any) -> Any:
+    """A ModelProto as the message of the package ``onnx``, for what that package is asked."""
+    import onnx
+
+    return model if isinstance(model, onnx.ModelProto) else onnx.ModelProto.FromString(model.SerializeToString())

@@ -1,4 +1,4 @@
-"""What an ONNX model takes and gives."""
+"""What an ONNX model takes and gives, and the contract that it holds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.format import Port, Ports
+from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.proto import decoded, dtype_name
 
 
@@ -24,3 +25,9 @@ def _port(value: Any) -> Port:
     tensor = value.type.tensor_type
     dims = tuple(int(d.dim_value) if d.dim_value > 0 else None for d in tensor.shape.dim)
     return Port(value.name, dtype_name(tensor.elem_type), dims if tensor.HasField("shape") else None)
+
+
+def held(path: Path) -> str | None:
+    """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
+    model = decoded(read_bytes(path), Detached())
+    return next((str(p.value) for p in model.metadata_props if p.key == CONTRACT_KEY), None)

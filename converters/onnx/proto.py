@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from converters.detached import LARGE, LARGE_FILE, Detached, Fields
 from converters.fetch import MAX_WEIGHTS, read_bytes
 from converters.graph.types import FLOAT32
+from converters.onnx.messages import ModelProto
 from converters.schema import check_nodes
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
@@ -50,13 +52,10 @@ def decoded(data: bytes, detached: Detached | None = None) -> Any:
 
     Raises DamagedFileError.
     """
-    import onnx
-    from google.protobuf.message import DecodeError
-
     if detached is not None and len(data) >= LARGE_FILE:
         data = detached.without(data, _CONTENTS)
     try:
-        model = onnx.ModelProto.FromString(data)
+        model = ModelProto.FromString(data)
         model.DiscardUnknownFields()  # what no reader knows is handed to no runtime
     except DecodeError as error:
         raise DamagedFileError(
@@ -78,7 +77,7 @@ def _check_texts(model: Any) -> None:
             nodes += len(message.node) + len(message.initializer)
             check_nodes(nodes)
         tensor = message.DESCRIPTOR.name == "TensorProto"
-        fields = [(f, getattr(message, f)) for f in ("name", "doc_string", "external_data")] if tensor else ()
+        fields = [(f, getattr(message, f)) for f in ("name", "external_data")] if tensor else ()
         for field, value in fields or ((f.name, v) for f, v in message.ListFields()):
             items = value if hasattr(value, "append") or hasattr(value, "add") else (value,)
             if not items:

@@ -38,7 +38,6 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
 def contained(path: Path, detached: Detached | None = None) -> Any:
     """The ModelProto with the data of all its files, or ``detached`` with it. Raises what ``vetted`` raises."""
     model = decoded(read_bytes(path), detached)
-    model.ClearField("training_info")
     own = {(f.domain, f.name) for f in model.functions}
     parts = (model.graph, *model.functions)
     load_external(parts, path.parent, detached)

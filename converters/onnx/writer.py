@@ -25,6 +25,7 @@ from converters.graph.types import FLOAT32, TensorType
 from converters.inner import View
 from converters.onnx import messages
 from converters.onnx.files import files_of
+from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.shorten import shortened
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.pieces import Pieces, equal
@@ -61,7 +62,6 @@ _ELEMENTWISE = frozenset(
     )
 )
 PRODUCER = "export-model"
-CONTRACT_KEY = "export_model_contract"
 
 
 class _Builder:

@@ -16,8 +16,8 @@ from converters.bundle.embed import contract_of, redrawn
 from converters.bundle.embed import facts_of as facts_of_contract
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
+from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.reader import OnnxModel
-from converters.onnx.writer import CONTRACT_KEY
 from converters.renaming import renamed
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import torch_generation

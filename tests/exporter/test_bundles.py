@@ -16,7 +16,7 @@ from converters.bundle import bundle
 from converters.bundle.bundle import Bundle
 from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph
-from converters.onnx.writer import CONTRACT_KEY
+from converters.onnx.messages import CONTRACT_KEY
 from converters.schema import SavedModel, parse
 from exporter.version import __version__
 from fixtures import FIXTURES

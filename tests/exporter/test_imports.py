@@ -165,6 +165,21 @@ def test_a_plain_export_imports_what_it_uses(tmp_path: Path) -> None:
     assert {m for m in loaded for name in NOT_LOADED if m == name or m.startswith(f"{name}.")} == set()
 
 
+def test_a_verified_bundle_is_vetted_without_what_costs_most(tmp_path: Path) -> None:
+    """A quarter of a second for the package ``onnx``, 25 ms for a version."""
+    python("-m", "exporter", ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
+    script = (
+        "import sys\nfrom exporter.cli.main import main\n"
+        "try:\n    main(['verify', sys.argv[1], '--runtimes', 'onnxruntime'])\nexcept SystemExit:\n    pass\n"
+        "print(*sys.modules)"
+    )
+    *said, last = python("-c", script, tmp_path / "continuous").out.splitlines()
+    loaded = set(last.split())
+    assert said[-1].startswith("PASSED")
+    assert "converters.onnx.vetted" in loaded
+    assert {"onnx", "importlib.metadata", "email", "converters.onnx.reader"}.isdisjoint(loaded)
+
+
 def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
     code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
     assert python("-c", code).out.split() == ["False", "True"]

@@ -12,7 +12,8 @@ import pytest
 from converters.format import WriteOptions
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from converters.onnx.writer import CONTRACT_KEY, write
+from converters.onnx.messages import CONTRACT_KEY
+from converters.onnx.writer import write
 from converters.policy import Policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from converters.fetch import read_bytes
+from converters.onnx.messages import packaged
 from converters.onnx.proto import decoded, load_external
 from converters.targets.unity.onnx_constants import RANDOM_OPS, value_of
 from converters.targets.unity.onnx_shapes import inferred_shapes
@@ -138,7 +139,7 @@ def read_onnx_file(path: Path) -> OnnxFile:
                 why="no length is negative",
                 fix="export or download it again",
             )
-    return OnnxFile(model)
+    return OnnxFile(packaged(model))
 
 
 def attributes(node: Any) -> Mapping[str, Any]:
