@@ -212,4 +212,7 @@ def rnn_sizes(state: Weights, module: str) -> tuple[int, int, int]:
     gates, rest = divmod(state.length(f"{module}.weight_hh_l0", 0), max(hidden, 1))
     if rest or gates not in (3, 4):
         raise state.unknown(module, "its weights are no LSTM's and no GRU's")
-    return hidden, gates, sum(name.startswith("weight_hh_l") for name in state.under(f"{module}."))
+    names = state.under(f"{module}.")
+    if any(name.endswith("_reverse") for name in names):
+        raise state.unknown(module, "it reads its history backwards, too, and an agent has none of what comes")
+    return hidden, gates, sum(name.startswith("weight_hh_l") for name in names)

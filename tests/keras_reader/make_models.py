@@ -106,6 +106,7 @@ MODELS: dict[str, Model] = {
         [6],
         lambda x: [
             *(k.ReLU()(x), k.ReLU(0.8, 0.1)(x), k.ReLU(None, 0.2, 0.3)(x), k.ReLU(1.0, 0.0, 0.5)(x)),
+            k.ReLU(threshold=1.0)(k.Rescaling(0.0, 1.0)(x)),
             *(k.LeakyReLU()(x), k.LeakyReLU(0.05)(x), k.ELU(0.7)(x), k.PReLU()(x)),
             *(k.Softmax()(k.Reshape([2, 3])(x)), k.Softmax(axis=1)(k.Reshape([2, 3])(x))),
             *(k.Dense(2, activation=k.LeakyReLU(0.3))(x), k.PReLU(shared_axes=[1])(k.Reshape([2, 3])(x))),
@@ -118,7 +119,7 @@ MODELS: dict[str, Model] = {
             *(k.LayerNormalization(axis=1, center=False)(x), k.BatchNormalization()(x)),
             *(k.BatchNormalization(axis=1, scale=False)(x), k.BatchNormalization(center=False, epsilon=0.1)(x)),
             *(k.GroupNormalization(3)(x), k.GroupNormalization(-1)(x), k.UnitNormalization()(x)),
-            k.RMSNormalization()(x),
+            *(k.RMSNormalization()(x), k.UnitNormalization()(k.Rescaling(1e-8)(x))),
         ],
     ),
     "numbers": of_one(

@@ -109,6 +109,7 @@ def test_what_the_weights_do_not_tell_is_refused_and_named(tmp_path: Path) -> No
     weight = np.ones((4, 4), np.float32)
     for name, more, words in (
         ("rsl_5_5", {"cnns.0.weight": weight}, "cnns.0.weight"),
+        ("rsl_3_1_lstm", {"memory_a.rnn.weight_hh_l0_reverse": weight}, "reads its history backwards"),
         ("clean_ppo", {"critic.0.weight": np.ones((1, 9), np.float32)}, "are of no PPO"),
         ("clean_ppo", {"std": np.ones(4, np.float32)}, "not read from a checkpoint: std"),
         ("clean_dqn_atari", {"network.0.weight": np.ones((4, 2, 5, 5), np.float32)}, "its strides are not in the file"),

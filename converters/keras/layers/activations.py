@@ -103,11 +103,11 @@ def activated(step: Step, value: str, key: str = "activation") -> str:
 
 
 def _relu(step: Step) -> str:
-    """max_value, negative_slope and threshold: below the threshold the slope times the distance to it."""
+    """max_value, negative_slope and threshold: up to the threshold the slope times the distance to it."""
     b, x = step.net, step.x
     top, slope, threshold = (float(_scalar(step.get(k)) or 0) for k in ("max_value", "negative_slope", "threshold"))
     if threshold:
-        over = b.add("GreaterEqual", [x, b.number(x, threshold)])
+        over = b.add("Greater", [x, b.number(x, threshold)])
         below = nn.scaled(b, x, slope, -slope * threshold) if slope else b.add("ZerosLike", [x])
         value = b.add("Select", [over, x, below])
     else:

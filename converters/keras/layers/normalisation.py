@@ -61,10 +61,11 @@ def _group(step: Step) -> str:
 
 
 def _unit(step: Step) -> str:
-    """X over its norm; a square sum of 0 counts as 1e-12."""
+    """X over its norm, which is 1e-12 at least in Keras 3 (2: its square is)."""
     b, x = step.net, step.x
+    least = 1e-24 if step.is_keras_3 else 1e-12
     total = b.reduce("Sum", b.add("Square", [x]), _axes(step), keep=True)
-    return b.add("Mul", [x, b.add("Rsqrt", [b.add("Maximum", [total, b.number(x, 1e-12)])])])
+    return b.add("Mul", [x, b.add("Rsqrt", [b.add("Maximum", [total, b.number(x, least)])])])
 
 
 LAYERS: Mapping[str, Translate] = {
