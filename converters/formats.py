@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 
 from converters.format import Format
-from signatures.errors import UsageError
+from signatures.errors import UsageError, meant
 
 #: Packages of ``converters``, in the order in which formats are recognised, written and reported.
 ROOMS = (
@@ -32,10 +31,8 @@ DEFAULTS = tuple(f.key for f in WRITTEN.values() if f.default)
 def written(key: str) -> Format:
     """The format of a word of ``--to``. Raises UsageError."""
     if key not in WRITTEN:
-        close = difflib.get_close_matches(key, WRITTEN, n=1)
         raise UsageError(
-            f"--to {key}: there is no such format",
-            fix=(f"did you mean {close[0]}? " if close else "") + f"the formats are {', '.join(WRITTEN)}",
+            f"--to {key}: there is no such format", fix=f"{meant(key, WRITTEN)}the formats are {', '.join(WRITTEN)}"
         )
     return WRITTEN[key]
 

@@ -21,7 +21,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from operator import index
 from typing import Any
@@ -96,6 +96,14 @@ def whole(name: str, value: object, least: int, most: int | None = None) -> int:
         )
         raise UsageError(f"{name} is {value}", fix=fix)
     return number
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """``did you mean …? `` where one of those that are known is close to a name that is not; else nothing."""
+    import difflib  # 2 ms, which nobody needs who mistypes nothing
+
+    close = difflib.get_close_matches(name, [*known], n=1)
+    return f"did you mean {close[0]}? " if close else ""
 
 
 class SourceError(ExportModelError):

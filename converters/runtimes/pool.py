@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 from converters.format import Format
 from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
-from signatures.errors import RuntimeUnavailableError, UsageError
+from signatures.errors import RuntimeUnavailableError, UsageError, meant
 
 #: Runtimes that compute by themselves; numpy and js are this project's own.
 INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
@@ -47,9 +46,9 @@ def chosen_runtimes(
     names = [n for word in _names(wanted) for n in several.get(word, (word,))]
     for name in names:
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            meant = f"did you mean {close[0]}? " if close else ""
-            raise UsageError(f"there is no runtime {name!r}", fix=f"{meant}the runtimes are {', '.join(known)}")
+            raise UsageError(
+                f"there is no runtime {name!r}", fix=f"{meant(name, known)}the runtimes are {', '.join(known)}"
+            )
         if not known[name].installed:
             raise RuntimeUnavailableError(f"the runtime {name} is not installed", fix=known[name].how)
     return tuple(dict.fromkeys(["numpy", *names])), infos

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NoReturn
 
-from converters.pieces import Pieces
 from converters.policy import Policy
 from signatures.errors import ProfileError
 from signatures.records import dataclass
@@ -31,7 +30,6 @@ class Profile:
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()
-    check: Callable[[Profile, Mapping[str, Pieces], str], None] | None = None
 
 
 def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:

@@ -1,19 +1,55 @@
-"""The list of profiles: every consumer that a policy can be made for, in a file of its own beside this one."""
+"""The list of profiles: every consumer that a policy can be made for."""
 
 from __future__ import annotations
 
-import difflib
+from functools import partial
 
-from converters.targets import barracuda3, barracuda10, barracuda14, tfsharp, unity6
+from converters.targets import tfsharp
+from converters.targets.mlagents import version2, version3
 from converters.targets.profile import Profile
-from signatures.errors import UsageError
+from signatures.errors import UsageError, meant
 
 #: The newest first; ``--for help`` shows them in this order.
 PROFILES: tuple[Profile, ...] = (
-    unity6.PROFILE,
-    barracuda3.PROFILE,
-    barracuda14.PROFILE,
-    barracuda10.PROFILE,
+    Profile(
+        name="unity6",
+        aliases=("sentis", "inference-engine"),
+        purpose="ML-Agents 3.0 and 4.0 in Unity 2023 and Unity 6 (Sentis 2.1, Inference Engine 2.2 to 2.4)",
+        formats=("onnx",),
+        dress=partial(version3.dress, profile="unity6"),
+        importers=("Sentis 2.1.3", "Inference Engine 2.2.2", "Inference Engine 2.4.0"),
+        checkers=("R22", "R23", "R23-2.4"),
+    ),
+    Profile(
+        name="barracuda-3",
+        aliases=("barracuda",),
+        purpose="ML-Agents 2.3 (release 20) in Unity 2020 to 2022 (Barracuda 3.0)",
+        formats=("onnx", "nn"),
+        dress=partial(version3.dress, profile="barracuda-3"),
+        opset=12,
+        importers=("Barracuda 3.0.0",),
+        checkers=("R20",),
+    ),
+    Profile(
+        name="barracuda-1.4",
+        purpose="ML-Agents 2.0 to 2.2 (releases 17 to 19) in Unity 2019 to 2021 (Barracuda 1.4 to 2.3)",
+        formats=("onnx", "nn"),
+        dress=partial(version3.dress, profile="barracuda-1.4"),
+        opset=12,
+        importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),
+        checkers=("R20",),
+    ),
+    Profile(
+        name="barracuda-1.0",
+        purpose="ML-Agents 1.0 to 1.9 (releases 1 to 16) in Unity 2018 to 2020 (Barracuda 1.0 to 1.3); "
+        "memory in .nn alone",
+        formats=("onnx", "nn"),
+        own_names=frozenset({"nn"}),
+        dress=partial(version2.dress, profile="barracuda-1.0"),
+        opset=11,
+        importers=("Barracuda 1.1.2", "Barracuda 1.4.0"),
+        checkers=("R20",),
+    ),
     *tfsharp.PROFILES,
 )
 
@@ -23,9 +59,8 @@ def profile(name: str) -> Profile:
     for known in PROFILES:
         if name.lower() in (known.name, *known.aliases):
             return known
-    names = [n for p in PROFILES for n in (p.name, *p.aliases)]
-    close = difflib.get_close_matches(name.lower(), names, n=1)
+    close = meant(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
     raise UsageError(
         f"--for {name}: there is no such profile",
-        fix=(f"did you mean {close[0]}? " if close else "") + f"the profiles are {', '.join(p.name for p in PROFILES)}",
+        fix=f"{close}the profiles are {', '.join(p.name for p in PROFILES)}",
     )

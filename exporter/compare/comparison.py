@@ -8,7 +8,6 @@ is a failure that says what to map.
 
 from __future__ import annotations
 
-import difflib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -39,7 +38,7 @@ from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import verify
 from signatures.contract import POLICY
-from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, naming
+from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, meant, naming
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import draw_cases
@@ -257,8 +256,7 @@ def _mapped(
 
 def _suggestion(name: str, names: Sequence[str]) -> str:
     names = list(dict.fromkeys(names))
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"did you mean {close[0]}?" if close else f"there are {', '.join(names[:20])}"
+    return meant(name, names).strip() or f"there are {', '.join(names[:20])}"
 
 
 def _find(name: str, ports: Sequence[Port]) -> Port | None:

@@ -67,9 +67,11 @@ def artefacts_of(
             return contract, artifacts, tuple(notes)
         how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
         artifacts = [f.artifact(job.policy, how) for f in formats]
-        for artifact in artifacts:
-            if job.profile.check is not None:
-                job.profile.check(job.profile, artifact.files, job.policy.name)
+        if job.profile.importers:
+            from converters.targets.importable import importable
+
+            for artifact in artifacts:
+                importable(job.profile, artifact.files, job.policy.name)
         return contract, artifacts, ()
 
 

@@ -22,6 +22,7 @@ from converters.graph.run import run_graph
 from converters.onnx.edit import lifted
 from converters.policy import Policy
 from converters.source import ReadOptions
+from converters.targets.importable import importable
 from converters.targets.profile import Profile
 from converters.targets.unity.checker import UnityVerdict, check_file
 from converters.targets.unity.consumers import consumer
@@ -78,8 +79,8 @@ class Pair:
         dressed = profile.dress(policy)
         form = form or profile.formats[0]
         artifact = written(form).artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
-        if profile.check is not None:
-            profile.check(profile, artifact.files, policy.name)
+        if profile.importers:
+            importable(profile, artifact.files, policy.name)
         data = artifact.files[artifact.main].joined()
         made = onnx.ModelProto.FromString(data if form == "onnx" else b"")
         return cls(policy, profile, dressed, plain or Plain(policy), made, data, form)
