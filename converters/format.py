@@ -65,12 +65,9 @@ class Artifact:
         """Write its files to a folder; what each became, by its path. Raises OSError."""
         from signatures.contract import FileEntry  # it loads numpy
 
-        written = {}
-        for relative, data in self.files.items():
-            place = folder / relative
-            place.parent.mkdir(parents=True, exist_ok=True)
-            written[relative] = FileEntry(data.write(place), data.size)
-        return written
+        for parent in dict.fromkeys(relative.rpartition("/")[0] for relative in self.files):
+            (folder / parent).mkdir(parents=True, exist_ok=True)
+        return {relative: FileEntry(data.write(folder / relative), data.size) for relative, data in self.files.items()}
 
 
 @dataclass(frozen=True, slots=True)

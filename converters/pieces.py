@@ -50,8 +50,13 @@ class _Span:
 class Pieces:
     """The content of a file: its parts in their order."""
 
-    def __init__(self, *parts: bytes | np.ndarray | _Span) -> None:
-        self._parts = [_Span(p, 0, p.nbytes) if isinstance(p, np.ndarray) else p for p in parts]
+    def __init__(self, *parts: bytes | np.ndarray | _Span | Pieces) -> None:
+        self._parts: list[bytes | _Span] = []
+        for part in parts:
+            if isinstance(part, Pieces):
+                self._parts += part._parts
+            else:
+                self._parts.append(_Span(part, 0, part.nbytes) if isinstance(part, np.ndarray) else part)
         self.size = sum(map(len, self._parts))
 
     def chunks(self) -> Iterator[bytes | memoryview]:
@@ -81,7 +86,7 @@ class Pieces:
         """Write the file; returns its sha256. Raises OSError."""
         digest = hasher(self.size)
         with path.open("wb") as file:
-            for chunk in self.chunks():
+            for chunk in self.chunks() if self.size > _CHUNK else (self.joined(),):
                 digest.update(chunk)
                 file.write(chunk)
         found: str = digest.hexdigest()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from converters.graph.nodes import Graph, ref, split_ref
 
@@ -17,6 +16,4 @@ def renamed(graph: Graph, names: Mapping[str, str]) -> Graph:
         name, index = split_ref(reference)
         return ref(names.get(name, name), index)
 
-    return Graph(
-        tuple(replace(n, name=names.get(n.name, n.name), inputs=tuple(map(moved, n.inputs))) for n in graph.nodes)
-    )
+    return Graph(tuple(n.moved(names.get(n.name, n.name), map(moved, n.inputs)) for n in graph.nodes))

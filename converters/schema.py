@@ -16,6 +16,7 @@ from google.protobuf.message import DecodeError
 from converters.detached import LARGE_FILE, Detached, Fields
 from converters.messages import message_classes
 from converters.pieces import Pieces
+from converters.varints import varint
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Nodes of a file, training part and functions included.
@@ -139,6 +140,11 @@ def serialise(message: Any) -> bytes:
 def pieces(message: Any, detached: Detached) -> Pieces:
     """As ``serialise``, with what is detached in its place."""
     return detached.whole(serialise(message))
+
+
+def field(number: int, content: Pieces) -> Pieces:
+    """A field of a message that holds another, which is serialised already."""
+    return Pieces(varint(number << 3 | 2), varint(content.size), content)
 
 
 # ------------------------------------------------------------------ dtypes (types.proto)

@@ -1,13 +1,12 @@
 """Graph to GraphDef.
 
 Two dialects: *portable* writes only what TensorFlow 1.4 knows (no attribute or op newer than it, no ``_class``, no
-device, no function library), which every later version reads too; *explicit* writes every attribute, because
-TensorFlow.js applies no defaults to some of them (``dilations``).
+device, no function library), which every later version reads too; *explicit* writes every op and attribute.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -50,9 +49,8 @@ def encode(graph: Graph, *, explicit: bool = False, detached: Detached | None = 
             proto.attr["dtype"].type = schema.dtype_number(node.value.dtype)
             proto.attr["value"].tensor.CopyFrom(from_array(node.value, detached))
             continue
-        for attr in entry.attrs:
-            value = _value(node, attr, types)
-            if value is _OMIT or (not explicit and attr.since is not None and value == attr.default):
+        for attr, value in attributes(node, types):
+            if not explicit and attr.since is not None and value == attr.default:
                 continue
             try:
                 _set(proto.attr[attr.name], attr.kind, value)
@@ -64,14 +62,17 @@ def encode(graph: Graph, *, explicit: bool = False, detached: Detached | None = 
     return message
 
 
-_OMIT: Any = object()
+def attributes(node: Node, types: Types) -> Iterator[tuple[Attr, Any]]:
+    """The attributes that a GraphDef has of a node, those that follow from its inputs and outputs included."""
+    for attr in op_of(node).attrs:
+        if attr.derive is not None:
+            yield attr, _derived(node, attr.derive, types)
+        elif (value := node.attrs.get(attr.name, attr.default)) is not REQUIRED:
+            yield attr, value
 
 
-def _value(node: Node, attr: Attr, types: Types) -> Any:
-    if attr.derive is None:
-        value = node.attrs.get(attr.name, attr.default)
-        return _OMIT if value is REQUIRED else value
-    side, _, position = attr.derive.partition(":")
+def _derived(node: Node, derive: str, types: Types) -> Any:
+    side, _, position = derive.partition(":")
     if side == "count":
         return len(node.inputs) - int(position or 0)
     if side == "in":

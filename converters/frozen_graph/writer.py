@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from converters import schema
 from converters.bundle.embed import with_contract
 from converters.detached import Detached, is_readable
@@ -27,7 +29,11 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 
 def frozen(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
-    """The policy's GraphDef with its contract; without one, as the numpy reference needs it."""
-    detached = Detached()
-    graph = with_contract(stored(policy.graph, weights), contract)
-    return schema.pieces(encode(graph, detached=detached), detached)
+    """The policy's GraphDef with its contract, made once; without one, as the numpy reference needs it."""
+    made: dict[Any, Pieces] = policy.graph.made
+    key = frozen, contract, weights
+    if key not in made:
+        detached = Detached()
+        graph = with_contract(stored(policy.graph, weights), contract)
+        made[key] = schema.pieces(encode(graph, detached=detached), detached)
+    return made[key]

@@ -6,8 +6,9 @@ Graphs are immutable by convention: passes make new ones.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -43,15 +44,23 @@ class Node:
     attrs: Mapping[str, AttrValue] = field(default_factory=dict)
     value: np.ndarray | None = None
     origin: str | tuple[str, ...] | None = None
-    #: what ``shapes`` last inferred of it: the types that it read, and what came of them
-    inferred: tuple[Sequence[TensorType], Sequence[TensorType]] | None = field(
+    #: what ``shapes`` last inferred of it: the types that it read, what came of them, and the elements that were folded
+    inferred: tuple[Sequence[TensorType], Sequence[TensorType], int] | None = field(
         init=False, repr=False, compare=False, default=None
     )
 
     def with_inputs(self, inputs: Iterable[str]) -> Node:
         """The same node fed from other tensors."""
+        return self.moved(self.name, inputs)
+
+    def moved(self, name: str, inputs: Iterable[str]) -> Node:
+        """The same node under a name, fed from other tensors; what was inferred of it depends on neither."""
         fed = tuple(inputs)
-        return self if fed == self.inputs else replace(self, inputs=fed)
+        if fed == self.inputs and name == self.name:
+            return self
+        made = Node(name, self.op, fed, self.attrs, self.value, self.origin)
+        object.__setattr__(made, "inferred", self.inferred)
+        return made
 
 
 def ref(name: str, index: int = 0) -> str:
@@ -87,8 +96,8 @@ class Graph:
     _index: dict[str, Node] = field(init=False, repr=False, compare=False)
     #: what ``shapes.infer_types`` found, by its ``partial``: half of the passes ask for it
     inferred: dict[bool, dict[str, TensorType]] = field(init=False, repr=False, compare=False, default_factory=dict)
-    #: what ``run.run_graph`` has to compute, by what is fed and fetched
-    plans: dict[Any, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
+    #: what was made of it and may be asked for again: by who made it, and of what else
+    made: dict[Any, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", by_name(self.nodes))
@@ -121,21 +130,21 @@ class Graph:
         """Node name → the nodes that read any of its outputs, in graph order."""
         table: dict[str, list[Node]] = {node.name: [] for node in self.nodes}
         for node in self.nodes:
-            for name in dict.fromkeys(node_of(r) for r in node.inputs):
+            for name in dict.fromkeys(map(node_of, node.inputs)):
                 table[name].append(node)
         return table
 
     def ancestors(self, references: Iterable[str], stop: frozenset[str] = frozenset()) -> set[str]:
         """Names of all nodes upstream of ``references``, themselves included; does not look behind ``stop``."""
         seen: set[str] = set()
-        stack = [node_of(r) for r in references]
+        stack = list(map(node_of, references))
         while stack:
             name = stack.pop()
             if name in seen:
                 continue
             seen.add(name)
             if name not in stop:
-                stack.extend(node_of(r) for r in self._index[name].inputs)
+                stack.extend(map(node_of, self._index[name].inputs))
         return seen
 
     def descendants(self, names: Iterable[str]) -> set[str]:
@@ -149,20 +158,19 @@ class Graph:
     def pruned(self, references: Iterable[str]) -> Graph:
         """Only what is upstream of ``references``, in the same order."""
         keep = self.ancestors(references)
-        return Graph(tuple(n for n in self.nodes if n.name in keep))
+        return self if len(keep) == len(self.nodes) else Graph(tuple(n for n in self.nodes if n.name in keep))
 
 
-def by_name(nodes: Iterable[Node]) -> dict[str, Node]:
+def by_name(nodes: Sequence[Node]) -> dict[str, Node]:
     """Name → node; raises GraphError when two nodes have the same name."""
-    index: dict[str, Node] = {}
-    for node in nodes:
-        if node.name in index:
-            raise GraphError(
-                f"two nodes are called {node.name!r}",
-                why="names must be unique in a graph",
-                fix="export the graph again; this file breaks TensorFlow's own rules",
-            )
-        index[node.name] = node
+    index = {node.name: node for node in nodes}
+    if len(index) < len(nodes):
+        twice = next(name for name, count in Counter(n.name for n in nodes).items() if count > 1)
+        raise GraphError(
+            f"two nodes are called {twice!r}",
+            why="names must be unique in a graph",
+            fix="export the graph again; this file breaks TensorFlow's own rules",
+        )
     return index
 
 
@@ -185,10 +193,10 @@ def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
     The edge NextIteration → Merge closes a while loop and does not count. Raises GraphError on any other cycle, on
     dangling inputs and on a name that stands twice.
     """
-    checked_inputs(nodes)
     if _is_ordered(nodes):
         by_name(nodes)
         return tuple(nodes)
+    checked_inputs(nodes)
     index = by_name(nodes)
     done: dict[str, bool] = {}  # False = being visited
     ordered: list[Node] = []
@@ -226,9 +234,8 @@ def _is_ordered(nodes: Sequence[Node]) -> bool:
     """Whether every node stands behind those that it reads; a Merge may make it say no."""
     seen: set[str] = set()
     for node in nodes:
-        for reference in node.inputs:
-            if node_of(reference) not in seen:
-                return False
+        if not seen.issuperset(map(node_of, node.inputs)):
+            return False
         seen.add(node.name)
     return True
 

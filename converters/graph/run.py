@@ -38,8 +38,8 @@ class _Plan:
 
 def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
     """The graph's own for these tensors: a policy is run hundreds of times for the same ones."""
-    key = (tuple(fed), tuple(fetch))
-    if key not in graph.plans:
+    key = _plan, tuple(fed), tuple(fetch)
+    if key not in graph.made:
         needed = _needed(graph, fetch, fed)
         constants, steps = dict[str, np.ndarray](), list[tuple[OpDef, Node]]()
         for node in graph.nodes:
@@ -54,8 +54,8 @@ def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
                 constants[node.name] = node.value
             else:
                 steps.append((op_of(node), node))
-        graph.plans[key] = _Plan(constants, steps)
-    plan: _Plan = graph.plans[key]
+        graph.made[key] = _Plan(constants, steps)
+    plan: _Plan = graph.made[key]
     return plan
 
 

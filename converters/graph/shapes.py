@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import operator
 from collections.abc import Mapping, Sequence
 from functools import cache
 from math import inf
@@ -47,7 +46,7 @@ def _inferred(graph: Graph, partial: bool) -> Types:
     types: Types = {}
     symbols, allowance = Symbols(), Allowance()
     for node in graph.nodes:
-        if node.op in CONTROL_FLOW and partial:
+        if partial and node.op in CONTROL_FLOW:
             dtype = types[node.inputs[0]].dtype if node.inputs and node.inputs[0] in types else FLOAT32
             dtype = node.attrs.get("element_dtype", dtype)
             if node.op == "TensorArraySizeV3":
@@ -61,29 +60,32 @@ def _inferred(graph: Graph, partial: bool) -> Types:
 
 def add_types(types: Types, node: Node, symbols: Symbols, allowance: Allowance) -> None:
     """Extend ``types`` by the outputs of a node whose inputs are in it; raises as ``infer_types`` does."""
-    for index, result in enumerate(_known_results(node, _arguments(node, types), symbols, allowance)):
-        types[ref(node.name, index)] = result
+    results = _known_results(node, _arguments(node, types), symbols, allowance)
+    if results:
+        types[node.name] = results[0]
+    for index in range(1, len(results)):
+        types[ref(node.name, index)] = results[index]
 
 
 def _known_results(
     node: Node, args: Sequence[TensorType], symbols: Symbols, allowance: Allowance
 ) -> Sequence[TensorType]:
-    """What a node gives. Most passes leave most nodes as they are: those are inferred once, unless new symbols come of
-    them, which must be the graph's own. What they fold is counted every time.
+    """What a node gives. Most passes leave most nodes as they are, but for their names: those are inferred once, unless
+    new symbols come of them, which must be the graph's own. What they fold is counted every time.
     """
     if node.inferred is not None:
-        before, results = node.inferred
-        if (
-            len(before) == len(args)
-            and all(map(operator.is_, before, args))
-            and allowance.take(_folded(node, args, results))
-        ):
+        before, results, folded = node.inferred
+        if len(before) == len(args) and all(map(_is_same, before, args)) and allowance.take(folded):
             return results
     made = symbols.count
     results = _results(op_of(node), node, args, symbols, allowance)
     if symbols.count == made and allowance.left >= 0:
-        object.__setattr__(node, "inferred", (args, results))
+        object.__setattr__(node, "inferred", (args, results, _folded(node, args, results)))
     return results
+
+
+def _is_same(before: TensorType, now: TensorType) -> bool:
+    return before is now or (before.dtype == now.dtype and before.shape == now.shape and before.value is now.value)
 
 
 def _folded(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> int:

@@ -13,9 +13,10 @@ import numpy as np
 
 from converters import schema
 from converters.bundle.embed import with_contract
-from converters.detached import Detached
+from converters.detached import Detached, is_readable
 from converters.format import WriteOptions
 from converters.frozen_graph.encode import encode
+from converters.frozen_graph.writer import frozen
 from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.passes.weights import stored
@@ -59,17 +60,27 @@ def _fill(entries: Any, specs: Iterable[TensorSpec]) -> None:
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
-    """The SavedModel artefact."""
-    detached = Detached()
-    message = schema.SavedModel(saved_model_schema_version=1)
-    meta = message.meta_graphs.add()
-    meta.meta_info_def.tags.append("serve")
-    graph = with_contract(stored(policy.graph, options.weights), options.contract)
-    meta.graph_def.CopyFrom(encode(graph, detached=detached))
+    """The SavedModel artefact. Its graph is that of the ``.bytes``, put between the other fields as it was serialised;
+    protobuf is given it again where the weights become variables.
+    """
+    graph = frozen(policy, options.contract, options.weights)
+    about, signed = schema.MetaGraphDef(), schema.MetaGraphDef()
+    about.meta_info_def.tags.append("serve")
     for key, (inputs, outputs) in signatures_of(policy).items():
-        definition = meta.signature_def[key]
+        definition = signed.signature_def[key]
         definition.method_name = METHOD
         _fill(definition.inputs, inputs)
         _fill(definition.outputs, outputs)
-    files = files_of(message, detached, sha256_hex(options.contract.encode()))
+    version = schema.SavedModel(saved_model_schema_version=1)
+    meta = Pieces(schema.serialise(about), schema.field(2, graph), schema.serialise(signed))
+    whole = Pieces(schema.serialise(version), schema.field(2, meta))
+    if is_readable(whole):
+        return {f"{FOLDER}/saved_model.pb": whole}
+    detached = Detached()
+    about.MergeFrom(signed)
+    about.graph_def.CopyFrom(
+        encode(with_contract(stored(policy.graph, options.weights), options.contract), detached=detached)
+    )
+    version.meta_graphs.append(about)
+    files = files_of(version, detached, sha256_hex(options.contract.encode()))
     return {f"{FOLDER}/{path}": data for path, data in files.items()}

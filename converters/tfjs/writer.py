@@ -15,18 +15,19 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from converters import schema
-from converters.detached import Detached
 from converters.format import WriteOptions
-from converters.frozen_graph.encode import encode
+from converters.frozen_graph.encode import PRODUCER, attributes
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
+from converters.graph.ops.base import AttrKind
 from converters.graph.ops.table import op_of
 from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
@@ -84,56 +85,58 @@ def for_tfjs(graph: Graph) -> Graph:
 # ------------------------------------------------------------------ GraphDef as JSON
 
 
-def _attribute(proto: Any) -> dict[str, Any]:
-    kind = proto.WhichOneof("value")
+def _attribute(kind: AttrKind, value: Any) -> dict[str, Any]:
+    """An attribute as protobuf's JSON has it: whole numbers as text, floats at the precision of float32."""
+    if isinstance(value, tuple):
+        if kind == "str" and value:
+            return {"list": {"s": [_text(v) for v in value]}}
+        return {"list": {"i": [str(int(v)) for v in value]} if kind == "int" and value else {}}
     if kind == "type":
-        return {"type": _dtype(proto.type)}
-    if kind == "i":
-        return {"i": str(proto.i)}
-    if kind in ("f", "b"):
-        return {kind: getattr(proto, kind)}
-    if kind == "s":
-        return {"s": base64.b64encode(proto.s).decode()}
-    if kind == "shape":
-        return {"shape": _shape(proto.shape)}
-    if proto.list.s:
-        return {"list": {"s": [base64.b64encode(v).decode() for v in proto.list.s]}}
-    return {"list": {"i": [str(v) for v in proto.list.i]} if proto.list.i else {}}
+        return {"type": _dtype(value)}
+    if kind == "int":
+        return {"i": str(int(value))}
+    if kind == "float":
+        return {"f": float(np.float32(value))}
+    if kind == "bool":
+        return {"b": bool(value)}
+    if kind == "str":
+        return {"s": _text(value)}
+    return {"shape": {"unknownRank": True} if value.dims is None else _shape(value.dims)}
 
 
-def _dtype(number: int) -> str:
-    return _dtype_name(schema.dtype_of(number))
+def _text(value: str | bytes) -> str:
+    return base64.b64encode(value if isinstance(value, bytes) else value.encode()).decode()
 
 
-def _dtype_name(dtype: np.dtype) -> str:
+def _dtype(dtype: np.dtype) -> str:
     """What TensorFlow.js calls the dtype that it has in place of one."""
     return schema.dtype_name(_NARROW.get(dtype, dtype))
 
 
-def _shape(proto: Any) -> dict[str, Any]:
-    if proto.unknown_rank:
-        return {"unknownRank": True}
-    return {"dim": [{"size": str(d.size)} for d in proto.dim]}
+def _shape(dims: Sequence[int | None]) -> dict[str, Any]:
+    return {"dim": [{"size": str(-1 if n is None else n)} for n in dims]}
 
 
 def _topology(graph: Graph) -> dict[str, Any]:
-    nodes = []
-    for proto in encode(graph, explicit=True, detached=Detached()).node:
-        entry: dict[str, Any] = {"name": proto.name, "op": proto.op}
-        if proto.input:
-            entry["input"] = list(proto.input)
-        if proto.op == "Const":
+    """The GraphDef with every attribute: TensorFlow.js applies no defaults to some of them (``dilations``)."""
+    types, nodes = infer_types(graph), []
+    for node in graph.nodes:
+        entry: dict[str, Any] = {"name": node.name, "op": node.op}
+        if node.inputs:
+            entry["input"] = list(node.inputs)
+        if node.op == "Const":
+            assert node.value is not None
             # tfjs looks the values up among the weights; the attribute only says dtype and shape.
-            tensor = proto.attr["value"].tensor
-            kind = _dtype(tensor.dtype)
+            kind = _dtype(node.value.dtype)
             entry["attr"] = {
                 "dtype": {"type": kind},
-                "value": {"tensor": {"dtype": kind, "tensorShape": _shape(tensor.tensor_shape)}},
+                "value": {"tensor": {"dtype": kind, "tensorShape": _shape(node.value.shape)}},
             }
         else:
-            entry["attr"] = {key: _attribute(proto.attr[key]) for key in sorted(proto.attr)}
+            values = attributes(node, types)
+            entry["attr"] = {a.name: _attribute(a.kind, v) for a, v in sorted(values, key=lambda pair: pair[0].name)}
         nodes.append(entry)
-    return {"node": nodes, "library": {}, "versions": {"producer": 24, "minConsumer": 12}}
+    return {"node": nodes, "library": {}, "versions": {"producer": PRODUCER, "minConsumer": 12}}
 
 
 # ------------------------------------------------------------------ signature and weights
@@ -142,8 +145,8 @@ def _topology(graph: Graph) -> dict[str, Any]:
 def _tensor_info(spec: TensorSpec) -> dict[str, Any]:
     return {
         "name": f"{spec.name}:0",
-        "dtype": _dtype_name(np.dtype(spec.dtype)),
-        "tensorShape": {"dim": [{"size": str(-1 if n is None else n)} for n in spec.shape]},
+        "dtype": _dtype(np.dtype(spec.dtype)),
+        "tensorShape": _shape(spec.shape),
     }
 
 
@@ -171,6 +174,11 @@ def _shards(weights: Pieces) -> Mapping[str, Pieces]:
     }
 
 
+@cache
+def _acting() -> Mapping[str, Pieces]:
+    return {name: Pieces((_JS / name).read_bytes()) for name in _ACTING}
+
+
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
     roots = policy.fetches.values()
@@ -196,6 +204,5 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         },
     }
     text = json.dumps(model, separators=(",", ":"), ensure_ascii=True).encode()
-    acting = {name: Pieces((_JS / name).read_bytes()) for name in _ACTING}
-    files = {"model.json": Pieces(text), **shards, **acting}
+    files = {"model.json": Pieces(text), **shards, **_acting()}
     return {f"tfjs/{name}": data for name, data in files.items()}

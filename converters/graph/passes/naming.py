@@ -70,9 +70,7 @@ def name_tensors(
         name, index = split_ref(reference)
         return ref(renamed.get(name, name), index)
 
-    nodes = [
-        replace(n, name=renamed.get(n.name, n.name), inputs=tuple(moved(r) for r in n.inputs)) for n in graph.nodes
-    ]
+    nodes = [n.moved(renamed.get(n.name, n.name), map(moved, n.inputs)) for n in graph.nodes]
     for name, reference in identities:
         origin = graph.producer(reference).origin if split_ref(reference)[1] == 0 else None
         nodes.append(Node(name, "Identity", (moved(reference),), origin=origin))

@@ -32,6 +32,8 @@ def unseeded(graph: Graph) -> Graph:
     """Samplers without the seed that the trainer's run had: with it, a game draws the same actions after every start,
     and TensorFlow.js, which starts its generator anew for every run, the same one each time.
     """
+    if not any(traits(n).sampler for n in graph.nodes):
+        return graph
     nodes = [replace(n, attrs={**n.attrs, "seed": 0, "seed2": 0}) if traits(n).sampler else n for n in graph.nodes]
     return Graph(tuple(nodes))
 
