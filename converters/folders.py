@@ -159,6 +159,12 @@ def _held(path: Path) -> int | None:
 
 def _remove(path: Path) -> None:
     failed: list[BaseException] = []
+    with contextlib.suppress(OSError):
+        if [inside.name for inside in path.iterdir()] == [MARKER]:  # nearly always; an empty one is known for ours, too
+            (path / MARKER).unlink()
+            path.rmdir()
+            _forget(path)
+            return
     shutil.rmtree(path, onerror=lambda function, place, error: failed.append(error[1]))
     if path.exists():
         why = f": {failed[0]}" if failed else ""

@@ -35,6 +35,7 @@ EIGHT_AXES, METADATA, ALIGNED, TYPED_WEIGHTS = 17, 18, 19, 20
 ALIGNMENT = 16
 _FLOAT, _HALF = 0, 1
 _MAX_AXES = 8
+_INT, _LONG = struct.Struct("<i"), struct.Struct("<q")
 MAX_LAYERS = 1 << 14
 
 Ints = tuple[int, ...]
@@ -171,7 +172,7 @@ class _Parser:
     # ------------------------------------------------------------------ the parts
 
     def model(self) -> NnModel:
-        version = self._integer("<q")
+        version = self._integer(_LONG)
         if version not in VERSIONS:
             raise self._error(f"the version is {version}", "the versions that were ever written are 15 to 20")
         inputs = self._list("inputs", 8, lambda: NnInput(self._text(), self._shape()))
@@ -181,7 +182,7 @@ class _Parser:
         half, padding = False, 0
         if version >= TYPED_WEIGHTS:
             self._what = "the type of the weights"
-            kind = self._integer("<i")
+            kind = self._integer()
             if kind not in (_FLOAT, _HALF):
                 raise self._error(f"the type of the weights is {kind}", "0 (float32) and 1 (half) are known")
             half = kind == _HALF
@@ -198,10 +199,10 @@ class _Parser:
     def _layer(self) -> Layer:
         name = self._text()
         self._what = f"layer {name!r}"
-        kind, activation = self._integer("<i"), self._integer("<i")
+        kind, activation = self._integer(), self._integer()
         self._ints(), self._ints()  # two arrays that every writer leaves empty
         pad, stride, pool = self._ints(), self._ints(), self._ints()
-        axis = self._integer("<i")
+        axis = self._integer()
         alpha, beta = struct.unpack("<ff", self._take(8))
         self._ints()  # a third
         inputs = self._list(f"inputs of layer {name!r}", 4, self._text)
@@ -211,7 +212,7 @@ class _Parser:
     def _dataset(self) -> Dataset:
         name = self._text()
         shape = self._shape()
-        return Dataset(name, shape, self._integer("<q"), self._integer("<i"), self._integer("<i"))
+        return Dataset(name, shape, self._integer(_LONG), self._integer(), self._integer())
 
     def _weights(self, layers: tuple[Layer, ...], half: bool) -> npt.NDArray[np.float32]:
         """The stream; it ends where the lengths of all datasets together say, as Unity's loader has it."""
@@ -259,13 +260,13 @@ class _Parser:
         self._at += count
         return self._data[self._at - count : self._at]
 
-    def _integer(self, form: str) -> int:
-        number: int = struct.unpack(form, self._take(struct.calcsize(form)))[0]
+    def _integer(self, form: struct.Struct = _INT) -> int:
+        number: int = form.unpack(self._take(form.size))[0]
         return number
 
     def _count(self, smallest: int) -> int:
         """A number of items of at least ``smallest`` bytes each, for which there is room."""
-        count = self._integer("<i")
+        count = self._integer()
         left = len(self._data) - self._at
         if count < 0 or count * smallest > left:
             raise self._error(

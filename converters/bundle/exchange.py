@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from converters.folders import LeftoverWarning, OwnFolder, left_in, sweep, taken
@@ -24,7 +24,9 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _PREFIX = ".export-model-"
 #: To look through a folder of very many bundles takes long: where it took more than this of the processor (seconds), it
 #: is done again no sooner than so many times as long later.
-_QUICK, _REST = 2e-3, 100
+_QUICK, _REST = 2e-4, 100
+#: Files that the disk is waited for at a time.
+_AT_ONCE = 2
 _next_look: dict[tuple[str, Path], float] = {}
 
 
@@ -104,10 +106,12 @@ def _exchanged(a: Path, b: Path) -> bool:
 
 def _synced(folder: Path) -> None:
     """Wait until all of a folder is on the disk: after a power cut, what has a name has its content."""
-    inside = [folder, *folder.rglob("*")]
-    # Side by side: the disk then waits once for all of them, not once for each.
+    inside = [path for place, _, files in os.walk(folder) for path in (Path(place), *(Path(place, f) for f in files))]
+    # A few at a time: the disk then waits for several of them at once; to start a thread for each takes longer.
     failed: list[OSError] = []
-    threads = [threading.Thread(target=_sync_or_note, args=(path, failed), daemon=True) for path in inside]
+    threads = [
+        threading.Thread(target=_sync_or_note, args=(inside[i::_AT_ONCE], failed), daemon=True) for i in range(_AT_ONCE)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -116,9 +120,10 @@ def _synced(folder: Path) -> None:
         raise failed[0]
 
 
-def _sync_or_note(path: Path, failed: list[OSError]) -> None:
+def _sync_or_note(paths: Sequence[Path], failed: list[OSError]) -> None:
     try:
-        _sync(path)
+        for path in paths:
+            _sync(path)
     except OSError as error:
         failed.append(error)
 

@@ -42,7 +42,10 @@ class Editor(Builder):
 
     def keep(self, node: Node) -> None:
         """Take a node over, its inputs redirected."""
-        self.append(self._fed(node))
+        if self._redirected:
+            node = self._fed(node)
+        self.position[node.name] = len(self.nodes)
+        self.nodes.append(node)
 
     def _fed(self, node: Node) -> Node:
         if self._redirected.keys().isdisjoint(node.inputs):
@@ -70,7 +73,7 @@ class Editor(Builder):
 
     def graph(self) -> Graph:
         """The new graph, redirections applied to all nodes, in topological order; the old one where nothing changed."""
-        nodes = [self._fed(n) for n in self.nodes]
+        nodes = [self._fed(n) for n in self.nodes] if self._redirected else self.nodes
         if len(nodes) == len(self._old.nodes) and all(map(operator.is_, nodes, self._old.nodes)):
             return self._old
         return Graph(topological(nodes))

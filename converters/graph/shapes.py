@@ -59,24 +59,27 @@ def _inferred(graph: Graph, partial: bool) -> Types:
 
 
 def add_types(types: Types, node: Node, symbols: Symbols, allowance: Allowance) -> None:
-    """Extend ``types`` by the outputs of a node whose inputs are in it; raises as ``infer_types`` does."""
-    results = _known_results(node, _arguments(node, types), symbols, allowance)
+    """Extend ``types`` by the outputs of a node whose inputs are in it; raises as ``infer_types`` does.
+
+    Most passes leave most nodes as they are, but for their names: those are inferred once, unless new symbols come of
+    them, which must be the graph's own. What they fold is counted every time.
+    """
+    args = _arguments(node, types)
+    if node.inferred is not None:
+        before, results, folded = node.inferred
+        if not ((args == before or _are_same(args, before)) and allowance.take(folded)):
+            results = _inferred_anew(node, args, symbols, allowance)
+    else:
+        results = _inferred_anew(node, args, symbols, allowance)
     if results:
         types[node.name] = results[0]
     for index in range(1, len(results)):
         types[ref(node.name, index)] = results[index]
 
 
-def _known_results(
+def _inferred_anew(
     node: Node, args: Sequence[TensorType], symbols: Symbols, allowance: Allowance
 ) -> Sequence[TensorType]:
-    """What a node gives. Most passes leave most nodes as they are, but for their names: those are inferred once, unless
-    new symbols come of them, which must be the graph's own. What they fold is counted every time.
-    """
-    if node.inferred is not None:
-        before, results, folded = node.inferred
-        if len(before) == len(args) and all(map(_is_same, before, args)) and allowance.take(folded):
-            return results
     made = symbols.count
     results = _results(op_of(node), node, args, symbols, allowance)
     if symbols.count == made and allowance.left >= 0:
@@ -84,8 +87,10 @@ def _known_results(
     return results
 
 
-def _is_same(before: TensorType, now: TensorType) -> bool:
-    return before is now or (before.dtype == now.dtype and before.shape == now.shape and before.value is now.value)
+def _are_same(now: Sequence[TensorType], before: Sequence[TensorType]) -> bool:
+    return len(now) == len(before) and all(
+        a.dtype == b.dtype and a.shape == b.shape and a.value is b.value for a, b in zip(now, before, strict=True)
+    )
 
 
 def _folded(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> int:

@@ -13,7 +13,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
-from converters.graph.ops.table import is_fed, passes_on, traits
+from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
 from converters.understand.state_names import looks_like_state
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.records import dataclass
@@ -154,11 +154,14 @@ def depends_on_input(graph: Graph, left_out: Callable[[Node], bool] = lambda nod
     """Names of nodes downstream of a placeholder (parameters included), not by way of those that are ``left_out``."""
     fed: set[str] = set()
     count = -1
+    loops = any(CONTROL_FLOW.get(n.op) == "next_iteration" for n in graph.nodes)
     while count != len(fed):  # a loop hands back what stands behind
         count = len(fed)
         for node in graph.nodes:
-            if is_fed(node) or (not left_out(node) and any(node_of(r) in fed for r in node.inputs)):
+            if is_fed(node) or (not fed.isdisjoint(map(node_of, node.inputs)) and not left_out(node)):
                 fed.add(node.name)
+        if not loops:
+            break
     return fed
 
 

@@ -66,6 +66,9 @@ TABLE = _table()
 #: Other names of an op → the op's.
 SPELLINGS: Mapping[str, str] = MappingProxyType({name: op.name for op in TABLE.values() for name in op.spellings})
 _UNKNOWN = OpDef("", written_as_older)
+#: Both in one, plain: they are asked for every node in every pass.
+_BY_NAME = dict(TABLE)
+_BY_SPELLING = {**TABLE, **{name: TABLE[op] for name, op in SPELLINGS.items()}}
 
 
 class Operation(Protocol):
@@ -79,7 +82,7 @@ class Operation(Protocol):
 
 def traits(node: Operation) -> OpDef:
     """What is known of a node's op, whichever version spells it; of an op that the table lacks, nothing."""
-    return TABLE.get(SPELLINGS.get(node.op, node.op), _UNKNOWN)
+    return _BY_SPELLING.get(node.op, _UNKNOWN)
 
 
 def is_fed(node: Operation) -> bool:
@@ -100,7 +103,7 @@ def hands_on(node: Operation) -> bool:
 
 def op_of(node: Node) -> OpDef:
     """The entry for a node's op; raises UnsupportedOpError."""
-    entry = TABLE.get(node.op)
+    entry = _BY_NAME.get(node.op)
     if entry is None:
         raise unsupported([node])
     return entry

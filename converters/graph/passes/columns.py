@@ -19,9 +19,12 @@ _WHOLE = (("slice", None, None, 1), ("slice", 0, None, 1))
 def parts_for_slices(graph: Graph, roots: Iterable[str]) -> Graph:
     """The graph with those slices left out, and what only they read; outputs and inputs stay."""
     outputs = {node_of(r) for r in roots}
+    slices = {n.name for n in graph.nodes if n.op == "StridedSlice" and n.name not in outputs}
+    if not any(graph.producer(graph[n].inputs[0]).op == "ConcatV2" for n in slices):
+        return graph
     types, editor = infer_types(graph), Editor(graph)
     for node in graph.nodes:
-        part = None if node.op != "StridedSlice" or node.name in outputs else _part(graph, types, node)
+        part = _part(graph, types, node) if node.name in slices else None
         if part is None:
             editor.keep(node)
         else:

@@ -19,8 +19,9 @@ _MATRIX = 2
 
 def settle_ranks(graph: Graph) -> Graph:
     """See the module."""
-    types = infer_types(graph)
-    odd = {n.name for n in graph.nodes if _is_odd(types, n)}
+    found = [n for n in graph.nodes if n.op == "BatchMatMul" or traits(n).activation == "softmax"]
+    types = infer_types(graph) if found else {}
+    odd = {n.name for n in found if _is_odd(types, n)}
     if not odd:
         return graph
     b = Builder(NameScope(n.name for n in graph.nodes))
@@ -43,7 +44,7 @@ def _is_odd(types: Types, node: Node) -> bool:
     shapes = [s for r in node.inputs if (s := types[r].shape) is not None]
     if traits(node).activation == "softmax":
         return any(len(s) > _MATRIX and isinstance(s[-1], int) for s in shapes)
-    if node.op != "BatchMatMul" or len(shapes) != _MATRIX or any(len(s) < _MATRIX for s in shapes):
+    if len(shapes) != _MATRIX or any(len(s) < _MATRIX for s in shapes):
         return False
     return shapes[0][:-2] != shapes[1][:-2]
 
