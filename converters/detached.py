@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -37,11 +37,23 @@ _VARINT, _LONG, _BYTES, _SHORT = 0, 1, 2, 5
 
 
 class Detached:
-    """Arrays by their marks."""
+    """Arrays by their marks: those of at least so many bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, least: int = LARGE) -> None:
+        self._least = least
         self._arrays: list[np.ndarray] = []
         self._numbers: dict[tuple[object, ...], int] = {}
+
+    @classmethod
+    def of(cls, arrays: Iterable[np.ndarray]) -> Detached:
+        """For a message of these arrays: if they are small together, all stay in it, which takes less than to look for
+        their places in it.
+        """
+        return cls(LARGE if sum(a.nbytes for a in arrays) >= LARGE_FILE else LARGE_FILE)
+
+    def takes(self, array: np.ndarray) -> bool:
+        """Whether an array is to be kept here."""
+        return array.nbytes >= self._least
 
     def mark(self, array: np.ndarray) -> bytes:
         """What stands for the bytes of an array in a message; the same memory has the same."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import field, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 from converters import schema
 from converters.detached import Detached
 from converters.folders import scratch_folder
-from converters.frozen_graph.subgraph import subgraph
+from converters.frozen_graph.subgraph import check, subgraph
 from converters.graph.nodes import Graph
 from converters.understand.facts import SourceFacts
 from signatures.records import dataclass
@@ -32,15 +32,19 @@ class OriginalRun:
     definition: Any = field(default=None, repr=False, compare=False)
     #: what of the definition lies beside it
     detached: Detached = field(default_factory=Detached, repr=False, compare=False)
+    #: the tensors that are asked for, and those that are fed: no more of the definition is run (None: all of it)
+    asked: tuple[Collection[str], Collection[str]] | None = None
 
     def narrowed(self, source_map: SourceMap) -> OriginalRun:
-        """The same with no more of the definition than a policy asks for.
+        """The same with no more of the definition than a policy asks for, which is held against what may be run.
 
         Raises UnsupportedOpError where an op that does more than compute hangs on it, GraphError where it is not whole.
         """
         if self.definition is None:
             return self
-        return replace(self, definition=subgraph(self.definition, source_map.fetched(), source_map.fed()))
+        asked = source_map.fetched(), source_map.fed()
+        check(self.definition, *asked)
+        return replace(self, asked=asked)
 
     @contextmanager
     def loadable(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -50,7 +54,8 @@ class OriginalRun:
             return
         with scratch_folder() as folder:
             file = folder / "source.pb"
-            schema.pieces(self.definition, self.detached).write(file)
+            part = self.definition if self.asked is None else subgraph(self.definition, *self.asked)
+            schema.pieces(part, self.detached).write(file)
             yield str(file), {"kind": "graph"}
 
 

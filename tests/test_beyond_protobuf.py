@@ -21,6 +21,7 @@ from signatures.sampling import draw_cases
 @pytest.fixture(autouse=True)
 def _low_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("converters.detached.MAX_MESSAGE", 10_000)
+    monkeypatch.setattr("converters.detached.LARGE_FILE", 10_000)
 
 
 def test_weights_lie_beside_the_model_and_the_runtimes_find_them(tmp_path: Path, pool: RuntimePool) -> None:

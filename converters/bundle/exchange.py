@@ -110,10 +110,12 @@ def _synced(folder: Path) -> None:
     # A few at a time: the disk then waits for several of them at once; to start a thread for each takes longer.
     failed: list[OSError] = []
     threads = [
-        threading.Thread(target=_sync_or_note, args=(inside[i::_AT_ONCE], failed), daemon=True) for i in range(_AT_ONCE)
+        threading.Thread(target=_sync_or_note, args=(inside[i::_AT_ONCE], failed), daemon=True)
+        for i in range(1, _AT_ONCE)
     ]
     for thread in threads:
         thread.start()
+    _sync_or_note(inside[::_AT_ONCE], failed)
     for thread in threads:
         thread.join()
     if failed:

@@ -23,15 +23,26 @@ from signatures.errors import GraphError
 COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *SPELLINGS))
 
 
+def check(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) -> None:
+    """Raise what ``subgraph`` raises."""
+    _checked(graph_def, fetches, feeds)
+
+
+def _checked(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
+    """The nodes by their names, and those that are asked for."""
+    nodes = {n.name: n for n in graph_def.node}
+    roots = list(dict.fromkeys([*map(node_of, fetches), *(f for f in map(node_of, feeds) if f in nodes)]))
+    _check(nodes, roots)
+    return nodes, roots
+
+
 def subgraph(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) -> Any:
     """A GraphDef of what the tensors ``fetches`` are computed from, and of the nodes of ``feeds`` that are there.
 
     Raises UnsupportedOpError that names every node upstream, behind a control input or not, whose op does anything but
     compute; GraphError where a tensor that is asked for, or an input of a node, is not there.
     """
-    nodes = {n.name: n for n in graph_def.node}
-    roots = list(dict.fromkeys([*map(node_of, fetches), *(f for f in map(node_of, feeds) if f in nodes)]))
-    _check(nodes, roots)
+    nodes, roots = _checked(graph_def, fetches, feeds)
     looping = any(n.op in CONTROL_FLOW for n in graph_def.node)
     kept: set[str] = set()
     stack = list(roots)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.detached import LARGE, Detached
+from converters.detached import Detached
 from converters.graph.allowance import Allowance
 from converters.schema import TensorProto, dtype_number, dtype_of
 from signatures.errors import DamagedFileError
@@ -95,7 +95,7 @@ def from_array(array: np.ndarray, detached: Detached | None = None) -> Any:
         proto.tensor_shape.dim.add(size=int(size))
     if array.dtype.kind == "S":
         proto.string_val.extend(array.reshape(-1).tolist())
-    elif detached is not None and array.nbytes >= LARGE:
+    elif detached is not None and detached.takes(array):
         proto.tensor_content = detached.mark(array)
     else:
         little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)

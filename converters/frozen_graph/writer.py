@@ -33,7 +33,7 @@ def frozen(policy: Policy, contract: str = "{}", weights: Storage = "float32") -
     made: dict[Any, Pieces] = policy.graph.made
     key = frozen, contract, weights
     if key not in made:
-        detached = Detached()
         graph = with_contract(stored(policy.graph, weights), contract)
+        detached = Detached.of(graph.values())
         made[key] = schema.pieces(encode(graph, detached=detached), detached)
     return made[key]

@@ -126,6 +126,10 @@ class Graph:
             node = self.producer(node.inputs[0])
         return node.value if node.op == "Const" else None
 
+    def values(self) -> list[np.ndarray]:
+        """Its constants."""
+        return [node.value for node in self.nodes if node.value is not None]
+
     def consumers(self) -> dict[str, list[Node]]:
         """Node name → the nodes that read any of its outputs, in graph order."""
         table: dict[str, list[Node]] = {node.name: [] for node in self.nodes}

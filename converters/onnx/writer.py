@@ -82,7 +82,7 @@ class _Builder:
         self.turned: dict[str, View] = {}
         self._values: dict[str, str] = {}
         self._constants: dict[tuple[Any, ...], list[tuple[np.ndarray, str]]] = {}
-        self.detached = Detached()
+        self.detached = Detached.of(graph.values())
         self._names = NameScope(())
         self._prefix = ""
 
@@ -147,7 +147,7 @@ class _Builder:
         return name
 
     def _tensor(self, array: np.ndarray, name: str) -> Any:
-        raw = None if array.nbytes < LARGE else self.detached.mark(array)
+        raw = self.detached.mark(array) if self.detached.takes(array) else None
         return messages.tensor(array if raw else np.asarray(array, order="C"), name, raw)
 
     def begin(self, prefix: str) -> None:

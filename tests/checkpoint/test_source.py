@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters import schema
 from converters.graph.run import run_graph
 from converters.policy import Policy
 from converters.source import ReadOptions
@@ -89,7 +90,9 @@ def test_the_original_has_the_checkpoints_values_in_place_of_its_variables(tmp_p
     ((model, policy),) = source.compiled()
     assert model.original is not None
     assert model.original.path == tmp_path / "raw_graph_def.pb"
-    ops = {n.name: n.op for n in model.original.definition.node}
+    with model.original.loadable() as (path, _):
+        given = schema.parse(schema.GraphDef, Path(path).read_bytes(), "TensorFlow graph")
+    ops = {n.name: n.op for n in given.node}
     assert "Const" in ops.values()
     assert not {"VariableV2", "Assign", "RestoreV2", "SaveV2"} & set(ops.values())
     assert policy.source.fetches["action"].removesuffix(":0") in ops
