@@ -11,6 +11,7 @@ from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
 from converters.graph.ops.table import is_fed
 from converters.graph.options import MAX_PORTS, CompileOptions
 from converters.graph.passes import conditions as has
+from converters.graph.passes.any_number import for_any_number, without_agents
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import complete_shapes, set_values, settle_inputs
 from converters.graph.passes.memories import join_memories
@@ -82,7 +83,9 @@ def compile_graph(
 
 def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> list[tuple[str, Compilation]]:
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
-    joined = join_memories(graph, _by_nodes(graph, options), facts)
+    options = _by_nodes(graph, options)
+    graph, facts = _for_any_number(graph, options, facts)
+    joined = join_memories(graph, options, facts)
     original, options, facts = joined.graph, joined.options, joined.facts
     graph = set_values(original, options.values)
     brains = find_brains(graph, options.outputs, facts.outputs)
@@ -113,6 +116,22 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         c = Compilation(pinned, brain, options, facts, original, pinned, roles, fetches, sources, joined.parts)
         found.append((brain.label if len(brains) > 1 else "", c))
     return found
+
+
+def _for_any_number(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tuple[Graph, SourceFacts]:
+    """A graph without an axis for the agents gets one, which is said."""
+    if facts.rows is not None or not without_agents(graph):
+        return graph, facts
+    outputs = [*options.outputs, *facts.outputs]
+    if not outputs:
+        outputs = [reference for brain in find_brains(graph) for _, _, reference in brain.outputs]
+    found = for_any_number(graph, list(dict.fromkeys(node_of(o) for o in outputs if node_of(o) in graph)))
+    if found is None:
+        return graph, facts
+    made, rows = found
+    said = "one agent" if rows == 1 else f"{rows} agents"
+    note = f"the source decides for {said} at a time; an axis for any number is added, and each row is as the source's"
+    return made, replace(facts, rows=rows, notes=(*facts.notes, note), memories=facts.memories or None)
 
 
 def _source_of(graph: Graph, reference: str) -> str | tuple[str, ...] | None:

@@ -3,8 +3,7 @@
 torch.onnx.export fixes every length that ``dynamic_axes`` does not name, and what it traced may hold the number of rows
 inside, too. Three readings are tried, and each is held to what it says: the model's own free axis; its fixed number of
 rows, left free (``importer/fixed_batch.py``); the model for one agent, computed for each (``graph/passes/rows.py``).
-A constant that was made for one row (torch's ``arange`` over the batch, an index) cannot be told from any other, so it
-is tried: what several rows give together is what each gives alone.
+What only says that it takes any number is tried (``graph/passes/row_trial.py``).
 """
 
 from __future__ import annotations
@@ -15,21 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph, TensorShape, node_of
-from converters.graph.ops.samplers import SAMPLERS
-from converters.graph.passes.normalise import normalise
+from converters.graph.nodes import Graph
+from converters.graph.passes.row_trial import MAX_NUMBERS, ROWS, check_rows, too_large
 from converters.graph.passes.rows import for_every_row
-from converters.graph.run import run_graph
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import TensorType
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import DTYPES
 from signatures.errors import ExportModelError, NotAPolicyError, SignatureError
 from signatures.records import dataclass
 
-_ROWS = 3
-#: Numbers that the trial may make: all tensors of all rows together. A policy has some thousands, a camera's a million.
-_MAX_NUMBERS = 1 << 24
 #: Numbers that a model with a fixed batch may take at a time (32 MiB).
 _MAX_FED = 1 << 23
 
@@ -196,12 +189,12 @@ def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) ->
     """The error that names the first output which is wrong for more rows than one, draws left out; ``said``: the file
     says that it takes one row, so that one too large to be tried is believed. Else SignatureError is raised for it.
     """
-    if _size(importer.graph()) > _MAX_NUMBERS:
+    if too_large(importer.graph()):
         if said:
             return None
         raise SignatureError(
             "the model was exported for one row, and is too large to be tried with more",
-            why=f"its tensors hold more than {_MAX_NUMBERS} numbers for {_ROWS} rows",
+            why=f"its tensors hold more than {MAX_NUMBERS} numbers for {ROWS} rows",
             fix="export it again with the batch left free everywhere",
         )
     try:
@@ -209,52 +202,3 @@ def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) ->
     except SignatureError as error:
         return error
     return None
-
-
-def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
-    """Raise SignatureError that names the first output which is wrong for more rows than one."""
-    drawn = graph.descendants(n.name for n in graph.nodes if n.op in SAMPLERS)
-    judged = [o for o in outputs if node_of(o) not in drawn]
-    if not judged:
-        return
-    graph = normalise(graph.pruned(judged), judged)
-    types = infer_types(graph)
-    axes = {name: _free(kind) for name, kind in types.items()}
-    feeds = {n.name: _rows(n.attrs["shape"], n.attrs["dtype"]) for n in graph.nodes if n.op == "Placeholder"}
-    together = run_graph(graph, feeds, judged)
-    for row in range(_ROWS):
-        alone = run_graph(graph, {name: _row(a, row, axes[name]) for name, a in feeds.items()}, judged)
-        for name in judged:
-            axis = axes[name] or 0
-            got = together[name]
-            same = got.ndim > axis and got.shape[axis] == _ROWS
-            same = same and np.allclose(_row(got, row, axis), alone[name], 1e-4, 1e-4)
-            if not same:
-                raise SignatureError(
-                    f"the output {graph[name].origin or name!r} is computed for one row only",
-                    why="the model says that it takes any number of rows, but a constant inside was made for one: with "
-                    f"{_ROWS} rows, row {row} comes out otherwise than alone",
-                    fix="export it again with the batch left free everywhere, or name the outputs that you need: "
-                    "--output action=action",
-                )
-
-
-def _size(graph: Graph) -> int:
-    """The numbers of all tensors of a trial: shapes are what a file claims, and a policy never takes as many."""
-    shapes = (kind.shape or () for kind in infer_types(normalise(graph)).values())
-    return sum(math.prod(d if isinstance(d, int) else _ROWS for d in shape) for shape in shapes)
-
-
-def _free(kind: TensorType) -> int | None:
-    """The axis of the agents: of a memory [layers, B, n] it is not the first."""
-    return next((i for i, d in enumerate(kind.shape or ()) if isinstance(d, str)), None)
-
-
-def _row(array: np.ndarray, row: int, axis: int | None) -> np.ndarray:
-    return array if axis is None else np.take(array, [row], axis)
-
-
-def _rows(shape: TensorShape, dtype: np.dtype) -> np.ndarray:
-    dims = [_ROWS if d is None else d for d in shape.dims or ()]
-    numbers = np.random.Generator(np.random.PCG64(0)).normal(size=dims)
-    return (np.abs(numbers) if dtype.kind in "iub" else numbers).astype(dtype)

@@ -224,9 +224,9 @@ def _check_batch(name: str, shape: tuple[int | str, ...] | None, compiled: Compi
     if taken and all(dims is not None and None not in dims for dims in taken.values()):
         shown = ", ".join(f"{n} {list(dims)}" for n, dims in taken.items())
         raise SignatureError(
-            f"the graph decides for one agent alone: {shown}",
-            why=f"{name!r} ({source}) comes as {list(shape)}; only an ONNX model is made one for any number of agents",
-            fix="freeze it from placeholders with a free first axis ([None, n]), or give the ONNX of the same network",
+            f"the graph has no axis for any number of agents: {shown}",
+            why=f"{name!r} ({source}) comes as {list(shape)}, and what computes it cannot be told row by row",
+            fix="freeze it from placeholders with a free first axis ([None, n])",
         )
     raise SignatureError(
         f"output {name!r} ({source}) has shape {list(shape)}, without the batch axis",

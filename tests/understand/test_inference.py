@@ -473,13 +473,6 @@ def test_a_long_chain_of_views_needs_no_deep_stack() -> None:
     assert meaning(views) == (Role.CONTINUOUS, ())
 
 
-@pytest.mark.parametrize("dims", [(1, 3), (3,)])
-def test_a_graph_for_one_agent_says_so(dims: tuple[int, ...]) -> None:
-    made = Graph((placeholder("vector_observation", dims, FLOAT), Node("action", "Tanh", ("vector_observation",))))
-    with pytest.raises(SignatureError, match=r"decides for one agent alone: vector_observation .*\n.*\n.*\[None, n\]"):
-        compile_graph(made, "one")
-
-
 def test_a_history_with_time_first_says_so() -> None:
     made = Graph((placeholder("x", (4, None, 3), FLOAT), Node("action", "Tanh", ("x",))))
     with pytest.raises(SignatureError, match=r"the agents' axis of the input 'x' is its second"):

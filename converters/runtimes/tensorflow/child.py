@@ -41,10 +41,15 @@ def main() -> None:
             self.session = tf.compat.v1.Session(graph=graph, config=settings)
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-            values = self.session.run(
-                [_tensor(n) for n in fetch], {_tensor(name): array for name, array in feeds.items()}
-            )
+            given = {_tensor(name): self._fitting(_tensor(name), array) for name, array in feeds.items()}
+            values = self.session.run([_tensor(n) for n in fetch], given)
             return dict(zip(fetch, values, strict=True))
+
+        def _fitting(self, name: str, array: Any) -> Any:
+            """A row as a source takes it that has no axis for the agents."""
+            shape = self.session.graph.get_tensor_by_name(name).shape
+            alone = shape.is_fully_defined() and shape.rank != array.ndim and shape.num_elements() == array.size
+            return array.reshape(shape.as_list()) if alone else array
 
     def imported(definition: Any) -> Any:
         for node in definition.node:
