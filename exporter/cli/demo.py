@@ -33,8 +33,13 @@ def demo_command(out: Path, no_open: bool) -> None:
     """
     from converters.bundle.bundle import writing
     from exporter.demo import BALL
+    from signatures.errors import UsageError
 
     source, report = out / BALL.name, out / "parity.html"
+    if out.exists() and any(p.is_symlink() or (p.exists() and not p.is_file()) for p in (source, report)):
+        raise UsageError(
+            f"{out} has something else in it", why="links are not written through", fix="-o names a folder"
+        )
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(BALL, source)

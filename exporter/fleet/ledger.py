@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.fetch import address_of, shown
+from converters.fetch import address_of, read_bytes, shown
 from exporter.export.labels import read_labels
 from exporter.export.options import ExportOptions
 from exporter.remote.fetching import version
@@ -38,9 +39,16 @@ class Ledger:
         self._lines: dict[str, Mapping[str, Any]] = {}
         #: what is at an address is not looked at: all is exported
         self._keeps = address_of(options.out) is None
+        if os.path.lexists(self._path) and (self._path.is_symlink() or not self._path.is_file()):
+            raise BundleError(
+                "is in the way and is no file of ours",
+                where=str(self._path),
+                why="lines are appended to it: behind a link they would change another file",
+                fix="remove it, or choose another folder with -o",
+            )
         try:
-            text = self._path.read_text(encoding="utf-8") if self._path.is_file() else ""
-        except (OSError, ValueError):
+            text = read_bytes(self._path, empty=True).decode() if self._keeps and self._path.exists() else ""
+        except (SourceError, ValueError):
             text = ""
         for line in text.splitlines():
             try:
@@ -56,7 +64,7 @@ class Ledger:
             same = (
                 entry.get("options") == self._key
                 and _is_as_it_was(source, entry["seen"], entry["files"])
-                and all(sha256_hex((self._out / n / POLICY).read_bytes()) == h for n, h in entry["policies"].items())
+                and all(sha256_hex(read_bytes(self._out / n / POLICY)) == h for n, h in entry["policies"].items())
             )
             return [str(name) for name in entry["policies"]] if same else None
         except (OSError, LookupError, TypeError, ValueError, AttributeError, SourceError):
@@ -122,7 +130,7 @@ def _is_same(path: Path, stamp: Stamp) -> bool:
     """By size and time, as git does it; a file that was only touched is read."""
     size, time, digest = stamp
     now = _times(path)
-    return now == [size, time] or (now[0] == size and sha256_hex(path.read_bytes()) == digest)
+    return now == [size, time] or (now[0] == size and sha256_hex(read_bytes(path)) == digest)
 
 
 def _times(path: Path) -> list[int]:

@@ -42,7 +42,7 @@ def filesystem(address: str) -> tuple[Any, str]:
     import fsspec
 
     try:
-        system, path = fsspec.core.url_to_fs(address, **(_patience() if is_http(address) else {}))
+        system, path = fsspec.core.url_to_fs(address, **(_manner() if is_http(address) else {}))
     except ImportError as error:
         raise UsageError(
             f"{address.partition('://')[0]}:// needs another package",
@@ -58,11 +58,16 @@ def is_http(address: str) -> bool:
     return address.startswith(("http://", "https://"))
 
 
-def _patience() -> dict[str, Any]:
-    """How long a web server may be silent; aiohttp's own five minutes are for all of a file, however large."""
+def _manner() -> dict[str, Any]:
+    """How long a web server may be silent; aiohttp's own five minutes are for all of a file, however large.
+
+    Files come as they are: packed on the way, a small answer would fill the disk.
+    """
     import aiohttp
 
-    return {"client_kwargs": {"timeout": aiohttp.ClientTimeout(total=6 * 3600, sock_connect=30, sock_read=60)}}
+    timeout = aiohttp.ClientTimeout(total=6 * 3600, sock_connect=30, sock_read=60)
+    headers = {"Accept-Encoding": "identity"}
+    return {"client_kwargs": {"timeout": timeout, "headers": headers, "auto_decompress": False}}
 
 
 @contextlib.contextmanager
@@ -85,8 +90,9 @@ def asking(address: str, *, writes: bool = False) -> Iterator[None]:
 
 
 def is_pattern(address: str) -> bool:
-    """Whether it stands for several; a ? begins a query."""
-    return any(sign in address for sign in _MAGIC)
+    """Whether it stands for several; a ? begins a query, and a host may have brackets (IPv6)."""
+    inside = address.partition("://")[2].partition("/")[2] if is_http(address) else address
+    return any(sign in inside for sign in _MAGIC)
 
 
 def matching(address: str) -> list[Path]:

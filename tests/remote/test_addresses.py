@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import os
 import shutil
@@ -336,6 +337,33 @@ def test_a_file_may_take_longer_than_five_minutes() -> None:
     system, _ = filesystem.filesystem("https://example.com/p.onnx")
     timeout = system.client_kwargs["timeout"]
     assert (timeout.total >= 3600, timeout.sock_connect, timeout.sock_read) == (True, 30, 60)
+
+
+@pytest.mark.parametrize("address", ["http://[/x.onnx", "http://*", "http://*/x.onnx", "http://a b/x"])
+def test_a_host_is_no_pattern(address: str, tmp_path: Path) -> None:
+    """Patterns are of paths: a bracket in a host ended in StopIteration."""
+    (tmp_path / "list.txt").write_text(address)
+    ran = command(tmp_path / "list.txt", "-o", tmp_path / "out", "--verify", "none")
+    assert (ran.status, "Traceback" in ran.err) == (2, False)
+    assert address in ran.err
+
+
+class _Packed(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Encoding", "gzip")
+        self.end_headers()
+        self.wfile.write(gzip.compress(bytes(1 << 26)))
+
+    do_HEAD = do_GET  # noqa: N815
+
+    def log_message(self, *args: Any) -> None:
+        pass
+
+
+def test_what_comes_is_not_unpacked_on_the_way(serving: Any) -> None:
+    with nearby(Path(f"{serving(_Packed)}/policy.onnx")) as place:
+        assert place.stat().st_size < 1 << 20
 
 
 @pytest.mark.parametrize("listed", [["/odd/a", "/odd/a/b"], ["/elsewhere/x"]])
