@@ -13,7 +13,7 @@ from exporter.cli.options import one_bundle
 from exporter.cli.terminal import say
 from signatures.errors import UsageError
 
-_SCENES = ("auto", "ball3d", "gridworld", "hallway", "tennis", "none")
+_SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "none")
 
 
 @click.command(

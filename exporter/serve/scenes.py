@@ -53,8 +53,11 @@ SCENES = (
     Scene("hallway", "Hallway", 4, branches=(3,), memory=True),
     Scene("tennis", "Tennis", 5, branches=(3,), side="left"),
     Scene("tennis", "Tennis", 5, continuous=1, side="right"),
+    Scene("crawler2d", "Crawler2D", 26, continuous=8),
 )
-"""The environments of fixtures/environments, after the examples of ML-Agents."""
+"""The environments of fixtures/environments: after examples of ML-Agents, but for Crawler2D. That is no example's name
+or shape, so that a policy of ML-Agents' Crawler, which another physics made, does not end here.
+"""
 
 
 def scene_of(name: str, signature: PolicySignature, asked: str = AUTO) -> Scene | None:

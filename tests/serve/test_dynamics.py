@@ -14,6 +14,8 @@ from exporter.serve.site import PAGE
 from fixtures.environments import ENVIRONMENTS
 
 AGENTS, STEPS = 5, 400
+#: How many continuous actions.
+CONTINUOUS = {"3DBall": 2, "Crawler2D": 8}
 PROGRAM = """
 import { readFileSync } from "node:fs";
 const { file, name, agents, seed, actions } = JSON.parse(readFileSync(0));
@@ -39,8 +41,8 @@ def in_node(name: str, seed: int, actions: list[Any]) -> list[dict[str, Any]]:
 
 def drawn(name: str, rng: np.random.Generator) -> tuple[Any, dict[str, Any]]:
     """An action as Python takes it and as JavaScript does; beyond ±1 too, and masked moves."""
-    if name == "3DBall":
-        both = rng.uniform(-1.3, 1.3, (AGENTS, 2))
+    if name in CONTINUOUS:
+        both = rng.uniform(-1.3, 1.3, (AGENTS, CONTINUOUS[name]))
         return both, {"continuous": both.tolist()}
     if name == "Tennis":
         left, right = rng.integers(0, 3, (AGENTS, 1)), rng.uniform(-1.5, 1.5, (AGENTS, 1))
@@ -67,8 +69,13 @@ def flat(observation: dict[str, Any]) -> dict[str, np.ndarray]:
     return {k: np.array(v) for k, v in parts.items()}
 
 
-@pytest.mark.parametrize("seed", [0, 2026, 2**32 - 1])
-@pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
+#: Crawler2D's 3,200 substeps once: a seed is a seed.
+LIVES = [
+    (name, seed) for name in sorted(ENVIRONMENTS) for seed in (2**32 - 1, 0, 2026)[: 1 if name == "Crawler2D" else 3]
+]
+
+
+@pytest.mark.parametrize(("name", "seed"), LIVES)
 def test_the_same_seed_and_actions_give_the_same_lives(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     actions = [drawn(name, rng) for _ in range(STEPS)]

@@ -231,6 +231,37 @@ def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
     assert (seen.console, seen.requests) == ([], [page.as_uri()])
 
 
+def test_a_crawler_walks_ahead_and_lands_on_its_feet(bundle: Bundle, tmp_path: Path) -> None:
+    """It is lifted and flicked while all else waits; then it comes down and walks on."""
+    page = tmp_path / "page.html"
+    page.write_bytes(assemble_one_file(bundle("Crawler2D")))
+    seen_number = "Number(document.querySelector('.bars').rows[{}].lastChild.textContent.replace('−', '-'))"
+    height, ahead = seen_number.format(0), seen_number.format(3)
+    farthest = "parseFloat(document.querySelector('#status').textContent.replace('farthest ', ''))"
+    seen = visit(
+        f"{page.as_uri()}#speed=8",
+        [
+            ["wait", f"{STATUS}.seconds > 5"],
+            ["click", "#pause"],
+            ["eval", farthest],
+            ["eval", f"{farthest} / {STATUS}.seconds"],
+            ["eval", height],
+            ["drag", "#canvas", [0.55, 0.85], [0.58, 0.74]],
+            ["eval", height],
+            ["eval", ahead],
+            ["click", "#pause"],
+            ["wait", f"{STATUS}.seconds > 15"],
+            ["eval", farthest],
+        ],
+    )
+    walked, pace, before, lifted, flicked, later = (seen.results[k] for k in (2, 3, 4, 6, 7, 10))
+    assert 1.5 < pace < 2.5
+    assert before < 0.6 < lifted  # of the third, which is the one that is shown since
+    assert flicked > 0.05
+    assert later > walked + 10
+    assert (seen.console, seen.requests) == ([], [page.as_uri()])
+
+
 def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
     """In each other's place they act the same, as does an .onnx that is dropped; how little they differ is shown."""
     assert export_model(run_folder("3DBall"), "-o", tmp_path, "--to", "bytes,tfjs,onnx", "--verify", "none").status == 0

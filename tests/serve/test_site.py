@@ -67,6 +67,7 @@ def test_a_bundle_gives_the_same_bytes_each_time(bundle: Bundle) -> None:
         ("Hallway", "hallway", None),
         ("Tennis-LeftBrain", "tennis", "left"),
         ("Tennis-RightBrain", "tennis", "right"),
+        ("Crawler2D", "crawler2d", None),
         ("continuous", None, None),
     ],
 )

@@ -11,7 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fixtures.environments import ENVIRONMENTS, Ball3D, GridWorld, Hallway, Tennis, ball3d, gridworld, tennis
+from fixtures.environments import (
+    ENVIRONMENTS,
+    Ball3D,
+    Crawler2D,
+    GridWorld,
+    Hallway,
+    Tennis,
+    ball3d,
+    crawler2d,
+    gridworld,
+    tennis,
+)
 from fixtures.environments.base import Environment, Streams
 from fixtures.evaluate import play, together
 
@@ -70,7 +81,7 @@ def test_draws_are_uniform_and_only_the_rows_asked_for_move() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @given(seed=SEEDS, rows=st.integers(1, 6))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_an_agent_lives_the_same_life_alone_and_among_others(name: str, seed: int, rows: int) -> None:
     few, many = ENVIRONMENTS[name](rows), ENVIRONMENTS[name](7)
     here, there = few.reset(seed=seed)[0], many.reset(seed=seed)[0]
@@ -336,3 +347,53 @@ def test_ball_and_rackets_stay_on_the_court_and_each_brain_sees_its_side(seed: i
         observation, _, terminated, _, _ = environment.step(some_actions(environment, chance))
         speed = np.abs(environment.racket[~terminated, 0] - before[~terminated]) / tennis.TIME_STEP
         assert (speed <= tennis.RACKET_SPEED + 1e-9).all()
+
+
+# ------------------------------------------------------------------ Crawler2D
+
+MASS = np.array([crawler2d.HIP_MASS] * 2 + [crawler2d.KNEE_MASS] * 4 + [crawler2d.FOOT_MASS] * 4)
+
+
+def test_what_a_crawler_does_in_the_air_moves_its_middle_nowhere() -> None:
+    """Torques come in pairs, and rods pull both ends: the centre of mass falls as a stone does."""
+    environment = Crawler2D(3)
+    environment.reset(seed=1)
+    environment.place[1] += 50.0
+    momentum = (environment.speed * MASS[:, None]).sum(1)
+    chance = np.random.default_rng(0)
+    for _ in range(20):
+        _, _, terminated, *_ = environment.step(chance.uniform(-1, 1, (3, 8)))
+        assert not terminated.any()
+    momentum[1] -= MASS.sum() * crawler2d.GRAVITY * 20 * crawler2d.TIME_STEP
+    np.testing.assert_allclose((environment.speed * MASS[:, None]).sum(1), momentum, atol=1e-9)
+
+
+def test_a_crawler_that_does_nothing_stands_where_it_is() -> None:
+    score = play(environment := Crawler2D(2), lambda _: np.zeros((2, 8)), seed=2)
+    assert score.success.all()
+    assert np.abs(score.returns).max() < 0.2
+    assert environment.place.shape == (2, 10, 2)
+
+
+def test_rods_come_back_to_their_lengths_and_nothing_is_below_the_ground() -> None:
+    environment = Crawler2D(6)
+    environment.reset(seed=3)
+    chance = np.random.default_rng(3)
+    legs = (([0, 1] * 2, range(2, 6), crawler2d.THIGH), (range(2, 6), range(6, 10), crawler2d.SHIN))
+    off = []
+    for _ in range(60):
+        environment.step(chance.uniform(-1, 1, (6, 8)))
+        x, y = environment.place
+        np.testing.assert_allclose(np.hypot(x[1] - x[0], y[1] - y[0]), crawler2d.BODY, rtol=1e-9)
+        off += [np.abs(np.hypot(x[b] - x[a], y[b] - y[a]) / length - 1.0) for a, b, length in legs]
+        assert y.min() >= 0.0
+    assert np.mean(off) < 0.02  # an impact is felt for a substep or two
+
+
+def test_a_crawler_that_turns_over_has_fallen() -> None:
+    environment = Crawler2D(1)
+    environment.reset(seed=0)
+    environment.place[0] *= -1.0
+    environment.place[1] += 2.0
+    _, _, terminated, _, info = environment.step(np.zeros((1, 8)))
+    assert (terminated[0], info["success"][0]) == (True, False)
