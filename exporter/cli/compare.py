@@ -10,7 +10,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import Command
-from exporter.cli.options import comparing, pairs, trusting, understanding
+from exporter.cli.options import JUDGING, as_given, comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.graph.options import CompileOptions
@@ -72,7 +72,7 @@ def compare_command(
         )
     console.verified(report, ", ".join(map(shown, candidates)))
     console.json({"reports": [report.to_dict()]})
-    command = ("compare", *map(shown, (reference, *candidates)), *(word for m in mapped for word in ("--map", m)))
+    command = ("compare", *map(shown, (reference, *candidates)), *as_given(JUDGING))
     console.write_reports(
         lambda: [Entry(report, read[0].signature, read[0].graph, steps=options.steps, command=command)]
     )

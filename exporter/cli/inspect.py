@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from exporter.cli.export import export_command
 from exporter.cli.group import Command
-from exporter.cli.options import activating, read_options, trusting, understanding
+from exporter.cli.options import activating, as_given, read_options, trusting, understanding
 from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import ExportModelError, UsageError
 
@@ -113,7 +112,8 @@ def inspect_command(
     if as_json:
         say_json(found[0] if len(sources) == 1 else {"sources": found})
     elif not releases and status == 0:
-        say(f"next: {typed(*map(shown, sources), *_given_for_both(), '-o', 'exported')}")
+        both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
+        say(f"next: {typed(*map(shown, sources), *both, '-o', 'exported')}")
     if status:
         sys.exit(status)
 
@@ -135,25 +135,6 @@ def _inspected(
         for path in written:
             say(f"wrote {path}")
     return {**found.to_dict(), **({"written": [str(path) for path in written]} if written else {})}
-
-
-def _given_for_both() -> list[str]:
-    """The options of this call that an export takes as well, as they were given."""
-    context = click.get_current_context()
-    both = {p.name for p in export_command.params} - {"as_json"}
-    words: list[str] = []
-    for option in context.command.params:
-        name = option.name
-        if not isinstance(option, click.Option) or name not in both or name is None:
-            continue
-        if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
-            continue
-        if option.is_flag:
-            words.append(option.opts[0])
-            continue
-        values = context.params[name] if option.multiple else [context.params[name]]
-        words += [word for value in values for word in (option.opts[0], str(value))]
-    return words
 
 
 def _unity(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from exporter.cli.console import Console
 from signatures.errors import UsageError
@@ -40,6 +41,44 @@ def one_bundle(place: Path, command: str) -> Path | None:
             f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: {typed(command, found[0])}"
         )
     return found[0] if found else None
+
+
+def as_given(names: Container[str]) -> list[str]:
+    """The options of this call whose parameters ``names`` has, word for word, where the command line had them."""
+    context = click.get_current_context()
+    words: list[str] = []
+    for option in context.command.params:
+        name = option.name
+        if not isinstance(option, click.Option) or name is None or name not in names:
+            continue
+        if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
+            continue
+        if option.is_flag:
+            words.append(option.opts[0])
+            continue
+        values = context.params[name] if option.multiple else [context.params[name]]
+        words += [word for value in values for word in (option.opts[0], str(value))]
+    return words
+
+
+#: What decides how a policy is read and judged. A report that says how to compare again has these as they were given.
+JUDGING = frozenset(
+    [
+        "mapped",
+        "brain",
+        "inputs",
+        "outputs",
+        "values",
+        "trust_source",
+        "source",
+        "step",
+        "golden",
+        "sizes",
+        "tolerances",
+        "atol",
+        "rtol",
+    ]
+)
 
 
 def sensors_of(text: str) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:

@@ -25,7 +25,7 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
         return
     from converters.runtimes.confinement import in_force
     from converters.runtimes.registry import available_runtimes
-    from exporter.tables import table
+    from exporter.tables import paragraph, table
 
     found = available_runtimes()
     kept = in_force()
@@ -39,9 +39,10 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     held = [_SAID[part] for part, there in kept.items() if there]
     say()
     if held:
-        say(f"a runtime's process {', '.join(held)}" + (" (a browser has its own sandbox)" if not lacking else ""))
+        sandbox = " (a browser has its own sandbox)" if not lacking else ""
+        say_lines(paragraph(f"{', '.join(held)}{sandbox}", "a runtime's process ", "  "))
     if lacking:
-        say(f"not on this system: {', '.join(lacking)}")
+        say_lines(paragraph(", ".join(lacking), "not on this system: ", "  "))
 
 
 @runtimes_command.command("install")

@@ -12,7 +12,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import Command
-from exporter.cli.options import comparing, trusting
+from exporter.cli.options import JUDGING, as_given, comparing, trusting
 
 if TYPE_CHECKING:
     from exporter.reports.entry import Entry
@@ -96,4 +96,5 @@ def _bundle_entries(
 ) -> list[Entry]:
     from exporter.reports.entry import of_bundle
 
-    return [of_bundle(report, *place, steps) for report, place in zip(reports, places, strict=True)]
+    words = as_given(JUDGING)
+    return [of_bundle(report, *place, steps, words) for report, place in zip(reports, places, strict=True)]

@@ -181,7 +181,7 @@ def inspection_text(inspection: Inspection) -> str:
         f"{len(inspection.policies)} {'policy' if len(inspection.policies) == 1 else 'policies'}"
         + (f"; {inspection.producer}" if inspection.producer else "")
     )
-    return "\n\n".join([printable(head), *(_policy_text(p) for p in inspection.policies)])
+    return "\n\n".join([paragraph(head, "", "  "), *(_policy_text(p) for p in inspection.policies)])
 
 
 def _policy_text(inspected: PolicyInspection) -> str:
@@ -195,12 +195,12 @@ def _policy_text(inspected: PolicyInspection) -> str:
         layout = f" [{'|'.join(signature.memory.layout)}]" if signature.memory.layout else ""
         facts.append(f"memory {signature.memory.size}{layout}")
     head = f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}"
-    lines = [printable(head), "", "\n\n".join(table(head, rows) for head, rows in _tables(signature))]
+    lines = [paragraph(head, "", "  "), "", "\n\n".join(table(head, rows) for head, rows in _tables(signature))]
     lines += ["", f"parameters: {inspected.parameters:,}"]
     for name, way in inspected.layers.items():
         lines.append(paragraph(way, "layers: " if len(inspected.layers) == 1 else f"layers to {name}: ", "  "))
     lines += [paragraph(text, f"{name} is normalised by: ", "  ") for name, text in _normalised(signature)]
-    lines += map(printable, _label_lines(signature.labels))
+    lines += _label_lines(signature.labels)
     if signature.constants:
         lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
     lines += [paragraph(note, "note: ", "  ") for note in signature.notes]
@@ -238,7 +238,8 @@ def _label_lines(labels: Mapping[str, Any]) -> list[str]:
     named = [(name, texts) for name, texts in labels.get("observations", {}).items()]
     named += [("continuous actions", labels["actions"])] if "actions" in labels else []
     named += [(f"branch {i}", texts) for i, texts in enumerate(labels.get("branches", []))]
-    lines = [f"labels of {name}: " + ", ".join(f"{i} {text}" for i, text in enumerate(texts)) for name, texts in named]
+    numbered = [(name, ", ".join(f"{i} {text}" for i, text in enumerate(texts))) for name, texts in named]
+    lines = [paragraph(text, printable(f"labels of {name}: "), "  ") for name, text in numbered]
     return ["", *lines] if lines else []
 
 

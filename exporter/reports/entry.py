@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -59,16 +59,16 @@ def of_result(result: ExportResult, steps: int) -> Entry | None:
     return Entry(result.report, policy.signature, policy.graph, result.agreed, steps, _verify(result.folder))
 
 
-def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int) -> Entry:
+def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int, words: Sequence[str] = ()) -> Entry:
     """The entry of a bundle that was verified again (so its files are what policy.json says); ``place``: the
-    address that it was fetched from.
+    address that it was fetched from; ``words``: options to verify it again with.
     """
     found = Bundle.open(folder)
     try:
         graph = found.graph()
     except (OSError, ExportModelError):  # a report without a picture is better than none where it has gone since
         graph = None
-    return Entry(report, found.signature, graph, found.contract, steps, _verify(place or folder))
+    return Entry(report, found.signature, graph, found.contract, steps, (*_verify(place or folder), *words))
 
 
 def _verify(place: Path) -> tuple[str, ...]:

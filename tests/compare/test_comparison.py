@@ -325,8 +325,12 @@ def test_the_command_line_compares_and_reports(bundles: Bundles, tmp_path: Path)
     assert ran.status == 1
     assert "--map action=Identity" in ran.out
     assert "action" in (tmp_path / "p.html").read_text()
-    right = export_model(*command, "--map", "action=Identity", "--max-size", "1MB", "--json")
+    read = ("--map", "action=Identity", "--input", "action_masks=masks", "--max-size", "1MB")
+    right = export_model(*command, *read, "--json", "--html", tmp_path / "p.html")
     assert right.status == 0
+    again = (tmp_path / "p.html").read_text().partition("The same again")[2].partition("</p>")[0]
+    assert all(f"{flag} {value}" in again for flag, value in zip(read[::2], read[1::2], strict=True))
+    assert "--json" not in again
     (report,) = right.json["reports"]
     assert report["verdict"] == "passed"
     assert [c["kind"] for c in report["comparisons"] if c["output"] == "size"] == ["size"]

@@ -106,6 +106,14 @@ def test_help_fits_a_terminal_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> 
         assert max(map(len, shown.splitlines())) <= 80, shown
 
 
+def test_what_is_listed_fits_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the command to copy, which stays in one line."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in (("inspect", fixture("recurrent")), ("inspect", fixture("twobrains")), ("runtimes",)):
+        lines = export_model(*words).out.splitlines()
+        assert max(len(line) for line in lines if not line.startswith("next: ")) <= 80, lines
+
+
 def test_no_argument_shows_the_usage_and_is_status_2() -> None:
     ran = export_model()
     assert (ran.status, ran.out) == (2, "")
