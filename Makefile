@@ -62,7 +62,7 @@ types: install
 	$(BIN)/mypy
 
 check: lint types
-	$(PYTEST) -n 2 --dist worksteal -q -m "not (runtimes or slow or corpus or legacy or browser or peers)"
+	EXPORT_MODEL_TEST_DAILY=1 $(PYTEST) -n 2 --dist worksteal -q -m "not (runtimes or slow or corpus or legacy or browser or peers)"
 
 test: install browser lint types
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90 --durations=25

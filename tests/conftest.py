@@ -26,10 +26,13 @@ os.environ.pop("COLUMNS", None)
 
 #: What the tests that compare all formats run them in.
 NEEDED = ("tensorflow", "onnxruntime", "onnxruntime-web", "tfjs-cpu", "tfjs-wasm")
-#: Those of them that cost little: three fifths of a verification's time are Node's.
-QUICK = ("tensorflow", "onnxruntime")
+#: The one of them that costs little: of a verification's time TensorFlow takes two fifths, Node half.
+QUICK = ("onnxruntime",)
 #: Set, every policy of a sweep is run in all of NEEDED, as one that has something new always is.
 FULL = "EXPORT_MODEL_TEST_FULL"
+
+#: Set (by make check), properties are tried on a fifth of their examples.
+DAILY = "EXPORT_MODEL_TEST_DAILY"
 
 #: No time limit per example: on a busy machine it says nothing of the code. Each test has pytest's own.
 settings.register_profile("busy", deadline=None)
@@ -62,6 +65,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if swept[family] % of:
                 item.add_marker(pytest.mark.no_cover)
             swept[family] += 1
+
+
+def examples(count: int, **options: Any) -> settings:
+    """Settings of a property that is dear: so many examples, fewer in the daily loop."""
+    return settings(deadline=None, max_examples=max(count // 5, 5) if DAILY in os.environ else count, **options)
 
 
 @pytest.fixture(scope="session")

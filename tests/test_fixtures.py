@@ -186,6 +186,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Array]:
     return read_npz(archive)
 
 
+@pytest.mark.runtimes
 @needs_tensorflow
 @pytest.mark.parametrize("name", FIXTURES)
 def test_tensorflow_reproduces_the_goldens(name: str, replayed: dict[str, Array]) -> None:
@@ -197,6 +198,7 @@ def test_tensorflow_reproduces_the_goldens(name: str, replayed: dict[str, Array]
         np.testing.assert_allclose(again, value, rtol=1e-5, atol=1e-5, err_msg=key, strict=True)
 
 
+@pytest.mark.runtimes
 @needs_tensorflow
 def test_script_makes_what_is_committed() -> None:
     installed = tensorflow_version()

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.barracuda.encode import encode
@@ -14,23 +14,24 @@ from converters.barracuda.format import NnModel, Trailer, parse
 from tests.barracuda.conftest import SHARED
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.test_format import PAIRS, assert_same, models
+from tests.conftest import examples
 
 
 @given(models())
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_a_model_is_encoded_as_the_format_lays_it_out(model: NnModel) -> None:
     assert encode(model) == write_nn(model)
 
 
 @given(models())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_a_file_read_and_written_again_is_the_same_bytes(model: NnModel) -> None:
     data = write_nn(model)
     assert encode(parse(data)) == data
 
 
 @given(models(), PAIRS)
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_metadata_lies_behind_what_loaders_of_an_older_version_read(
     model: NnModel, pairs: tuple[tuple[str, str], ...]
 ) -> None:
@@ -44,7 +45,7 @@ def test_metadata_lies_behind_what_loaders_of_an_older_version_read(
 
 
 @given(models(), st.integers(0, 3))
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_metadata_are_found_by_their_key(model: NnModel, number: int) -> None:
     pairs = tuple((f"key {i}", str(i)) for i in range(number))
     found = replace(model, trailer=Trailer("", "", "", (), pairs))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.barracuda.format import VERSIONS, Dataset, Layer, NnInput, NnMemory, NnModel, Trailer, parse
@@ -18,6 +18,7 @@ from signatures.errors import DamagedFileError, ExportModelError
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import public_files
 from tests.barracuda.nn_files import Maker, write_nn
+from tests.conftest import examples
 
 INT32 = st.integers(-(2**31), 2**31 - 1)
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=12)
@@ -77,13 +78,13 @@ def assert_same(a: NnModel, b: NnModel) -> None:
 
 
 @given(models())
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_what_is_written_is_read_back(model: NnModel) -> None:
     assert_same(parse(write_nn(model)), model)
 
 
 @given(models(), st.data())
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_a_file_cut_anywhere_is_an_error_with_its_place(model: NnModel, data: st.DataObject) -> None:
     whole = write_nn(model)
     end = len(write_nn(replace(model, trailer=None)))
@@ -100,7 +101,7 @@ def test_a_file_cut_anywhere_is_an_error_with_its_place(model: NnModel, data: st
 
 
 @given(st.binary(max_size=300), st.sampled_from(VERSIONS))
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_garbage_is_refused(data: bytes, version: int) -> None:
     for file in (data, struct.pack("<q", version) + data):
         try:
@@ -120,7 +121,7 @@ def small() -> NnModel:
 
 
 @given(st.data())
-@settings(max_examples=400, deadline=None)
+@examples(400)
 def test_a_changed_byte_is_read_or_refused(data: st.DataObject) -> None:
     file = bytearray(write_nn(small()))
     for _ in range(data.draw(st.integers(1, 4))):
@@ -132,7 +133,7 @@ def test_a_changed_byte_is_read_or_refused(data: st.DataObject) -> None:
 
 
 @given(st.sampled_from(all_cases()), st.data())
-@settings(max_examples=400, deadline=None)
+@examples(400)
 def test_changed_numbers_in_any_kind_of_layer_are_read_or_refused(case: Case, data: st.DataObject) -> None:
     file = bytearray(write_nn(case.model))
     numbers = st.sampled_from((-(2**31), -5, -1, 0, 1, 2, 3, 4, 8, 255, 1 << 24, 2**31 - 1))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -14,6 +14,7 @@ from converters import schema
 from converters.checkpoint.tensor_bundle import Checkpoint, slice_key
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 from tests.checkpoint.writing import bundle, literal, table
+from tests.conftest import examples
 
 DTYPES = (np.float32, np.float64, np.float16, np.int32, np.int64, np.uint8, np.bool_)
 VALUES = st.dictionaries(
@@ -24,7 +25,7 @@ VALUES = st.dictionaries(
     min_size=1,
     max_size=8,
 )
-FRESH = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+FRESH = examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @FRESH

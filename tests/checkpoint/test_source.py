@@ -224,6 +224,7 @@ def test_a_metagraph_without_its_values(tmp_path: Path) -> None:
         read_source(file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["model-1.ckpt.index", "model-1.ckpt.data-00000-of-00001", "raw_graph_def.pb"])
 def test_damage_leaves_nothing_behind(tmp_path: Path, name: str) -> None:
     """Every byte cut off, or changed, one by one: a clear error or the same policy."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from converters.checkpoint import table as module
@@ -14,6 +14,7 @@ from converters.checkpoint.snappy import SnappyError, decompress
 from converters.checkpoint.table import MAGIC, read_table
 from signatures.errors import DamagedFileError, ExportModelError
 from tests.checkpoint.writing import block, literal, table, varint
+from tests.conftest import examples
 
 PAIRS = st.dictionaries(st.binary(max_size=12), st.binary(max_size=40), min_size=1, max_size=40).map(
     lambda d: sorted(d.items())
@@ -126,7 +127,7 @@ def test_an_empty_table() -> None:
     assert list(read_table(table([]))) == []
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(PAIRS, st.data())
 def test_a_changed_bit_is_found(pairs: list[tuple[bytes, bytes]], data: st.DataObject) -> None:
     """Every byte that is read is under a checksum or in the footer; what is under none changes nothing."""

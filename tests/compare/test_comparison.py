@@ -317,6 +317,7 @@ def test_where_nothing_ran_nothing_is_said_to_agree(bundles: Bundles, pool: Runt
         compare_artefacts(fixture("discrete"), [file], runtimes="numpy", pool=pool)
 
 
+@pytest.mark.runtimes
 def test_the_command_line_compares_and_reports(bundles: Bundles, tmp_path: Path) -> None:
     folder = bundles("discrete")
     lost = edited(folder / "discrete.onnx", tmp_path / "lost.onnx", lambda m: renamed(m, "action", "Identity"))
@@ -337,6 +338,7 @@ def test_the_command_line_compares_and_reports(bundles: Bundles, tmp_path: Path)
     is_refused(export_model(*command, "--map", "action"), "NAME=VALUE")
 
 
+@pytest.mark.runtimes
 def test_recorded_samples_are_run_and_held_against(bundles: Bundles, tmp_path: Path) -> None:
     folder = bundles("continuous")
     with np.load(fixture("continuous.npz")) as known:

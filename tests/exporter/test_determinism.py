@@ -34,6 +34,7 @@ def in_this_process(folder: Path, *flags: str) -> dict[str, str]:
     return digests(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", FLAGS)
 def test_the_bytes_do_not_depend_on_the_run(how: str, tmp_path: Path) -> None:
     first = in_this_process(tmp_path / "first", *FLAGS[how])
@@ -41,6 +42,7 @@ def test_the_bytes_do_not_depend_on_the_run(how: str, tmp_path: Path) -> None:
     assert len(first) == 7 * 8
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("seed", ["0", "4242"])
 def test_the_bytes_do_not_depend_on_the_process_or_its_hashes(seed: str, tmp_path: Path) -> None:
     expected = in_this_process(tmp_path / "here")

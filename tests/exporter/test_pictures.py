@@ -41,6 +41,7 @@ def graph_in(path: Path) -> Any:
     return tf.compat.v1.GraphDef.FromString(second.graph_def)
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("name", ["continuous", "recurrent", "twobrains", "visual"])
 def test_tensorflow_reads_the_graph_back_as_it_is_in_the_file(name: str, tmp_path: Path) -> None:
     ran = export_model("inspect", fixture(name), "--logdir", tmp_path)

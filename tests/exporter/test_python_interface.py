@@ -167,6 +167,7 @@ def test_a_disagreement_is_a_result_when_nobody_is_strict(tmp_path: Path) -> Non
     assert {c.format for c in result.report.failures} == {"onnx"}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("disagreeing")
 def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
     ran = command(BALL, "-o", tmp_path)
@@ -183,6 +184,7 @@ def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
     assert (as_json.json["policies"][0]["passed"], as_json.json["policies"][0]["parity"]["passed"]) == (False, False)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("disagreeing")
 def test_verifying_again_ends_with_status_1_too(tmp_path: Path) -> None:
     command(BALL, "-o", tmp_path)

@@ -110,6 +110,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("point", [*(f"write:{i}" for i in range(WRITES)), "before exchange"])
 def test_the_old_bundle_is_whole_when_a_run_is_killed_before_the_exchange(point: str, out: Path) -> None:
     killed(point, out)
@@ -118,12 +119,14 @@ def test_the_old_bundle_is_whole_when_a_run_is_killed_before_the_exchange(point:
     assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {"continuous"}
 
 
+@pytest.mark.runtimes
 def test_the_new_bundle_is_whole_when_a_run_is_killed_after_the_exchange(out: Path) -> None:
     killed("after exchange", out)
     assert is_whole(out / "continuous")
     assert is_deterministic(out / "continuous")
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("point", [f"write:{i}" for i in range(WRITES)])
 def test_nothing_is_in_the_place_when_the_first_run_is_killed(point: str, tmp_path: Path) -> None:
     killed(point, tmp_path / "out")
@@ -132,6 +135,7 @@ def test_nothing_is_in_the_place_when_the_first_run_is_killed(point: str, tmp_pa
     assert is_whole(tmp_path / "out" / "continuous")
 
 
+@pytest.mark.runtimes
 def test_without_an_exchange_the_next_run_puts_the_old_bundle_back(out: Path) -> None:
     """Killed between the two renames; the next run is refused, and the old bundle is in its place all the same."""
     killed("rename:1", out)
@@ -141,6 +145,7 @@ def test_without_an_exchange_the_next_run_puts_the_old_bundle_back(out: Path) ->
     assert not is_deterministic(out / "continuous")
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("point", ["rename:0", "remove"])
 def test_without_an_exchange_a_bundle_is_whole_at_the_other_points(point: str, out: Path) -> None:
     killed(point, out)
@@ -229,6 +234,7 @@ def test_what_is_called_like_a_stage_but_is_not_ours_stays(out: Path) -> None:
         assert (folder / "old" / "continuous").is_dir()
 
 
+@pytest.mark.runtimes
 def test_what_a_killed_run_left_is_removed_by_the_next_and_what_lives_is_not(out: Path) -> None:
     killed("write:1", out)
     (left,) = [p for p in out.iterdir() if p.name.startswith(".")]
@@ -243,6 +249,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next_and_what_lives_is_not(out
     assert not [p for p in (left, unmarked, torn, new) if p.exists()]
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("locks", [True, False])
 def test_without_locks_a_folder_is_swept_a_day_later(locks: bool, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     killed("write:1", out)
@@ -302,6 +309,7 @@ main(arguments)
 """
 
 
+@pytest.mark.runtimes
 @pytest.mark.parametrize("again", ["once", "again"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_no_folder_and_no_traceback(number: signal.Signals, again: str, tmp_path: Path) -> None:
@@ -334,6 +342,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.runtimes
 def test_a_signal_that_was_lost_ends_it_all_the_same(tmp_path: Path) -> None:
     temporary = tmp_path / "temporary"
     temporary.mkdir()

@@ -21,6 +21,7 @@ def test_formats_that_nothing_ran_are_named(tmp_path: Path) -> None:
     assert "PASSED: 1 format/runtime pairs agree with numpy; not verified: bytes, saved_model, tfjs" in ran.out
 
 
+@pytest.mark.runtimes
 def test_a_recording_alone_verifies_nothing(tmp_path: Path) -> None:
     with np.load(fixture("continuous.npz")) as known:
         np.savez(

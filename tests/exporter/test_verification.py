@@ -176,6 +176,7 @@ FAULTS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "words"), FAULTS, ids=[f[0].__name__.strip("_") for f in FAULTS])
 @pytest.mark.parametrize(
     ("kind", "runtime"),
@@ -243,6 +244,7 @@ def test_another_choice_is_a_fault_unless_it_is_a_tie(exporting: Exporting, tmp_
 # ------------------------------------------------------------------ draws
 
 
+@pytest.mark.slow
 def test_draws_have_the_right_distribution(exporting: Exporting) -> None:
     report = report_of(exporting("sampled"))
     draws = [c for c in report.comparisons if c.kind == "draws"]
@@ -261,18 +263,21 @@ def _always(choice: int) -> Callable[[Tensors], None]:
     return change
 
 
+@pytest.mark.slow
 def test_a_sampler_that_always_draws_the_same_is_found(exporting: Exporting) -> None:
     result = exporting("sampled", ActingPool(spoiling("onnx", "onnxruntime", _always(0))))
     assert ("onnx", "onnxruntime", "action", "draws") in failures(result)
     assert "the same after every start" in "\n".join(failure_lines(report_of(result)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", [-1, 7])
 def test_a_class_outside_of_its_branch_is_found(choice: int, exporting: Exporting) -> None:
     result = exporting("sampled", ActingPool(spoiling("tfjs", "tfjs-cpu", _always(choice))))
     assert "a class outside of its branch was drawn" in "\n".join(failure_lines(report_of(result)))
 
 
+@pytest.mark.slow
 def test_a_draw_of_the_wrong_shape_is_found(exporting: Exporting) -> None:
     def transposed(answer: Tensors) -> None:
         answer["action"] = answer["action"].T
@@ -347,6 +352,7 @@ def test_without_bytes_a_reference_is_made_for_the_comparison(exporting: Exporti
     assert not list(result.folder.glob("*.bytes"))
 
 
+@pytest.mark.slow
 def test_noise_that_stays_in_the_graph_is_compared_by_its_shape_and_distribution(exporting: Exporting) -> None:
     report = report_of(exporting("visual", compile=CompileOptions(noise="keep")))
     kinds = {(c.output, c.kind) for c in report.comparisons if c.format == "onnx"}
@@ -354,6 +360,7 @@ def test_noise_that_stays_in_the_graph_is_compared_by_its_shape_and_distribution
     assert kinds == {("action", "shape"), ("action", "draws"), *numbers}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoilt", [np.nan, 3.0])
 def test_noise_that_stays_in_the_graph_and_goes_wrong_is_found(exporting: Exporting, spoilt: float) -> None:
     def wrong(answer: Tensors) -> None:

@@ -20,11 +20,12 @@ from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH, INT32, Dim, Symbols, broadcast
 from signatures.errors import GraphError
+from tests import conftest
 from tests.graph.harness import Array, Bindings
 from tests.graph.making import const, defaults, placeholder
 
 #: The same examples in every run: a failure is about the change at hand.
-examples = settings(deadline=None, derandomize=True, max_examples=150)
+examples = conftest.examples(150, derandomize=True)
 
 
 def kernel(op: str, *arrays: Array, **attrs: Any) -> Array:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes import pool as runtimes
 from exporter.cli.app import app
 from exporter.cli.console import Console, Progress
 from fixtures import path as fixture
@@ -31,8 +30,9 @@ def exporting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Exporting:
 
     def run(*options: object, good: bool = True, command: tuple[object, ...] | None = None) -> Ran:
         pool = ActingPool() if good else ActingPool(spoil)
-        monkeypatch.setattr(runtimes, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
-        monkeypatch.setattr(runtimes, "RuntimePool", lambda: pool)
+        for module in ("exporter.export.again", "converters.runtimes.pool"):
+            monkeypatch.setattr(f"{module}.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
+            monkeypatch.setattr(f"{module}.RuntimePool", lambda: pool)
         return export_model(*(command or (fixture("continuous"), "-o", tmp_path / "out")), *options)
 
     return run

@@ -142,6 +142,7 @@ def test_a_saved_model_without_a_graph() -> None:
         read_saved_model(b"\x08\x01")
 
 
+@pytest.mark.slow
 def test_damage_leaves_nothing_behind(tmp_path: Path) -> None:
     content, out = saved({"serving_default": ("action",)}), tmp_path / "out"
     file = tmp_path / "model/saved_model.pb"

@@ -126,6 +126,7 @@ def test_is_the_policy_that_the_onnx_beside_it_is(case: Case) -> None:
         assert mine[name].reshape(other[name].shape) == pytest.approx(other[name], abs=1e-6, rel=1e-5), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ppo_1_1", "ppo_1_1_hybrid_lstm", "sac_0_23", "ppo_0_25_discrete_lstm"])
 def test_is_exported_and_its_verdict_is_self_consistent(name: str, tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="onnxruntime is not here; get it with: pip install onnxruntime")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
@@ -17,6 +17,7 @@ from converters.targets.unity.checker import check_file
 from converters.targets.unity.consumers import CONSUMERS
 from signatures.errors import ExportModelError
 from tests.commands import ROOT
+from tests.conftest import examples
 from tests.unity.policies import Draft
 
 OPS = ("Gemm", "MatMul", "Reshape", "LSTM", "Conv", "Split", "Identity", "Constant", "Slice", "Transpose", "Expand", "")
@@ -83,7 +84,7 @@ def damaged(draw: st.DrawFn) -> bytes:
     return bytes(model.SerializeToString())
 
 
-@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@examples(200, derandomize=True, database=None)
 @given(data=damaged())
 def test_a_damaged_file_gets_a_verdict_or_one_clear_error(tmp_path_factory: Any, data: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "damaged.onnx"

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -16,11 +15,12 @@ from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.graph.types import BATCH
+from tests import conftest
 from tests.graph.harness import Bindings
 
 Array = npt.NDArray[Any]
 #: Same examples in every run: a failure is about the change at hand.
-examples = settings(deadline=None, derandomize=True, max_examples=60)
+examples = conftest.examples(60, derandomize=True)
 TOLERANCE = {"atol": 2e-5, "rtol": 2e-5}
 
 
