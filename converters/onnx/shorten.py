@@ -18,7 +18,8 @@ from converters.onnx import messages
 def shortened(
     nodes: Sequence[Any], constants: Mapping[str, np.ndarray], ranks: Mapping[str, int], outputs: Collection[str]
 ) -> list[Any]:
-    """The nodes with Clip for a Max of a Min, and ArgMax as a column for one that is reshaped to a column.
+    """The nodes with Clip for a Max of a Min, LeakyRelu for the larger of a tensor and a part of it, and ArgMax as a
+    column for one that is reshaped to a column.
 
     ``constants`` are the initializers' values by name, ``ranks`` the number of axes of the values that it is known of.
     """
@@ -27,7 +28,9 @@ def shortened(
     left_out: set[str] = set()
     kept = []
     for node in nodes:
-        made = _clip(node, makers, constants) or _column(node, makers, constants, ranks)
+        made = (
+            _clip(node, makers, constants) or _leaky(node, makers, constants) or _column(node, makers, constants, ranks)
+        )
         if made is not None and reads[made[1]] == 1 and made[1] not in outputs:
             left_out.add(made[1])
             kept.append(made[0])
@@ -37,7 +40,7 @@ def shortened(
 
 
 def _bounded(node: Any, kind: str, constants: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
-    """(value, bound) of a Min or Max with a scalar."""
+    """(value, number) of a Min, Max or Mul with a scalar."""
     if node is None or node.op_type != kind or len(node.input) != 2:
         return None
     for value, bound in (node.input, node.input[::-1]):
@@ -53,6 +56,17 @@ def _clip(node: Any, makers: Mapping[str, Any], constants: Mapping[str, np.ndarr
         return None
     clip = messages.node("Clip", [below[0], above[1], below[1]], node.output, node.name)
     return clip, above[0]
+
+
+def _leaky(node: Any, makers: Mapping[str, Any], constants: Mapping[str, np.ndarray]) -> tuple[Any, str] | None:
+    if node.op_type != "Max" or len(node.input) != 2:
+        return None
+    for value, part in (node.input, node.input[::-1]):
+        slope = _bounded(makers.get(part), "Mul", constants)
+        if slope is not None and slope[0] == value and 0 < constants[slope[1]] < 1:
+            alpha = float(constants[slope[1]])
+            return messages.node("LeakyRelu", [value], node.output, node.name, alpha=alpha), part
+    return None
 
 
 def _column(

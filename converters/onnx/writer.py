@@ -17,8 +17,8 @@ from converters.detached import LARGE, Detached
 from converters.format import WriteOptions
 from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.table import op_of, unsupported
-from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
+from converters.graph.passes.lean import lean
 from converters.graph.passes.weights import Storage, compact
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import FLOAT32, TensorType
@@ -71,7 +71,7 @@ class _Builder:
         self.opset = opset
         self.constant_first = self.chooses = profile not in FIRST_IMPORTERS
         self.has_erf = profile not in _WITHOUT_ERF
-        self._sinks = profile is not None
+        self.splits = profile is None
         self._transposed: dict[str, tuple[str, tuple[int, ...]]] = {}
         self._scalars: set[str] = set()
         self.types: Types = infer_types(graph)
@@ -107,7 +107,7 @@ class _Builder:
         return self._names.fresh(wish)
 
     def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
-        sunk = self._sunk(op, inputs, attributes) if self._sinks and outputs == 1 else ""
+        sunk = self._sunk(op, inputs, attributes) if outputs == 1 else ""
         if sunk:
             return sunk
         names = [self.fresh(f"{self._prefix}/{op}" if self._prefix else op) for _ in range(outputs)]
@@ -211,6 +211,11 @@ class _Builder:
                 self._names.release(value)
             self.bind(reference, renamed.get(value, value))
         self._rename(before, renamed)
+        for index, value in enumerate(result if isinstance(result, tuple) else (result,)):
+            if (turned := self._transposed.get(renamed.get(value, value))) is not None:
+                source, order = turned
+                back = tuple(sorted(range(len(order)), key=order.__getitem__))
+                self.turned.setdefault(ref(node.name, index), View(source, back))
 
     def give(self, output: str) -> None:
         """Let an output be made: what is an input, a constant or another output as well is so by a node of its own.
@@ -275,9 +280,13 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
             why=f"the lowerings are made for opsets {min(ASKED_FOR)} to {max(ASKED_FOR)}",
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
-    graph = fuse(policy.graph, policy.fetches.values(), activations=False)
-    if options.profile is None:
-        graph = parts_for_slices(graph, policy.fetches.values())
+    roots = policy.fetches.values()
+    # Models for one consumer stay as they were tried in it.
+    graph = fuse(
+        policy.graph if options.profile else lean(policy.graph, policy.signature, policy.fetches),
+        roots,
+        activations=False,
+    )
     builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], options.profile)
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)

@@ -29,13 +29,14 @@ from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.base import AttrKind
 from converters.graph.ops.table import op_of
-from converters.graph.passes.columns import parts_for_slices
 from converters.graph.passes.fuse import fuse
+from converters.graph.passes.lean import lean
 from converters.graph.passes.weights import Storage, are_steps, compact, stored
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
 from converters.pieces import Pieces
 from converters.policy import Policy
+from converters.tfjs.shorten import clipped
 from signatures.errors import UnsupportedOpError
 from signatures.spec import TensorSpec
 
@@ -182,7 +183,9 @@ def _acting() -> Mapping[str, Pieces]:
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
     roots = policy.fetches.values()
-    graph = fuse(parts_for_slices(for_tfjs(policy.graph), roots), roots, activations=True)
+    graph = fuse(
+        clipped(for_tfjs(lean(policy.graph, policy.signature, policy.fetches)), roots), roots, activations=True
+    )
     if options.weights == "int8":
         graph = stored(graph, options.weights, casts=False)
     entries, values = _weights(graph, options.weights)

@@ -1,7 +1,9 @@
 """``python -m tests.bench.latency``: how fast our ONNX and TensorFlow.js models run beside those of the official tools.
 
 Both sides are made of the same graph and give the same outputs: tf2onnx is given our ``.bytes``, tensorflowjs_converter
-our SavedModel. They are called in turn in one process with one thread; a ratio below 1 says that ours is faster.
+our SavedModel. "loops" is the recurrent policy once more, the official tools given the source as it was trained, with
+its while loop, for the outputs that both have. Sides are called in turn in one process with one thread, and it is the
+processor's time that is measured (in WebGL the clock's); a ratio below 1 says that ours is faster.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
@@ -21,61 +24,102 @@ from tests.peers.environment import Peers, PeersUnavailableError, ensure_peers
 
 ROOT = Path(__file__).resolve().parents[2]
 JS = ROOT / "converters/runtimes/javascript/js"
-POLICIES = ("continuous", "discrete", "recurrent", "visual")
+POLICIES = ("continuous", "discrete", "recurrent", "visual", "loops")
 BATCHES = (1, 64)
-BACKENDS = ("cpu", "wasm")
+RUNTIMES = ("onnxruntime", "cpu", "wasm", "webgl")
 #: Calls of a side before the other's turn.
 _CALLS = 20
+
+
+@dataclass(frozen=True)
+class Side:
+    """One tool's files, and what is fetched of them."""
+
+    onnx: Path
+    tfjs: Path
+    outputs: Sequence[str]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.latency", description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=60, help="turns of each side")
+    parser.add_argument("--policies", default=",".join(POLICIES), help="of these, by commas")
+    parser.add_argument("--runtimes", default=",".join(RUNTIMES[:3]), help="of these and webgl, by commas")
     options = parser.parse_args()
     try:
         peers = ensure_peers()
     except PeersUnavailableError as error:
         print(f"not measured: {error}")
         return 0
-    heads = [*(f"onnxruntime {b}" for b in BATCHES), *(f"{k} {b}" for k in BACKENDS for b in BATCHES)]
-    print("our time / theirs (tf2onnx in onnxruntime; tensorflowjs_converter in TensorFlow.js), by batch")
-    print(f"{'':12}" + "".join(f"{h:>16}" for h in heads), flush=True)
+    cells = [(r, b) for r in options.runtimes.split(",") for b in BATCHES]
+    print("our time / theirs (tf2onnx in onnxruntime; tensorflowjs_converter in TensorFlow.js), smallest and median of")
+    print(f"{options.rounds} rounds, by runtime and batch")
+    print(f"{'':12}" + "".join(f"{f'{r} {b}':>16}" for r, b in cells), flush=True)
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
-        for policy in POLICIES:
-            rows.append(list(ratios(policy, options.rounds, peers, Path(scratch)).values()))
-            print(f"{policy:12}" + "".join(f"{r:>16.2f}" for r in rows[-1]), flush=True)
-    means = [math.exp(sum(map(math.log, column)) / len(column)) for column in zip(*rows, strict=True)]
-    print(f"{'geom. mean':12}" + "".join(f"{m:>16.2f}" for m in means))
+        for policy in options.policies.split(","):
+            sides = made(policy, peers, Path(scratch) / policy)
+            print(f"{policy:12}", end="", flush=True)
+            row = []
+            for runtime, batch in cells:
+                row.append(ratios(runtime, sides, batch, options.rounds))
+                print(f"{'{:.2f} {:.2f}'.format(*row[-1]):>16}", end="", flush=True)
+            print()
+            if policy != "loops":
+                rows.append(row)
+    if rows:
+        means = [
+            [math.exp(sum(map(math.log, c)) / len(c)) for c in zip(*cell, strict=True)]
+            for cell in zip(*rows, strict=True)
+        ]
+        print(f"{'geom. mean':12}" + "".join(f"{'{:.2f} {:.2f}'.format(*m):>16}" for m in means))
     return 0
 
 
-def ratios(policy: str, rounds: int, peers: Peers, scratch: Path) -> dict[str, float]:
-    """Runtime and batch → our time in theirs."""
+def made(policy: str, peers: Peers, scratch: Path) -> tuple[Side, Side]:
+    """Our files and theirs."""
     from exporter import export_model
 
-    (bundle,) = export_model(ROOT / "fixtures" / f"{policy}.bytes", scratch, verify="none")
-    inputs, outputs = (
-        ",".join(f"{s.name}:0" for s in side)
-        for side in (bundle.policy.signature.inputs, bundle.policy.signature.outputs)
-    )
+    source = ROOT / "fixtures" / f"{policy.replace('loops', 'recurrent')}.bytes"
+    (bundle,) = export_model(source, scratch, verify="none")
+    signature = bundle.policy.signature
+    specs = [s for s in signature.outputs if policy != "loops" or s.source]
     onnx, tfjs = bundle.folder / "theirs.onnx", bundle.folder / "theirs"
-    source = str(bundle.folder / f"{policy}.bytes")
-    peers.run([*peers.tf2onnx(), "--graphdef", source, "--inputs", inputs, "--outputs", outputs, "--output", str(onnx)])
-    saved = str(bundle.folder / "saved_model")
-    peers.run([*peers.tensorflowjs_converter(), "--input_format=tf_saved_model", saved, str(tfjs)])
-    found = {}
-    for batch in BATCHES:
-        found[f"onnxruntime {batch}"] = in_onnxruntime(bundle.folder / f"{policy}.onnx", onnx, batch, rounds)
-    for backend in BACKENDS:
-        for batch in BATCHES:
-            found[f"{backend} {batch}"] = in_tfjs(backend, bundle.folder / "tfjs", tfjs, batch, rounds)
-    return found
+    if policy == "loops":
+        inputs, given = _placeholders(source), [str(s.source) for s in specs]
+        names = ",".join(o.split(":")[0] for o in given)
+        command = ["--input_format=tf_frozen_model", f"--output_node_names={names}", str(source), str(tfjs)]
+    else:
+        source = bundle.folder / source.name
+        inputs, given = [f"{s.name}:0" for s in signature.inputs], [f"{s.name}:0" for s in specs]
+        command = ["--input_format=tf_saved_model", str(bundle.folder / "saved_model"), str(tfjs)]
+    wanted = ["--inputs", ",".join(inputs), "--outputs", ",".join(given), "--output", str(onnx)]
+    peers.run([*peers.tf2onnx(), "--graphdef", str(source), *wanted])
+    peers.run([*peers.tensorflowjs_converter(), *command])
+    ours = Side(bundle.folder / f"{bundle.policy.name}.onnx", bundle.folder / "tfjs", [s.name for s in specs])
+    return ours, Side(onnx, tfjs, given)
 
 
-def in_onnxruntime(ours: Path, theirs: Path, batch: int, rounds: int) -> float:
-    """Our time in theirs, one thread."""
-    calls = [_call(path, batch) for path in (ours, theirs)]
+def _placeholders(source: Path) -> list[str]:
+    from converters import schema
+
+    message = schema.GraphDef()
+    message.ParseFromString(source.read_bytes())
+    return [f"{n.name}:0" for n in message.node if n.op == "Placeholder"]
+
+
+def ratios(runtime: str, sides: tuple[Side, Side], batch: int, rounds: int) -> tuple[float, float]:
+    """Our smallest time in theirs, our median in theirs."""
+    if runtime == "onnxruntime":
+        ours, theirs = (sorted(t) for t in in_onnxruntime(sides, batch, rounds))
+        return ours[0] / theirs[0], median(ours) / median(theirs)
+    (least, middle), (other_least, other_middle) = in_tfjs(runtime, sides, batch, rounds)
+    return least / other_least, middle / other_middle
+
+
+def in_onnxruntime(sides: tuple[Side, Side], batch: int, rounds: int) -> list[list[float]]:
+    """Each side's rounds, one thread."""
+    calls = [_call(side, batch) for side in sides]
     times: list[list[float]] = [[], []]
     for number in range(-10, rounds):
         for side, call in zip(times, calls, strict=True):
@@ -84,31 +128,36 @@ def in_onnxruntime(ours: Path, theirs: Path, batch: int, rounds: int) -> float:
                 call()
             if number >= 0:
                 side.append(time.process_time() - begin)
-    return median(times[0]) / median(times[1])
+    return times
 
 
-def _call(path: Path, batch: int) -> Callable[[], object]:
+def _call(side: Side, batch: int) -> Callable[[], object]:
     import numpy as np
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(path), settings, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(side.onnx), settings, providers=["CPUExecutionProvider"])
     kinds: Mapping[str, type] = {"tensor(float)": np.float32, "tensor(int32)": np.int32, "tensor(int64)": np.int64}
-    feeds = {
-        i.name: np.full([n if isinstance(n, int) else batch for n in i.shape], 0.5).astype(kinds[i.type])
+    number = {"batch_size:0": batch, "sequence_length:0": 1}
+    feeds: Mapping[str, object] = {
+        i.name: np.full([n if isinstance(n, int) else batch for n in i.shape], number.get(i.name, 0.5), kinds[i.type])
         for i in session.get_inputs()
     }
-    return lambda: session.run(None, feeds)
+    return lambda: session.run(list(side.outputs), feeds)
 
 
-def in_tfjs(backend: str, ours: Path, theirs: Path, batch: int, rounds: int) -> float:
-    """Our time in theirs, in one Node."""
+def in_tfjs(backend: str, sides: tuple[Side, Side], batch: int, rounds: int) -> list[list[float]]:
+    """The smallest and the median time of each side, in one Node or one page."""
+    from converters.runtimes.javascript.browser import chromium_executable
+
     script = Path(__file__).with_suffix(".mjs")
-    command = ["node", script, JS / "tfjs_node.mjs", JS, backend, str(batch), str(rounds), ours, theirs]
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=True)
-    mine, other = json.loads(done.stdout.strip().splitlines()[-1])
-    return float(mine / other)
+    command = ["node", script, JS / "tfjs_node.mjs", JS, backend, batch, rounds]
+    for side in sides:
+        command += [side.tfjs, ",".join(o.split(":")[0] for o in side.outputs)]
+    done = subprocess.run([*map(str, command), chromium_executable() or ""], capture_output=True, text=True, check=True)
+    found: list[list[float]] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
 
 
 if __name__ == "__main__":

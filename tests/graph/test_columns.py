@@ -56,7 +56,7 @@ def test_a_slice_that_is_an_output_stays() -> None:
     assert "StridedSlice" in ops(parts_for_slices(joined([0, 0], [0, 3], begin=1, end=1), ["taken", "y"]))
 
 
-LOW, HIGH, ROW = np.float32(-1), np.float32(2), np.ones(3, np.float32)
+LOW, HALF, HIGH, ROW = np.float32(-1), np.float32(0.5), np.float32(2), np.ones(3, np.float32)
 COLUMN = np.array([-1, 1])
 
 
@@ -64,6 +64,9 @@ COLUMN = np.array([-1, 1])
     ("pair", "constants", "expected"),
     [
         ((("Min", "x", "p", {}), ("Max", "q", "m", {})), {"p": HIGH, "q": LOW}, ["Clip"]),
+        ((("Mul", "x", "p", {}), ("Max", "x", "m", {})), {"p": HALF}, ["LeakyRelu"]),
+        ((("Mul", "p", "x", {}), ("Max", "m", "x", {})), {"p": HIGH}, ["Mul", "Max"]),
+        ((("Mul", "x", "p", {}), ("Max", "m", "z", {})), {"p": HALF}, ["Mul", "Max"]),
         ((("Min", "p", "x", {}), ("Max", "m", "q", {})), {"p": HIGH, "q": LOW}, ["Clip"]),
         ((("Min", "x", "p", {}), ("Max", "m", "q", {})), {"p": LOW, "q": HIGH}, ["Min", "Max"]),
         ((("Min", "x", "p", {}), ("Max", "m", "q", {})), {"p": ROW, "q": LOW}, ["Min", "Max"]),
@@ -88,6 +91,8 @@ def test_two_nodes_are_one_where_onnx_has_it(
     assert list(made[-1].output) == ["y"]
     if expected == ["Clip"]:
         assert list(made[0].input) == ["x", "q", "p"]
+    if expected == ["LeakyRelu"]:
+        assert (list(made[0].input), made[0].attribute[0].f) == (["x"], 0.5)
     if expected == ["ArgMax"]:
         assert {a.name: a.i for a in made[0].attribute} == {"axis": 1, "keepdims": 1}
         assert len(shortened(nodes, values, {"m": 2}, ["y"])) == 2

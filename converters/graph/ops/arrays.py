@@ -365,7 +365,9 @@ def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
 
 
 def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
-    """A Slice for each piece: Barracuda reads the sizes of a Split from its attribute alone, which opset 13 has not."""
+    """For an importer of Unity's a Slice for each piece: Barracuda reads the sizes of a Split from its attribute alone,
+    which opset 13 has not.
+    """
     data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
     kind = builder.type_of(node.inputs[data_at])
     assert kind.shape is not None
@@ -376,6 +378,9 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     value = builder.value(node.inputs[data_at])
     if len(sizes) == 1:
         return (value,)
+    if builder.splits:
+        lengths = builder.const(np.array(sizes, np.int64), "sizes")
+        return builder.emit("Split", [value, lengths], outputs=len(sizes), axis=axis)
     bounds = [0, *itertools.accumulate(int(s) for s in sizes)]
     starts = [builder.const(np.array([b], np.int64), "bound") for b in bounds]
     on = builder.const(np.array([axis], np.int64), "axis")

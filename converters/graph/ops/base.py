@@ -38,6 +38,8 @@ class OnnxBuilder(Protocol):
     chooses: bool
     #: whether there is Erf
     has_erf: bool
+    #: whether there is Split, its sizes an input
+    splits: bool
 
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""

@@ -37,29 +37,42 @@ def parts_for_slices(graph: Graph, roots: Iterable[str]) -> Graph:
 def _part(graph: Graph, types: Types, node: Node) -> str | None:
     """What a slice takes, where it is a part that goes into a concatenation."""
     joined = graph.producer(node.inputs[0])
-    bounds = [graph.constant(r) for r in node.inputs[1:]]
-    shape = types[node.inputs[0]].shape
-    if joined.op != "ConcatV2" or shape is None:
+    axis = graph.constant(joined.inputs[-1]) if joined.op == "ConcatV2" else None
+    found = None if axis is None else _slice(graph, types, node, int(axis))
+    if found is None:
         return None
-    axis = graph.constant(joined.inputs[-1])
-    begin, end, strides = (b.tolist() if b is not None else None for b in bounds)
-    if axis is None or begin is None or end is None or strides is None:
-        return None
-    at = int(axis) % len(shape)
-    steps = strided_steps(node, len(shape), begin, end, strides)
-    if len(steps) != len(shape) or any(step not in _WHOLE for i, step in enumerate(steps) if i != at):
-        return None
-    if steps[at][0] != "slice" or steps[at][3] != 1:
-        return None
-    _, first, last, _ = steps[at]
+    at, first, last = found
     start = 0
     for part in joined.inputs[:-1]:
         dims = types[part].shape
         size = None if dims is None else dims[at]
         if not isinstance(size, int):
             return None
-        whole = shape[at]
-        if (first or 0, whole if last is None else last) == (start, start + size):
+        if (first, last) == (start, start + size):
             return part
         start += size
     return None
+
+
+def slice_of_columns(graph: Graph, types: Types, node: Node) -> tuple[str, int, int] | None:
+    """(tensor, first, end) where a node takes columns of a matrix, all its rows."""
+    shape = types[node.inputs[0]].shape if node.op == "StridedSlice" else None
+    found = None if shape is None or len(shape) != 2 else _slice(graph, types, node, 1)
+    return None if found is None else (node.inputs[0], *found[1:])
+
+
+def _slice(graph: Graph, types: Types, node: Node, axis: int) -> tuple[int, int, int] | None:
+    """(axis, first, end) of a slice that takes all of every axis but one, of known length."""
+    shape = types[node.inputs[0]].shape
+    bounds = [graph.constant(r) for r in node.inputs[1:]]
+    begin, end, strides = (b.tolist() if b is not None else None for b in bounds)
+    if shape is None or begin is None or end is None or strides is None:
+        return None
+    at = axis % len(shape)
+    steps, whole = strided_steps(node, len(shape), begin, end, strides), shape[at]
+    if len(steps) != len(shape) or any(step not in _WHOLE for i, step in enumerate(steps) if i != at):
+        return None
+    if steps[at][0] != "slice" or steps[at][3] != 1 or not isinstance(whole, int):
+        return None
+    first, last, _ = slice(*steps[at][1:]).indices(whole)
+    return at, first, last

@@ -1,0 +1,26 @@
+"""A graph in fewer ops, for runtimes in which the start of an op is most of a small policy's run: TensorFlow.js, ONNX.
+
+``.bytes`` and SavedModel keep what the source has; so do models for one consumer (``--for``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from converters.graph.nodes import Graph
+from converters.graph.passes.arithmetic import merge_constants, share, square_differences
+from converters.graph.passes.branches import join_branches
+from converters.graph.passes.columns import parts_for_slices
+from signatures.roles import Role
+from signatures.spec import PolicySignature
+
+#: What is joined of branches, so that their number can be told from the graph.
+_OF_BRANCHES = (Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS, Role.PROBS)
+
+
+def lean(graph: Graph, signature: PolicySignature, fetches: Mapping[str, str]) -> Graph:
+    """The same outputs, within the rounding of a constant or two, in fewer ops."""
+    roots = fetches.values()
+    for shorter in (parts_for_slices, share, merge_constants, square_differences):
+        graph = shorter(graph, roots)
+    return join_branches(graph, roots, {fetches[s.name] for s in signature.outputs if s.role in _OF_BRANCHES})
