@@ -35,6 +35,10 @@ class Editor(Builder):
         """The value of a tensor of the old graph that is a Const."""
         return self._old.constant(reference)
 
+    def producer(self, reference: str) -> Node:
+        """The node of the old graph that makes a tensor."""
+        return self._old.producer(reference)
+
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
         if reference != to:

@@ -31,6 +31,24 @@ KERNEL = floats(3, 2, 3, 4, seed=1)
 ODD = f32(NAN, INF, -INF, 0.5, 3, -3).reshape(2, 3)
 
 
+def layer_norm(scale: float = 1.0) -> Case:
+    """LayerNormalization as Keras 2 writes it: rows as the channels of one image."""
+    x = floats(5, 6)
+    nodes = [
+        placeholder("x", (None, 6)),
+        *(constant("one", 1), constant("rows", 5), constant("n", 6), constant("empty", np.zeros(0, F32))),
+        *(constant("f1", scale), constant("f0", 0.0), constant("back", [5, 6])),
+        node("shape", "Pack", "one", "rows", "n", "one", T=np.int32, N=4, axis=0),
+        node("image", "Reshape", "x", "shape", T=F32, Tshape=np.int32),
+        node("count", "Pack", "rows", T=np.int32, N=1, axis=0),
+        *(node(n, "Fill", "count", v, T=F32, index_type=np.int32) for n, v in (("scale", "f1"), ("offset", "f0"))),
+        node("normal", "FusedBatchNormV3", "image", "scale", "offset", "empty", "empty", T=F32, U=F32, epsilon=0.001,
+             data_format="NCHW", is_training=True, exponential_avg_factor=1.0),
+        node("y", "Reshape", "normal", "back", T=F32, Tshape=np.int32),
+    ]  # fmt: skip
+    return nodes, {"x": x}, None
+
+
 def unary(op: str, x: Array = ODD, **attrs: Any) -> Case:
     return [placeholder("x", (None, *x.shape[1:]), x.dtype), node("y", op, "x", T=x.dtype, **attrs)], {"x": x}, None
 
@@ -177,6 +195,7 @@ CASES: Mapping[str, Case] = {
     "FusedBatchNorm": batch_norm("FusedBatchNorm", IMAGE),
     "FusedBatchNormV2": batch_norm("FusedBatchNormV2", IMAGE, epsilon=0.1),
     "FusedBatchNormV3": batch_norm("FusedBatchNormV3", IMAGE, epsilon=0.01),
+    "FusedBatchNormV3, Keras' LayerNormalization": layer_norm(),
     "FusedBatchNormV3, NCHW": batch_norm("FusedBatchNormV3", TURNED, epsilon=0.01, data_format="NCHW"),
     "Einsum": summed("abc,cde->abde", floats(2, 3, 4), floats(4, 2, 3)),
     "Einsum, of attention": summed("aecd,abcd->acbe", floats(2, 3, 2, 4), floats(2, 5, 2, 4)),
@@ -290,6 +309,11 @@ def test_other_meanings_are_refused(said: str) -> None:
     with pytest.raises(UnsupportedOpError, match=said) as caught:
         normalised(nodes)
     assert caught.value.issues == (("y", nodes[-1].op),)
+
+
+def test_statistics_of_a_batch_are_told_from_those_of_a_row() -> None:
+    with pytest.raises(UnsupportedOpError, match="in training mode"):
+        normalised(layer_norm(scale=2.0)[0])
 
 
 def test_all_unknown_ops_are_named() -> None:

@@ -87,6 +87,10 @@ class GraphBuilder(NodeBuilder, Protocol):
         """The value of a tensor of the old graph that is a Const."""
         ...
 
+    def producer(self, reference: str) -> Node:
+        """The node of the old graph that makes a tensor."""
+        ...
+
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
         ...

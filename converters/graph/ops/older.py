@@ -78,6 +78,8 @@ def select_v2(builder: GraphBuilder, node: Node) -> str:
 def _batch_norm(builder: GraphBuilder, node: Node) -> str:
     """FusedBatchNorm at inference: (x − mean)·(scale/√(variance + ε)) + offset."""
     if node.attrs.get("is_training", True):
+        if _is_layer_norm(builder, node):
+            return _layer_norm(builder, node)
         raise UnsupportedOpError(
             f"cannot convert {node.op} (node {node.name!r}) in training mode",
             issues=[(node.name, node.op)],
@@ -99,6 +101,37 @@ def _batch_norm(builder: GraphBuilder, node: Node) -> str:
         perm = builder.const(TO_NCHW, f"{node.name}/nchw/perm")
         result = builder.add("Transpose", [result, perm], f"{node.name}/nchw", node.origin)
     return result
+
+
+def _is_layer_norm(builder: GraphBuilder, node: Node) -> bool:
+    """Whether a training FusedBatchNorm is Keras 2's LayerNormalization: rows as channels of one image [1, B, n, 1],
+    scaled by ones and moved by zeros. No row hangs on another then.
+    """
+    image, scale, offset = (builder.producer(normal_ref(r)) for r in node.inputs[:3])
+    if node.attrs.get("data_format") != "NCHW" or image.op != "Reshape":
+        return False
+    target = builder.producer(normal_ref(image.inputs[1]))
+    if target.op != "Pack" or len(target.inputs) != 4:
+        return False
+    known = [
+        *((target.inputs[i], 1) for i in (0, 3)),
+        *((fill.inputs[1], value) for fill, value in ((scale, 1), (offset, 0)) if fill.op == "Fill"),
+    ]
+    constants = [(builder.constant_of(normal_ref(r)), value) for r, value in known]
+    return len(known) == 4 and all(c is not None and c.size == 1 and c.item() == value for c, value in constants)
+
+
+def _layer_norm(builder: GraphBuilder, node: Node) -> str:
+    """(x − mean)/√(variance + ε) over what a row [1, B, n, 1] has."""
+    axes = builder.const(np.array([2, 3], INT32), f"{node.name}/axes")
+    epsilon = builder.const(np.array(node.attrs.get("epsilon", 1e-4), FLOAT32), f"{node.name}/epsilon")
+    mean = builder.add("Mean", [node.inputs[0], axes], f"{node.name}/mean", keep_dims=True)
+    centred = builder.add("Sub", [node.inputs[0], mean], f"{node.name}/centred")
+    square = builder.add("Square", [centred], f"{node.name}/square")
+    variance = builder.add("Mean", [square, axes], f"{node.name}/variance", keep_dims=True)
+    positive = builder.add("Add", [variance, epsilon], f"{node.name}/var_eps")
+    deviation = builder.add("Sqrt", [positive], f"{node.name}/std")
+    return builder.add("RealDiv", [centred, deviation], f"{node.name}/y", node.origin)
 
 
 def _concat_v1(builder: GraphBuilder, node: Node) -> str:
