@@ -19,9 +19,10 @@ from converters.graph.ops.table import passes_on, traits
 from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.reader import OnnxModel
 from converters.renaming import renamed
+from converters.understand.brains import depends_on_input
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import torch_generation
-from signatures.roles import OUTPUT_NAMES, Role
+from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
 _ACTION = re.compile(r"actions?|act|action_mean|mean_actions?|action_logits|logits|outputs?|mean|mu|pi|policy")
@@ -62,6 +63,7 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     else:
         roles = _roles_by_name(model)
         graph = _with_spreads(model, graph, roles)
+        notes += _notes_of_constants(model, roles)
         facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model, roles))
         if _positional(model):
             facts = replace(facts, family="Stable-Baselines3")
@@ -256,6 +258,18 @@ def _notes_of_others(model: OnnxModel, roles: Mapping[str, Role | None]) -> tupl
     names = list(model.outputs)
     order = f"{names[0]} is the action, {names[1]} the value"
     return (f"outputs by their order, as Stable-Baselines3's policies give them: {order}",)
+
+
+def _notes_of_constants(model: OnnxModel, roles: Mapping[str, Role | None]) -> list[str]:
+    """Outputs that no input changes, and that no name explains: one may be what a Gaussian action is spread by."""
+    fed = depends_on_input(model.graph)
+    unnamed = (v for v, n in model.outputs.items() if roles.get(n) is None and n not in fed)
+    return [
+        f"the output {name} is the same for every input and is left out; if it is how far the action spreads, "
+        "call it std or log_std in the model"
+        for name in unnamed
+        if name not in CONSTANT_NAMES
+    ]
 
 
 def _common_notes(model: OnnxModel) -> list[str]:

@@ -246,3 +246,9 @@ def test_other_names_are_no_states(name: str) -> None:
 def test_a_stem_is_what_both_ends_share() -> None:
     assert stem_of("lstm_h_in") == stem_of("lstm_h_out") == ("lstm", "h")
     assert stem_of("scope/c0") == stem_of("cn") == ("c",)
+
+
+def test_an_output_that_no_input_changes_is_left_out_with_a_note(tmp_path: Path) -> None:
+    nodes = [helper.make_node("MatMul", ["obs", "w"], ["mean"]), helper.make_node("Identity", ["c"], ["out1"])]
+    path = model(tmp_path / "still.onnx", {"obs": ["batch", 3]}, nodes, ["mean", "out1"], {"c": np.ones(3, np.float32)})
+    assert any("out1 is the same for every input" in n and "log_std" in n for n in only(path).signature.notes)
