@@ -14,6 +14,14 @@ def test_every_test_has_a_limit(pytestconfig: pytest.Config, request: pytest.Fix
     assert settings.default.deadline is None
 
 
+@pytest.mark.xdist_group("limits")
+def test_tests_of_a_group_run_in_one_worker(pytestconfig: pytest.Config, request: pytest.FixtureRequest) -> None:
+    """Else each worker makes what they share; pytest-xdist finds the group at the end of the name."""
+    if not pytestconfig.getoption("loadgroup", False):
+        pytest.skip("not spread by groups")
+    assert request.node.nodeid.endswith("@limits")
+
+
 @given(st.just(0))
 def test_an_example_has_none(nothing: int) -> None:
     assert settings().deadline is None
