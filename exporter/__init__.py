@@ -7,11 +7,14 @@ imported before it is used: a cold start is a feature.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
 from exporter.version import __version__
 
+# As typing has it, whose import is a third of what is done before an interrupt is answered (exporter/cli/__init__.py).
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from exporter.acting.policy import load_policy
     from exporter.api import export_model, inspect_model, verify_bundle
     from exporter.compare.comparison import compare_artefacts

@@ -13,6 +13,8 @@ from signatures.errors import SourceError, UsageError
 _MOST_BYTES = 1 << 20
 #: Parts of a dotted key; tomllib takes the square of their number.
 _MOST_PARTS = 32
+#: A number whose digits Python does not write out again.
+_LONG_NUMBER = re.compile("0[xob][0-9a-fA-F_]{1000}")
 
 
 def read_options(path: Path, where: str, *, toml: bool) -> Any:
@@ -27,4 +29,6 @@ def read_options(path: Path, where: str, *, toml: bool) -> Any:
 
     if any(part.count(".") > _MOST_PARTS for part in re.split(r"[=\n{},\[\]]", text)):
         raise ValueError(f"a key has more than {_MOST_PARTS} parts")
+    if _LONG_NUMBER.search(text):
+        raise ValueError("a number has more than a thousand digits")
     return tomllib.loads(text)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 import time
@@ -20,17 +21,25 @@ import click
 from signatures.fields import printable
 
 _ERASE = "\r\x1b[2K"
+#: What the logs of a CI obey: a line that begins with "::" (GitHub), "##[", "##vso[" (Azure), "##teamcity[".
+_COMMANDS = re.compile(r"^[ \t]*:(?=:)|#(?=#\w*\[)", re.MULTILINE)
+_UNSEEN = "\u200b"
 
 
 def say(text: str = "", *, mark: str = "", colour: str | None = None, err: bool = False) -> None:
     """Print one line; ``mark`` stands before it in a colour."""
-    _echo((click.style(mark, fg=colour) if mark else "") + printable(text), err=err)
+    _echo((click.style(mark, fg=colour) if mark else "") + _inert(printable(text)), err=err)
 
 
 def say_lines(text: str, *, colour: str | None = None, keep: str = "", err: bool = False, nl: bool = True) -> None:
     """Print a text of several lines, each of which was made safe; ``keep`` is what else passes."""
-    safe = printable(text, f"\n{keep}")
+    safe = _inert(printable(text, f"\n{keep}"))
     _echo(safe if colour is None else click.style(safe, fg=colour), err=err, nl=nl)
+
+
+def _inert(text: str) -> str:
+    """A text in which no log of a CI finds a command."""
+    return _COMMANDS.sub(lambda found: found[0] + _UNSEEN, text)
 
 
 def _echo(text: str, *, err: bool, nl: bool = True) -> None:
@@ -40,7 +49,7 @@ def _echo(text: str, *, err: bool, nl: bool = True) -> None:
 
 def say_json(content: Mapping[str, Any]) -> None:
     """Print JSON, in ASCII: what cannot be printed is escaped, so that a program gets it as it is."""
-    click.echo(json.dumps(content, indent=1).replace("\x7f", "\\u007f"))
+    click.echo(json.dumps(content, indent=1).replace("\x7f", "\\u007f").replace("##", "#\\u0023"))
 
 
 class Progress:

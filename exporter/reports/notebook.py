@@ -1,4 +1,7 @@
-"""Results as a notebook shows them: a line and small tables that take the notebook's own style."""
+"""Results as a notebook shows them: a line and small tables that take the notebook's own style.
+
+Notebooks read $…$ as mathematics, which has links of its own in MathJax: names are not read so.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,14 @@ from collections.abc import Iterable, Sequence
 
 from exporter.reports.markup import Markup, el
 
+#: What MathJax 2 and 3 leave alone.
+_PLAIN = "tex2jax_ignore mathjax_ignore"
 Rows = Iterable[Sequence[str]]
 
 
 def notebook(title: str, *tables: tuple[Sequence[str], Rows]) -> Markup:
     """A line of text, and tables: each has a head and rows."""
-    return Markup(el("p", title) + "".join(_table(head, rows) for head, rows in tables))
+    return el("div", el("p", title), [_table(head, rows) for head, rows in tables], class_=_PLAIN)
 
 
 def _table(head: Sequence[str], rows: Rows) -> Markup:

@@ -121,6 +121,27 @@ def test_an_interrupt_while_the_program_itself_is_loaded_is_no_traceback() -> No
     assert (ran.status, ran.out, ran.err) == (130, "", "\nstopped\n")
 
 
+#: Of what ``python -m exporter`` and the console script import, from the command line's first module on.
+EARLY = """
+import sys
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "exporter.cli.main":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+{start}
+"""
+
+
+@pytest.mark.parametrize(
+    "start", ["from exporter.cli.main import main", "import runpy; runpy.run_module('exporter', run_name='__main__')"]
+)
+def test_an_interrupt_before_the_program_has_begun_is_no_traceback(start: str) -> None:
+    ran = python("-c", EARLY.format(start=start))
+    assert ran.status != 0
+    assert (ran.out, ran.err) == ("", "\nstopped\n")
+
+
 def test_a_command_of_the_demo_is_run_as_it_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     """A folder may be called as a command is."""
     given: list[tuple[str, ...]] = []

@@ -224,6 +224,7 @@ def test_a_notebook_shows_tables_of_escaped_text(tmp_path: Path) -> None:
     html = result._repr_html_()
     assert "✗" in html
     assert "&lt;b&gt;" in html
+    assert html.count("<p>") == html.count('<div class="tex2jax_ignore mathjax_ignore"><p>')  # no name is mathematics
     assert html.count("<tr>") > len(ALL)
     assert "normalised inside the policy" in inspect_model(BALL)._repr_html_()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -41,9 +42,10 @@ def test_what_is_no_file_is_refused_at_once(option: str, odd: str, tmp_path: Pat
 
 @pytest.mark.parametrize("option", ["--tolerances", "--labels"])
 @pytest.mark.parametrize(
-    "text", ["a." * 300_000 + "a = 1", "x = {" + "a." * 300_000 + "a = 1}", "x = " + "[" * 300_000]
+    "text",
+    ["x = 0x" + "F" * 6000, "a." * 300_000 + "a = 1", "x = {" + "a." * 300_000 + "a = 1}", "x = " + "[" * 300_000],
 )
-def test_keys_of_any_depth_are_refused(option: str, text: str, tmp_path: Path) -> None:
+def test_keys_of_any_depth_and_endless_numbers_are_refused(option: str, text: str, tmp_path: Path) -> None:
     given = tmp_path / "given.toml"
     given.write_text(text)
     ran = export_model(
@@ -51,3 +53,13 @@ def test_keys_of_any_depth_are_refused(option: str, text: str, tmp_path: Path) -
     )
     assert ran.status == 2
     assert "TOML" in ran.err
+
+
+@pytest.mark.parametrize("sensors", [[{"shape": [8]}] * 100_000, [{"shape": [1 << 40]}], {"shape": [8]}, "8"])
+def test_an_agent_has_no_more_than_an_agent_has(sensors: object, tmp_path: Path) -> None:
+    """A hundred thousand sensors took minutes."""
+    given = tmp_path / "given.json"
+    given.write_text(json.dumps({"continuous": 2, "sensors": sensors}))
+    ran = export_model("inspect", fixture("continuous"), "--unity", "R22", "--brain-parameters", given)
+    assert ran.status == 2
+    assert str(given) in ran.err

@@ -16,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper, save
 import exporter
 from converters.runtimes.javascript.node import node_executable
 from converters.runtimes.pool import RuntimePool
+from exporter.cli.terminal import say, say_json, say_lines
 from exporter.snippets.contract import quoted
 from fixtures import path as fixture
 from signatures.errors import SourceError
@@ -117,6 +118,19 @@ def test_an_error_has_its_own_lines_and_no_others() -> None:
     clean(message)
     own = [line for line in message.split("\n") if not line.startswith(" " * 7)]
     assert [line[:6] for line in own[1:]] == ["  why:", "  fix:"]
+
+
+@pytest.mark.parametrize(
+    "name", ["::error::x", "  ::add-mask::x", "##vso[task.setvariable variable=x]", "##[error]", "##teamcity[x]"]
+)
+def test_no_log_of_a_ci_obeys_a_name(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    say(name)
+    say_lines(f"a\n{name}: b", colour="red")
+    say_json({"name": name})
+    said = capsys.readouterr().out
+    assert "##" not in said
+    assert not [line for line in said.split("\n") if line.strip().startswith("::")]
+    assert json.loads(said[said.index("{") :]) == {"name": name}
 
 
 def test_there_is_one_way_to_the_terminal() -> None:

@@ -15,6 +15,8 @@ from signatures.records import dataclass
 
 #: Class of a sensor by the number of its axes, where nobody names it.
 _CLASSES = {1: "VectorSensor", 2: "BufferSensor", 3: "CameraSensor"}
+#: Sensors and branches that an agent has, bytes of the file that says so: it may be a stranger's.
+_MOST, _MOST_BYTES = 1024, 1 << 20
 _ACTIONS = "continuous:2, discrete:3,2 or continuous:2+discrete:3"
 
 
@@ -68,7 +70,10 @@ class Brain:
         if unknown:
             raise ValueError(f"{', '.join(sorted(unknown))} is not known")
         sensors: list[Sensor] = []
-        for given in entry.get("sensors", []):
+        listed = entry.get("sensors", [])
+        if not isinstance(listed, list) or len(listed) > _MOST:
+            raise ValueError(f"sensors: a list of {_MOST} or fewer is expected")
+        for given in listed:
             shape = _sizes(given["shape"], "a sensor's shape")
             if len(shape) not in _CLASSES:
                 raise ValueError(f"a sensor's shape has 1, 2 or 3 axes, not {len(shape)}")
@@ -124,7 +129,7 @@ def parse_actions(text: str) -> tuple[int, tuple[int, ...]]:
 def read_brain(path: Path) -> Brain:
     """Behavior Parameters from a JSON file. Raises SourceError where it is missing, UsageError for its content."""
     try:
-        entry = json.loads(read_bytes(path).decode("utf-8-sig"))
+        entry = json.loads(read_bytes(path, most=_MOST_BYTES).decode("utf-8-sig"))
         if not isinstance(entry, dict):
             raise ValueError("an object is expected")
         return Brain.from_dict(entry)
@@ -138,6 +143,10 @@ def read_brain(path: Path) -> Brain:
 
 
 def _sizes(values: Any, what: str) -> tuple[int, ...]:
-    if not isinstance(values, list) or any(isinstance(v, bool) or not isinstance(v, int) or v < 0 for v in values):
-        raise ValueError(f"{what}: whole numbers from 0 on are expected, not {values!r}")
+    if (
+        not isinstance(values, list)
+        or len(values) > _MOST
+        or any(isinstance(v, bool) or not isinstance(v, int) or not 0 <= v < 1 << 31 for v in values)
+    ):
+        raise ValueError(f"{what}: whole numbers from 0 on are expected, not {str(values)[:80]}")
     return tuple(values)
