@@ -78,13 +78,16 @@ def asking(address: str, *, writes: bool = False) -> Iterator[None]:
         yield
     except ExportModelError:
         raise
-    except FileNotFoundError as error:
-        raise kind("there is no such file", where=shown(address), fix="check the address") from error
     except Exception as error:  # each library has its own
+        # fsspec calls whatever a web server or the way there says a missing file; what it was stands behind it
+        said = error.__cause__ if isinstance(error, FileNotFoundError) and is_http(address) else None
+        said = error if said is None else said
+        if isinstance(said, FileNotFoundError):
+            raise kind("there is no such file", where=shown(address), fix="check the address") from error
         raise kind(
             "cannot be written" if writes else "cannot be fetched",
             where=shown(address),
-            why=f"{type(error).__name__}: {_ADDRESS.sub(lambda found: shown(found[0]), str(error))}",
+            why=f"{type(said).__name__}: {_ADDRESS.sub(lambda found: shown(found[0]), str(said))}",
             fix="check the address, your rights there, and the connection",
         ) from error
 

@@ -6,6 +6,7 @@ import gzip
 import importlib.util
 import os
 import shutil
+import socket
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -206,6 +207,14 @@ class _Redirecting(BaseHTTPRequestHandler):
 
     def log_message(self, *args: Any) -> None:
         pass
+
+
+def test_a_server_that_does_not_answer_is_not_a_missing_file() -> None:
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{taken.getsockname()[1]}/x.onnx"
+        with pytest.raises(SourceError, match=r"cannot be fetched\n  why: Client.*connect"):
+            export_model(address, "out", verify="none")
 
 
 class _Quiet(SimpleHTTPRequestHandler):
