@@ -7,6 +7,7 @@ numpy kernels, and in one runtime that computes by itself. A failing chain is re
 from __future__ import annotations
 
 import itertools
+import os
 import tempfile
 from pathlib import Path
 
@@ -17,11 +18,14 @@ from hypothesis import strategies as st
 from converters.runtimes.pool import RuntimePool
 from tests.chains.hops import FORMS, Hop, assert_runs_alike, told, walk
 from tests.chains.starts import GENUINE, OWN, Start
+from tests.conftest import FULL
 
 pytestmark = [pytest.mark.slow, pytest.mark.no_cover]
 
 bounded = settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=30 if FULL in os.environ else 12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 HOPS = st.builds(
     Hop,
