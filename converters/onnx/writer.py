@@ -26,7 +26,7 @@ from converters.inner import View
 from converters.onnx import messages
 from converters.onnx.files import files_of
 from converters.onnx.messages import CONTRACT_KEY
-from converters.onnx.shorten import shortened
+from converters.onnx.shorten import pooled_first, shortened
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.pieces import Pieces, equal
 from converters.policy import Policy
@@ -167,7 +167,7 @@ class _Builder:
         """One node for two, where ONNX has one."""
         constants = {name: array for alike in self._constants.values() for array, name in alike}
         ranks = {self._values.get(r, r): len(t.shape) for r, t in self.types.items() if t.shape is not None}
-        self.nodes = shortened(self.nodes, constants, ranks, wanted)
+        self.nodes = pooled_first(shortened(self.nodes, constants, ranks, wanted), wanted, self.fresh)
 
     def store(self, storage: Storage) -> None:
         """Keep initializers in fewer bytes where each of their numbers comes back as it was."""

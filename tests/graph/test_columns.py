@@ -11,7 +11,7 @@ import pytest
 from converters.graph.nodes import Graph
 from converters.graph.passes.columns import parts_for_slices
 from converters.onnx import messages
-from converters.onnx.shorten import shortened
+from converters.onnx.shorten import pooled_first, shortened
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import value
 from tests.graph.samples import floats
@@ -98,3 +98,15 @@ def test_two_nodes_are_one_where_onnx_has_it(
         assert len(shortened(nodes, values, {"m": 2}, ["y"])) == 2
     assert len(shortened(nodes, values, {"m": 1}, ["m", "y"])) == 2
     assert len(shortened([*nodes, messages.node("Neg", ["m"], ["z"])], values, {"m": 1}, ["y", "z"])) == 3
+
+
+def test_an_elu_comes_behind_the_pool_that_alone_reads_it() -> None:
+    def pair(op: str) -> list[Any]:
+        return [messages.node(op, ["x"], ["a"]), messages.node("MaxPool", ["a"], ["y"], kernel_shape=[2, 2])]
+
+    found = [(n.op_type, list(n.input), list(n.output)) for n in pooled_first(pair("Elu"), ["y"], lambda wish: wish)]
+    assert found == [("MaxPool", ["x"], ["y/before"]), ("Elu", ["y/before"], ["y"])]
+    for nodes, outputs in ((pair("Neg"), ["y"]), (pair("Elu"), ["y", "a"])):
+        assert [n.op_type for n in pooled_first(nodes, outputs, str)] == [nodes[0].op_type, "MaxPool"]
+    read = [*pair("Elu"), messages.node("Neg", ["a"], ["z"])]
+    assert [n.op_type for n in pooled_first(read, ["y", "z"], str)] == ["Elu", "MaxPool", "Neg"]
