@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from exporter.reports.entry import Entry
 from exporter.reports.matrix import matrix
 from exporter.reports.summary import verdict
-from exporter.tables import size_text
 from signatures.fields import printable
 
 #: Behind an @, so that no user is called by it.
@@ -42,8 +41,7 @@ def _policy(entry: Entry) -> list[str]:
     for row in sorted(found.rows, key=lambda r: r.passed):
         cells = [row.cells.get(o) for o in found.outputs]
         shown = ["–" if c is None else c.text if c.passed else f"**{c.text}**" for c in cells]
-        size = "" if row.size is None else size_text(row.size)
-        rows.append([code(row.format), code(row.runtime), size, *shown, "ok" if row.passed else "**FAIL**"])
+        rows.append([code(row.format), code(row.runtime), row.size, *shown, "ok" if row.passed else "**FAIL**"])
     lines += [*_table(head, rows), ""]
     tolerances = [
         f"- {code(c.output)} in {code(f'{c.format}/{c.runtime}')}: atol {c.tolerance.atol:g}, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from exporter.tables import sized
 from exporter.verify.findings import Failure, Finding
 from exporter.verify.report import ParityReport
 from signatures.records import dataclass
@@ -20,11 +21,11 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One format in one runtime; ``reason`` says why it gave no answer at all."""
+    """One format in one runtime; ``reason`` says why it gave no answer at all, ``size`` may be empty."""
 
     format: str
     runtime: str
-    size: int | None
+    size: str
     cells: Mapping[str, Cell]
     reason: str | None
 
@@ -52,7 +53,8 @@ def matrix(report: ParityReport) -> Matrix:
                 by_output.setdefault(c.output, []).append(c)
         reasons = [c.reason for c in pair.findings if isinstance(c, Failure)]
         cells = {output: _cell(found) for output, found in by_output.items()}
-        rows.append(Row(pair.format, pair.runtime, report.sizes.get(pair.format), cells, next(iter(reasons), None)))
+        size = sized(pair.format, report.sizes, report.whole_sizes)
+        rows.append(Row(pair.format, pair.runtime, size, cells, next(iter(reasons), None)))
     outputs = tuple(dict.fromkeys(c.output for c in report.comparisons if not isinstance(c, Failure)))
     return Matrix(outputs, tuple(rows))
 

@@ -12,7 +12,7 @@ from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
 from exporter.reports.matrix import Cell, matrix
-from exporter.tables import size_text, typed
+from exporter.tables import sized, typed
 from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
 
@@ -140,9 +140,8 @@ def agreement(entry: Entry) -> Markup:
     found = matrix(entry.report)
     rows = []
     for row in found.rows:
-        size = "" if row.size is None else size_text(row.size)
         verdict = el("td", "✓ ok" if row.passed else "✗ fails", class_="ok" if row.passed else "fail")
-        cells: list[Child] = [_breakable(row.format), row.runtime, verdict, el("td", size, class_="number")]
+        cells: list[Child] = [_breakable(row.format), row.runtime, verdict, el("td", row.size, class_="number")]
         cells += [_cell(row.cells.get(output)) for output in found.outputs]
         rows.append(cells)
     head = ("format", "runtime", "verdict", "size", *found.outputs)
@@ -360,7 +359,7 @@ def files(entry: Entry) -> Markup | None:
     """Sizes of the formats."""
     if not entry.report.sizes:
         return None
-    rows = [(kind, size_text(size)) for kind, size in entry.report.sizes.items()]
+    rows = [(kind, sized(kind, entry.report.sizes, entry.report.whole_sizes)) for kind in entry.report.sizes]
     return section("Sizes", table("Bytes of each format", ("format", "size"), rows, [1]))
 
 

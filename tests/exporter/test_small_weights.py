@@ -14,6 +14,10 @@ from converters.graph.passes.weights import LEAST, Storage, compact, rounded
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model, verify_bundle
 from exporter.export.sources import read_source
+from exporter.reports.entry import of_result
+from exporter.reports.markdown import markdown_text
+from exporter.reports.page import page
+from exporter.tables import size_text
 from exporter.verify.checks import decisions as check
 from fixtures import path as fixture
 from signatures.errors import UsageError
@@ -106,6 +110,11 @@ def test_runtimes_run_it_and_decisions_are_told(storage: Storage, tmp_path: Path
     assert (decided.output, decided.runtime) == ("deterministic_action", storage)
     assert decided.max_abs_diff <= check.LIMITS[storage]
     assert all(report.whole_sizes[k] > size for k, size in report.sizes.items())
+    entry = of_result(result, 1)
+    assert entry is not None
+    for key, size in report.sizes.items():
+        said = f"{size_text(size)} of {size_text(report.whole_sizes[key])}"
+        assert said in markdown_text([entry]) and page([entry]).count(said) >= 2  # in the table and among the sizes
     again = verify_bundle(result.folder, source=fixture("recurrent"), runtimes="numpy,tensorflow")
     assert [c.reason for c in again.comparisons if c.kind == "decisions"] == [decided.reason]
     assert not [c for c in verify_bundle(result.folder, runtimes="onnxruntime").comparisons if c.kind == "decisions"]
