@@ -1,6 +1,6 @@
-"""``python -m tests.pictures``: docs/pictures/page.png, which moves, and report.png, as Chromium shows them.
+"""``python -m tests.pictures``: in docs/pictures page.png and crawler.png, which move, and report.png, from Chromium.
 
-The moving one is an APNG: one palette for all frames, and in each frame only what changed since the last.
+The moving ones are APNGs: one palette for all frames, and in each frame only what changed since the last.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tests.commands import export_model
 from tests.serve.browsing import visit
 
 PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
-FRAMES, STEPS, MILLISECONDS = 40, 5, 110
+FRAMES, MILLISECONDS = 40, 110
 #: Colours, beside the transparent one that says "as before".
 COLOURS = 127
 
@@ -30,30 +30,40 @@ Pixels = npt.NDArray[np.uint8]
 
 
 def main() -> None:
-    """Make both."""
+    """Make them all."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        ran = export_model(run_folder("3DBall"), "-o", folder, "--html", folder / "report.html")
+        report = folder / "report.html"
+        ran = export_model(run_folder("3DBall"), "-o", folder, "--html", report)
         assert ran.status == 0, ran.err
-        (folder / "page.html").write_bytes(assemble_one_file(folder / "3DBall"))
-        steps = f"for (let n = 0; n < {STEPS}; n++) document.querySelector('#step').click()"
-        once = [
-            ["eval", f"{{ {steps} }}"],
-            ["eval", "new Promise((done) => setTimeout(done, 120))"],
-            ["pixels", ".stage"],
-        ]
-        ready = ["wait", "document.querySelector('#status-2') !== null"]
-        hide = ["eval", "document.querySelectorAll('.stage .controls').forEach((e) => (e.hidden = true))"]
-        seen = visit(
-            f"{(folder / 'page.html').as_uri()}#beside=untrained",
-            [ready, hide, *(step for _ in range(FRAMES) for step in once)],
-            viewport={"width": 1160, "height": 900},
-            reducedMotion="reduce",
-        )
-        frames = [pixels(r) for r in seen.results if isinstance(r, dict)]
-        save("page.png", animated(frames))
-        report = visit((folder / "report.html").as_uri(), [["pixels", "body"]], viewport={"width": 1100, "height": 900})
-        save("report.png", animated([pixels(report.results[0])[:1100]]))
+        # It names the folder; a picture is of no run in particular.
+        report.write_text(report.read_text(encoding="utf-8").replace(scratch, "exported"), encoding="utf-8")
+        ran = export_model(run_folder("Crawler2D"), "-o", folder, "--to", "bytes,tfjs", "--verify", "none")
+        assert ran.status == 0, ran.err
+        save("page.png", moving(folder / "3DBall", "#beside=untrained", ".stage", steps=5))
+        save("crawler.png", moving(folder / "Crawler2D", "", ".lanes", steps=2))
+        seen = visit(report.as_uri(), [["pixels", "body"]], viewport={"width": 1100, "height": 900})
+        save("report.png", animated([pixels(seen.results[0])[:1100]]))
+
+
+def moving(bundle: Path, fragment: str, selector: str, *, steps: int) -> bytes:
+    """A part of a bundle's page, ``steps`` steps further in each frame."""
+    page = bundle.with_suffix(".html")
+    page.write_bytes(assemble_one_file(bundle))
+    once = [
+        ["eval", f"{{ for (let n = 0; n < {steps}; n++) document.querySelector('#step').click() }}"],
+        ["eval", "new Promise((done) => setTimeout(done, 120))"],
+        ["pixels", selector],
+    ]
+    ready = ["wait", f"document.querySelector('#status{'-2' if 'beside' in fragment else ''}') !== null"]
+    hide = ["eval", "document.querySelectorAll('.stage .controls').forEach((e) => (e.hidden = true))"]
+    seen = visit(
+        page.as_uri() + fragment,
+        [ready, hide, *(step for _ in range(FRAMES) for step in once)],
+        viewport={"width": 1160, "height": 900},
+        reducedMotion="reduce",
+    )
+    return animated([pixels(r) for r in seen.results if isinstance(r, dict)])
 
 
 def save(name: str, data: bytes) -> None:
