@@ -22,12 +22,12 @@ from exporter.verify.difference import floored, ties
 from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.roles import Role
-from signatures.sampling import Case, draw_cases, draw_rollout
+from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout
 from signatures.spec import PolicySignature
 
 SEED = 0
 _STEPS = 4
-_TOO_LARGE = ("beyond the clip", "1e3")
+_TOO_LARGE = ("beyond the clip", "1e3", *FAR_CASES)
 #: Inputs with images are large; those that do not fit are left out, but never the first three (batches of 1, 2 and 7).
 _MOST_BYTES = 4_000_000
 #: A page plays a dozen agents: the large batch of a verification is left out.
