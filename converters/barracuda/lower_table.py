@@ -80,7 +80,7 @@ _OPS: MappingProxyType[str, tuple[Lower, slice]] = MappingProxyType(
 
 _WHY = MappingProxyType(
     {
-        "Multinomial": "a drawn class is read on inside of the policy, and ML-Agents draws it from the scores itself",
+        "Multinomial": "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
     }
 )
 

@@ -110,7 +110,7 @@ class Bundle:
         path = self.folder / relative
         if not _is_inside(path, self.folder):
             raise BundleError(
-                f"names a file outside of the bundle: {relative}",
+                f"names a file outside the bundle: {relative}",
                 where=str(self.folder / POLICY),
                 why="a bundle's files lie in its folder",
                 fix=f"do not use this bundle; {_AGAIN}",
@@ -246,7 +246,7 @@ def check_replaceable(place: Path) -> None:
         if place.is_dir() and not place.is_symlink() and (not any(place.iterdir()) or (place / POLICY).is_file()):
             return
     raise BundleError(
-        "is in the way and is not a bundle",
+        "already exists and is not a bundle",
         where=str(place),
         why=f"it has no {POLICY}, so it is not this tool's to replace",
         fix="move it, or choose another folder with -o or another --name",

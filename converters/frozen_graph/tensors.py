@@ -43,7 +43,7 @@ def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached 
     if dtype.kind == "S":
         return _strings(list(proto.string_val) or [b""], shape, count)
     if dtype.kind == "O":
-        raise _damaged("it is a resource, which has no value outside of a session")
+        raise _damaged("it is a resource, which has no value outside a session")
     if content := proto.tensor_content:
         held = None if detached is None else detached.array(content)
         data = np.frombuffer(content, np.uint8) if held is None else held.reshape(-1).view(np.uint8)

@@ -212,7 +212,7 @@ class Builder:
         """A possibly negative axis as a positive one; raises UnsupportedOpError."""
         rank = self.rank(reference)
         if not -rank <= axis < max(rank, 1):
-            raise UnsupportedOpError(f"axis {axis} is outside of {rank} axes", why=_DAMAGED)
+            raise UnsupportedOpError(f"axis {axis} is out of range for {rank} axes", why=_DAMAGED)
         return axis % max(rank, 1)
 
     def joined(self, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:

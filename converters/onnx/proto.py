@@ -257,7 +257,7 @@ def _inside(folder: Path, location: str, name: str) -> Path:
         inside = False
     if not inside:
         raise DamagedFileError(
-            f"the weights of {name!r} are said to lie in {location!r}, outside of the model's folder",
+            f"the weights of {name!r} are said to lie in {location!r}, outside the model's folder",
             why="a model file is untrusted: nothing else of this machine is read for it",
             fix="put the file beside the model and export the model again",
         )

@@ -69,7 +69,7 @@ class LoadedPolicy:
         *,
         draws_itself: bool = False,
     ) -> None:
-        """``draws_itself``: the noise is inside of the file (``--noise keep``, ``--for``)."""
+        """``draws_itself``: the noise is inside the file (``--noise keep``, ``--for``)."""
         self.name, self.signature, self.runtime = name, signature, runtime
         self._draws_itself = draws_itself
         self._run = run
@@ -147,14 +147,14 @@ class LoadedPolicy:
         return self._decision(self._run(feeds, [s.name for s in self.signature.outputs]), deterministic)
 
     def _check_plain(self) -> None:
-        """Raise UsageError where an action is drawn inside of the graph, and there is none without chance."""
+        """Raise UsageError where an action is drawn inside the graph, and there is none without chance."""
         for head in self.signature.heads:
             sampled = head.spec.role is Role.SAMPLED and self._scores is None
             drawn = head.spec.role is Role.CONTINUOUS and self._draws_itself
             if head.plain is None and (sampled or drawn):
                 raise UsageError(
                     f"{head.name!r} cannot be had without chance",
-                    why="it is drawn inside of the file, which gives neither its mean nor its log-probabilities",
+                    why="it is drawn inside the file, which gives neither its mean nor its log-probabilities",
                     fix="export the policy without --for, or leave deterministic= out",
                 )
 

@@ -41,7 +41,7 @@ class Ledger:
         self._keeps = address_of(options.out) is None
         if os.path.lexists(self._path) and (self._path.is_symlink() or not self._path.is_file()):
             raise BundleError(
-                "is in the way and is no file of ours",
+                "already exists and is not a file of ours",
                 where=str(self._path),
                 why="lines are appended to it: behind a link they would change another file",
                 fix="remove it, or choose another folder with -o",

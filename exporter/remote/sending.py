@@ -66,7 +66,7 @@ def _there(address: str) -> set[str]:
         found = {path[len(root) :].lstrip("/") for path in system.find(root)} if system.exists(root) else set()
     if found and POLICY not in found and _SENDING not in found:
         raise BundleError(
-            "is in the way and is not a bundle",
+            "already exists and is not a bundle",
             where=shown(address),
             why=f"it has no {POLICY}, so it is not this tool's to replace",
             fix="move it, or choose another address with -o or another --name",

@@ -81,7 +81,7 @@ def again(entry: Entry) -> Markup | None:
     chosen = ["--runtimes", ",".join(ran)] if ran else ["--allow-unverified"]
     numbers = ["--seed", str(report.seed), "--samples", str(report.samples), "--steps", str(entry.steps)]
     line = typed(*entry.command, *chosen, *numbers)
-    return el("p", "The same again: ", el("code", line), class_="soft again")
+    return el("p", "To compare again: ", el("code", line), class_="soft again")
 
 
 _WORDS = (
@@ -175,9 +175,11 @@ def spread(entry: Entry) -> Markup | None:
         figures.append(_figure(output, picture, _equal_text(equal, len(group))))
     text = (
         "How many elements differ by how much, over all inputs; each bar is a decade of |Δ|, its height the square "
-        "root of the count. The dashed line is the absolute tolerance; the bar on the left is what is equal."
+        "root of the count. The dashed line is the absolute tolerance; the bar on the left counts equal elements."
     )
-    return section("How the differences are spread", el("p", text, class_="soft"), el("div", figures, class_="figures"))
+    return section(
+        "How differences are distributed", el("p", text, class_="soft"), el("div", figures, class_="figures")
+    )
 
 
 def _equal_text(equal: Sequence[Finding], of: int) -> str | None:
@@ -267,7 +269,7 @@ def tensors(entry: Entry) -> Markup | None:
     return section(
         "Inputs and outputs",
         table("What the policy is fed", head, rows(entry.signature.inputs)),
-        table("What it answers", head, rows(entry.signature.outputs)),
+        table("What it returns", head, rows(entry.signature.outputs)),
     )
 
 

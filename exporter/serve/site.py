@@ -160,7 +160,7 @@ def write_site(site: Mapping[str, bytes], place: Path) -> None:
     with writing(place):
         if place.is_symlink() or (place.exists() and not _replaceable(place)):
             raise BundleError(
-                "is in the way and is not a page of ours",
+                "already exists and is not a page of ours",
                 where=str(place),
                 why=f"it has no {SITE} that says so",
                 fix="move it, or choose another folder with --out",
@@ -178,7 +178,7 @@ def write_file(page: bytes, place: Path) -> None:
     with writing(place):
         if place.is_symlink() or (place.exists() and not _is_page(place)):
             raise BundleError(
-                "is in the way and is not a page of ours",
+                "already exists and is not a page of ours",
                 where=str(place),
                 why=f"it does not say that {MADE_BY} wrote it",
                 fix="move it, or choose another name with --out",

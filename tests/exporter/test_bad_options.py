@@ -205,7 +205,7 @@ def test_a_folder_that_is_no_bundle_is_not_replaced(ball: Path, tmp_path: Path) 
     (tmp_path / "out" / "Ball" / "thesis.tex").write_text("years")
     before = files_in(tmp_path)
     ran = export_model(ball, "-o", tmp_path / "out", "--verify", "none")
-    is_refused(ran, tmp_path / "out" / "Ball", "in the way", "policy.json", "--name")
+    is_refused(ran, tmp_path / "out" / "Ball", "already exists", "policy.json", "--name")
     assert files_in(tmp_path) == before
     assert (tmp_path / "out" / "Ball" / "thesis.tex").read_text() == "years"
 
@@ -213,12 +213,12 @@ def test_a_folder_that_is_no_bundle_is_not_replaced(ball: Path, tmp_path: Path) 
 def test_a_file_or_link_in_the_place_of_the_bundle_is_not_replaced(ball: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "Ball").write_text("mine")
-    is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), "in the way")
+    is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), "already exists")
     assert (tmp_path / "out" / "Ball").read_text() == "mine"
     (tmp_path / "out" / "Ball").unlink()
     for target in (tmp_path / "source", tmp_path / "nowhere"):
         (tmp_path / "out" / "Ball").symlink_to(target)
-        is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), "in the way")
+        is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "none"), "already exists")
         (tmp_path / "out" / "Ball").unlink()
     assert files_in(tmp_path / "out") == set()
 

@@ -58,5 +58,5 @@ def test_a_ledger_names_no_device(files: dict[str, object], tmp_path: Path, monk
     os.mkfifo("out/continuous/policy.json")
     ran = export_model(listed(tmp_path), "-o", "out", "--to", "bytes", "--verify", "none")
     assert ran.status == 2
-    assert "continuous: is in the way" in ran.err
+    assert "continuous: already exists" in ran.err
     assert Path("out/sampled/policy.json").is_file()

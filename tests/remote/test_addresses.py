@@ -135,7 +135,7 @@ def test_what_is_anothers_stays(theirs: list[str], memory: Any) -> None:
     given = "memory://models/discrete/discrete.bytes" if len(theirs) == 3 else "memory://runs/a/discrete.bytes"
     (refused,) = run([given], "memory://models")
     assert isinstance(refused.error, BundleError)
-    assert "memory://models/discrete: is in the way" in refused.error.message
+    assert "memory://models/discrete: already exists" in refused.error.message
     assert {path: memory.cat(path) for path in memory.find("/models")} == before
 
 

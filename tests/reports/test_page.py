@@ -98,7 +98,7 @@ def test_a_page_shows_all_that_is_known_of_a_policy(recurrent: tuple[Entry, Path
     parsed = Page(source)
     is_self_contained(source, parsed)
     for words in (
-        *("What disagrees", "Agreement", "How the differences are spread", "Memory", "The policy", "Worst inputs"),
+        *("What disagrees", "Agreement", "How the differences are distributed", "Memory", "The policy", "Worst inputs"),
         *("Tolerances", "Runtimes", "Sizes", "LSTM 16", "dense 32, swish", "recurrent_out differs by 0.001"),
         *("First difference:", "Smallest tolerance that would pass", "onnx in onnxruntime", "discrete, 3 + 2"),
     ):
@@ -152,10 +152,10 @@ def test_the_tolerance_is_the_middle_of_its_axis() -> None:
 
 def test_a_report_says_the_command_that_makes_it(recurrent: tuple[Entry, Path]) -> None:
     made, folder = recurrent
-    assert f"The same again: export-model verify {folder} --runtimes " in Page(page([made])).text
+    assert f"To compare again: export-model verify {folder} --runtimes " in Page(page([made])).text
     fetched = of_bundle(made.report, folder, Path("https://example.org/recurrent"), 3)
-    assert "The same again: export-model verify https://example.org/recurrent --runtimes " in Page(page([fetched])).text
-    assert "The same again" not in Page(page([entry(PASSING)])).text
+    assert "again: export-model verify https://example.org/recurrent --runtimes " in Page(page([fetched])).text
+    assert "To compare again" not in Page(page([entry(PASSING)])).text
     other = replace(entry(PASSING), command=("compare", "a b.onnx", "c.onnx"))
     assert "export-model compare 'a b.onnx' c.onnx --runtimes onnxruntime --seed 3" in Page(page([other])).text
 

@@ -193,7 +193,7 @@ def test_one_file_replaces_only_its_own(bundle: Bundle, tmp_path: Path) -> None:
         assert ran.status == 0, ran.err
         assert place.read_bytes() == assemble_one_file(bundle("continuous"))
     place.write_text("mine")
-    is_refused(export_model("serve", bundle("continuous"), "-o", place), "is in the way")
+    is_refused(export_model("serve", bundle("continuous"), "-o", place), "already exists")
     assert files_in(tmp_path / "deep") == {"page.html"}
 
 
@@ -280,11 +280,11 @@ def test_out_never_replaces_what_is_not_ours(bundle: Bundle, tmp_path: Path, ins
     place = tmp_path / "page"
     place.mkdir()
     (place / inside).write_text("{}")
-    is_refused(export_model("serve", bundle("continuous"), "--out", place), "is in the way")
+    is_refused(export_model("serve", bundle("continuous"), "--out", place), "already exists")
     assert files_in(tmp_path) == {"page", f"page/{inside}"}
     file = tmp_path / "file"
     file.write_text("")
-    with pytest.raises(BundleError, match="in the way"):
+    with pytest.raises(BundleError, match="already exists"):
         write_site({"index.html": b""}, file)
 
 

@@ -258,7 +258,7 @@ def _infer_concat(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
         return [TensorType(parts[0].dtype, (*known[0][:axis], symbols.fresh(), *known[0][axis + 1 :]))]
     rank = len(known[0])
     if not -rank <= axis < rank or any(len(s) != rank for s in known):
-        raise shape_error(node, args, f"parts of different rank, or axis {axis} outside of it")
+        raise shape_error(node, args, f"parts of different rank, or axis {axis} out of range")
     axis %= rank
     dims = list(known[0])
     for shape in known[1:]:

@@ -130,7 +130,7 @@ def _infer_strided_slice(node: Node, args: Sequence[TensorType], symbols: Symbol
         length = next(lengths)
         if step[0] == "take":
             if isinstance(length, int) and not -length <= step[1] < length:
-                raise shape_error(node, args, f"index {step[1]} is outside of {length}")
+                raise shape_error(node, args, f"index {step[1]} is out of range for {length}")
             continue
         if isinstance(length, int):
             dims.append(len(range(*slice(step[1], step[2], step[3]).indices(length))))
@@ -233,7 +233,7 @@ def _tfjs_strided_slice(builder: GraphBuilder, node: Node, types: Mapping[str, T
 
 
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
-    """An index that is outside of its axis is an error, as in TensorFlow on a CPU; numpy counts some from the end."""
+    """An index that is outside its axis is an error, as in TensorFlow on a CPU; numpy counts some from the end."""
     if indices.size and indices.dtype.kind in "iu" and indices.min() < 0:
         raise IndexError(f"index {indices.min()} is out of bounds: TensorFlow does not count from the end")
     return np.take(x, indices, axis=0 if axis is None else int(axis))

@@ -89,7 +89,7 @@ class _Unroller:
         for node in self.graph.nodes:
             if node.name in self.frames:  # loop bodies are made on demand, once per turn
                 if node.name not in read:  # an output
-                    raise _broken(node, f"the output {node.origin!r} lies inside of it, which no Exit leads out of")
+                    raise _broken(node, f"the output {node.origin!r} lies inside it, which no Exit leads out of")
                 continue
             try:
                 self.tensor(node.name, None)

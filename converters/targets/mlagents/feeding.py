@@ -164,7 +164,7 @@ def drawn_inside(dressing: Dressing, spec: TensorSpec) -> str:
     if len(spec.shape) != 2 or width is None:
         dressing.refuse(
             f"its noise {spec.name} has the shape {list(spec.shape)}",
-            why="draws are made inside of the model, a row of a known width for each agent",
+            why="draws are made inside the model, a row of a known width for each agent",
             fix="leave the noise out: --noise zero",
         )
     like = next((r for r, k in reversed(builder.types.items()) if _fits(k.shape, width) and k.dtype == FLOAT32), None)

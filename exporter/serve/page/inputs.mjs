@@ -28,7 +28,7 @@ export class Vector {
       return new Slider(name, middle, reach, changed);
     });
     const rows = this.#sliders.map(({ element }) => element);
-    const about = std === undefined ? "" : " (mean ± 3 standard deviations of the training)";
+    const about = std === undefined ? "" : " (mean ± 3 standard deviations in training)";
     this.element = h(
       "fieldset",
       {},
@@ -233,7 +233,7 @@ export class Masks {
   }
 }
 
-/** The action before, one choice per branch. */
+/** The previous action, one choice per branch. */
 export class Previous {
   #selects;
 
@@ -246,7 +246,7 @@ export class Previous {
     const fields = this.#selects.map((select, i) => {
       return h("span", { class: "field" }, h("label", { for: select.id }, count > 1 ? `branch ${i}` : "action"), select);
     });
-    this.element = h("fieldset", {}, h("legend", {}, "The action before"), h("div", { class: "boxes" }, fields));
+    this.element = h("fieldset", {}, h("legend", {}, "Previous action"), h("div", { class: "boxes" }, fields));
   }
 
   value() {

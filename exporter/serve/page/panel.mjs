@@ -85,7 +85,7 @@ export class Panel {
     return h(
       "fieldset",
       {},
-      h("legend", {}, "Chance"),
+      h("legend", {}, "Randomness"),
       h(
         "div",
         { class: "boxes" },
@@ -132,7 +132,7 @@ export class Panel {
     }
     if (contract.memory?.output) {
       this.#answers.memory = new Strip("The memory that comes out");
-      made.push(h("figure", {}, h("figcaption", {}, "Memory after it"), this.#answers.memory.element));
+      made.push(h("figure", {}, h("figcaption", {}, "Memory afterwards"), this.#answers.memory.element));
     }
     this.#answers.others = contract.outputs.slice(1).filter(({ role }) => ["value_estimate", "other"].includes(role));
     this.#answers.list = h("dl", { class: "others" });
