@@ -2,7 +2,8 @@
 
 The sources are all of ../shared/corpus and ../shared/genuine, as often as are asked for, each copy a file of its own
 content where the format allows it. A figure is of a whole call of the command line: wall time, the processor's time of
-all its processes (which a busy machine leaves nearly as it is), and the memory of the largest of them.
+its processes (which a busy machine leaves nearly as it is), the memory of the largest of them, and what the first
+one and its workers have on the way.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from exporter.fleet.sources import sources_in
 from tests.bench.plot import Line, plot
@@ -29,6 +31,8 @@ ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared"
 PAGE, PLOT = ROOT / "docs" / "performance.md", ROOT / "docs" / "pictures" / "throughput.svg"
 BEGIN, END = "<!-- throughput: written by python -m tests.bench.throughput --write -->\n", "<!-- /throughput -->\n"
+#: Numbers of policies at which memory is looked at.
+MARKS = (200, 1000, 2000)
 #: What is verified in → policies a second on two cores that are aimed at.
 AIMS = {"none": 80, "numpy,onnxruntime": 15, "numpy,onnxruntime,tfjs-wasm": 10}
 
@@ -44,6 +48,8 @@ class Measured:
     wall: float
     processor: float
     peak_mib: float
+    #: (policies, MiB of the first process, of its workers)
+    memory: tuple[tuple[int, float, tuple[float, ...]], ...] = ()
 
     @property
     def milliseconds(self) -> float:
@@ -93,7 +99,7 @@ def measured(sources: Sequence[Path], verify: str, jobs: int, scratch: Path) -> 
     with tempfile.TemporaryFile() as said:
         start = time.perf_counter()
         process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
-        _, status, used = os.wait4(process.pid, 0)
+        status, used, memory = _watched(process.pid, out)
         wall = time.perf_counter() - start
         process.returncode = os.waitstatus_to_exitcode(status)
         said.seek(0)
@@ -102,7 +108,27 @@ def measured(sources: Sequence[Path], verify: str, jobs: int, scratch: Path) -> 
     if process.returncode or policies is None:
         raise RuntimeError(text[-2000:])
     processor = used.ru_utime + used.ru_stime
-    return Measured(verify, jobs, len(sources), int(policies[1]), wall, processor, used.ru_maxrss / 1024)
+    return Measured(verify, jobs, len(sources), int(policies[1]), wall, processor, used.ru_maxrss / 1024, memory)
+
+
+def _watched(pid: int, out: Path) -> tuple[int, Any, tuple[tuple[int, float, tuple[float, ...]], ...]]:
+    """How a process ended, what it used, and what it and its children had in memory when so many bundles were there."""
+    seen: list[tuple[int, float, tuple[float, ...]]] = []
+    while True:
+        ended, status, used = os.wait4(pid, os.WNOHANG)
+        if ended:
+            return status, used, tuple(seen)
+        if len(seen) < len(MARKS) and out.is_dir():
+            count = sum(not path.name.startswith(".") for path in out.iterdir())
+            if count >= MARKS[len(seen)]:
+                workers = " ".join(_lines(f"/proc/{pid}/task/{pid}/children")).split()
+                seen.append((count, _resident(str(pid)), tuple(map(_resident, workers))))
+        time.sleep(0.2)
+
+
+def _resident(pid: str) -> float:
+    """MiB of a process."""
+    return sum(int(line.split()[1]) / 1024 for line in _lines(f"/proc/{pid}/status") if line.startswith("VmRSS:"))
 
 
 def runs(count: int, verified: int, jobs: Sequence[int]) -> Iterator[Measured]:
@@ -121,6 +147,15 @@ def row(found: Measured) -> str:
         f"| {found.verify} | {found.jobs} | {found.policies} | {found.rate:.1f} | {found.milliseconds:.1f} "
         f"| {2000 / found.milliseconds:.1f} | {AIMS[found.verify]} | {found.peak_mib:.0f} |"
     )
+
+
+def memory_of(found: Measured) -> list[str]:
+    """A sentence for each number of policies at which it was looked at."""
+    return [
+        f"{count} policies, `--jobs {found.jobs}`, verified in {found.verify}: {first:.0f} MiB, its workers "
+        f"{' and '.join(f'{w:.0f}' for w in workers) or 'none'}"
+        for count, first, workers in found.memory
+    ]
 
 
 HEAD = (
@@ -163,6 +198,8 @@ def main() -> int:
     for each in runs(options.count, options.verified, [int(n) for n in options.jobs.split(",")]):
         found.append(each)
         print(row(each), flush=True)
+        for text in memory_of(each):
+            print(text, flush=True)
     if options.json:
         options.json.write_text(json.dumps([asdict(f) for f in found], indent=1) + "\n")
     if options.write:
@@ -178,8 +215,10 @@ def write(found: Sequence[Measured], command: str, where: str) -> None:
     ]
     PLOT.write_text(plot(lines, "processes (--jobs)", "policies a second"), encoding="utf-8")
     table = "\n".join([HEAD, *map(row, found)])
+    memory = "".join(f"- {text}\n" for each in found for text in memory_of(each))
     section = (
-        f"{BEGIN}\n{where}. `{command}`\n\n{table}\n\n![Policies a second against jobs](pictures/{PLOT.name})\n\n{END}"
+        f"{BEGIN}\n{where}. `{command}`\n\n{table}\n\nResident memory on the way:\n\n{memory}\n"
+        f"![Policies a second against jobs](pictures/{PLOT.name})\n\n{END}"
     )
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)

@@ -30,7 +30,8 @@ distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.runtimes
 
 NAMES = ("continuous", "discrete", "twobrains", "recurrent")
-COPIES = 6
+#: Four sources each, which are five policies; 400 are the 2,000 that docs/performance.md tells of.
+COPIES = int(os.environ.get("EXPORT_MODEL_TEST_COPIES", "6"))
 
 
 @pytest.fixture
@@ -85,7 +86,7 @@ def test_a_worker_is_killed(
     made = []
     for outcome in export_fleet(sources, ExportOptions(tmp_path / "many", verify="none"), cluster=address):
         made.append(outcome)
-        if len(made) == 5:
+        if len(made) == len(sources) // 2:
             os.kill(workers[0].pid, signal.SIGKILL)
     assert workers[0].wait() == -signal.SIGKILL
     assert [o.path.name for o in made if o.error is not None] == ["broken.bytes"]
