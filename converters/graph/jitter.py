@@ -5,6 +5,7 @@ Runtimes approximate some functions, each in its own way: ``ops/approximations.p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,10 @@ from converters.graph.shapes import run_kernel
 
 #: Of functions that were not measured.
 _ELSE = (4.0, 0.0)
+#: Operands of more elements are not moved one by one, which a policy of some megabytes takes seconds for.
+_MOST_DRAWN = 1 << 22
+#: Mean square of one unit in the last place, in ε² of the number it is of: mantissas spread as logarithms do.
+_UNIT = 0.75 / (2 * math.log(2))
 
 
 class Jitter:
@@ -29,8 +34,12 @@ class Jitter:
         self._approximations = known[arithmetic]
 
     def operands(self, entry: OpDef, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """What an op reads: every term of a sum of products moved by one unit in its last place."""
-        return [self._moved(a) for a in operands] if entry.precision == "summed" else list(operands)
+        """What an op reads: every term of a sum of products moved by one unit in its last place; of large operands
+        ``_added_up`` knows what comes of that.
+        """
+        if entry.precision != "summed":
+            return list(operands)
+        return [self._moved(a) if a.size <= _MOST_DRAWN else a for a in operands]
 
     def results(
         self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]
@@ -65,6 +74,7 @@ class Jitter:
 
         Partial sums of n terms walk: on average their square is half of ‖terms‖², and each is rounded by about a
         quarter of a unit, so the total is about ε/4·√n·‖terms‖. The kernel itself, run on squares, gives ‖terms‖².
+        An operand that was not moved would have moved each term by about a unit of its own.
         """
         if any(r.dtype.kind != "f" for r in results):
             return results
@@ -73,10 +83,11 @@ class Jitter:
         else:  # the second operand is the kernel: its last axis is the result's (a transposed one has as many elements)
             terms = operands[1].size / max(1, results[0].shape[-1])
         with np.errstate(all="ignore"):
+            terms = terms / 16 + _UNIT * sum(a.size > _MOST_DRAWN for a in operands)
             squares = run_kernel(entry, node, [np.square(a) if a.dtype.kind == "f" else a for a in operands])
             moved = []
             for result, square in zip(results, squares, strict=True):
-                step = np.finfo(result.dtype).eps / 4 * np.sqrt(terms * np.maximum(square, 0))
+                step = np.finfo(result.dtype).eps * np.sqrt(terms * np.maximum(square, 0))
                 signs = self._signs(result.shape)
                 moved.append(np.where(np.isfinite(step), result + signs * step, result).astype(result.dtype))
         return moved

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from converters.graph.jitter import Jitter
+from converters.graph.nodes import Graph, Node
+from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from signatures.errors import ExportModelError, GraphError
 from tests.graph.harness import Runtimes, policy_of
@@ -72,3 +75,31 @@ def test_float16_inside_is_float32_in_tensorflow_js(backend: str, runtimes: Runt
     x = np.array([[0.5, -1.25, 3]], np.float32)
     (y,) = runtimes.tfjs(backend, policy_of(made, ["y"]), {"x": x})
     np.testing.assert_array_equal(y, x * 2, strict=True)
+
+
+@pytest.mark.parametrize("terms", [16, 512])
+def test_what_moving_each_weight_makes_is_known_of_large_ones(terms: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(terms)
+    weights = rng.standard_normal((terms, 64)).astype(np.float32)
+    nodes = [Node("x", "Placeholder"), Node("w", "Const", value=weights), Node("y", "MatMul", ("x", "w"))]
+    feeds = {"x": rng.standard_normal((8, terms)).astype(np.float32)}
+    exact = run_graph(Graph(tuple(nodes)), feeds, ["y"])["y"]
+
+    def spread() -> float:
+        moved = [run_graph(Graph(tuple(nodes)), feeds, ["y"], Jitter(seed))["y"] - exact for seed in range(20)]
+        return float(np.sqrt(np.mean(np.square(moved, dtype=np.float64))))
+
+    one_by_one = spread()
+    monkeypatch.setattr("converters.graph.jitter._MOST_DRAWN", 0)
+    assert 0.9 < spread() / one_by_one < 1.1
+
+
+def test_columns_of_a_large_product_are_computed_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.standard_normal((3, 50)).astype(np.float32), rng.standard_normal((50, 17)).astype(np.float32)
+    product = TABLE["MatMul"].kernel
+    assert product is not None
+    whole = product(Node("y", "MatMul"), a, b)
+    monkeypatch.setattr("converters.graph.ops.linear._AT_ONCE", 100)
+    for each, other in ((Node("y", "MatMul"), b), (Node("y", "MatMul", attrs={"transpose_b": True}), b.T.copy())):
+        np.testing.assert_array_equal(product(each, a, other), whole)

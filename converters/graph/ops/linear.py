@@ -24,6 +24,8 @@ from converters.graph.ops.reducing import reduced
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
 
 T = type_attr()
+#: Elements of a matrix that are made float64 at a time.
+_AT_ONCE = 1 << 22
 
 
 def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -34,7 +36,16 @@ def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         if a.dtype.kind != "f":
             return np.asarray(a @ b)
-        return np.asarray(a.astype(np.float64) @ b.astype(np.float64)).astype(a.dtype)
+        return _product(a.astype(np.float64), b).astype(a.dtype)
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """In float64; of a large matrix some columns at a time, so that it is never held in twice its bytes."""
+    if b.size <= _AT_ONCE or b.ndim > 2:
+        return np.asarray(a @ b.astype(np.float64))
+    step = max(1, _AT_ONCE // len(b))
+    parts = [a @ b[:, i : i + step].astype(np.float64) for i in range(0, b.shape[1], step)]
+    return np.concatenate(parts, axis=-1)
 
 
 def _infer_matmul(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
