@@ -9,12 +9,13 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from converters import schema
+from converters.detached import Detached
 from converters.inner import Feeds, InnerTensors, Loaded, own_names
 
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     """Those of a ``.bytes``."""
-    graph = schema.parse(schema.GraphDef, loaded.path.read_bytes(), "GraphDef")
+    graph = schema.parse(schema.GraphDef, loaded.path.read_bytes(), "GraphDef", Detached())  # for its names alone
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         """TensorFlow 1.x refuses to fetch what it is fed, by the same name: it is what was fed."""

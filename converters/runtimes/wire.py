@@ -17,6 +17,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 Tensors = dict[str, np.ndarray]
+#: Bytes that are taken from a pipe at once.
+_CHUNK = 1 << 20
 
 
 class FramingError(Exception):
@@ -24,15 +26,18 @@ class FramingError(Exception):
 
 
 def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None) -> None:
-    """Send a header with its tensors."""
+    """Send a header with its tensors, which may be as large as a model: they are not copied."""
     parts = []
     entries = []
     for name, array in (tensors or {}).items():
         dtype, little = _dtypes(array.dtype)
         entries.append({"name": name, "dtype": dtype, "shape": list(array.shape)})
-        parts.append(array.astype(little, copy=False).tobytes())
+        parts.append(np.ascontiguousarray(array, little))
     text = json.dumps({**header, "tensors": entries} if tensors is not None else dict(header)).encode()
-    stream.write(struct.pack("<I", len(text)) + text + b"".join(parts))
+    stream.write(struct.pack("<I", len(text)) + text)
+    for part in parts:
+        if part.size:
+            stream.write(part.data)
     stream.flush()
 
 
@@ -46,7 +51,8 @@ def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
         for entry in header.get("tensors", ()):
             dtype = np.dtype(entry["dtype"])
             data = _exactly(stream, math.prod(entry["shape"]) * dtype.itemsize)
-            tensors[entry["name"]] = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype).reshape(entry["shape"])
+            array = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype, copy=False)
+            tensors[entry["name"]] = array.reshape(entry["shape"])
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise FramingError(f"what it said is no frame: {error}") from error
     return header, tensors
@@ -58,11 +64,12 @@ def _dtypes(dtype: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
     return dtype.name, dtype.newbyteorder("<")
 
 
-def _exactly(stream: BinaryIO, count: int) -> bytes:
-    data = b""
+def _exactly(stream: BinaryIO, count: int) -> bytearray:
+    """So many bytes, in memory of their own, which what is made of them may write to."""
+    data = bytearray()
     while len(data) < count:
-        chunk = stream.read(count - len(data))
+        chunk = stream.read(min(count - len(data), _CHUNK))
         if not chunk:
             raise EOFError("the other process ended")
-        data = chunk if not data else data + chunk
+        data += chunk
     return data

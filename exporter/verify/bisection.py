@@ -102,15 +102,19 @@ class Bisector:
         try:
             inner = self._within(participant)
             for chunk in _chunks(list(known), known):
-                got = inner.fetch(feeds, chunk)
-                for name, array in got.items():
-                    if array.dtype == known[name].dtype and np.array_equal(array, known[name]):
-                        continue
-                    difference = compare(known[name], array, Tolerance(0, 0))
-                    if not difference.passed:
-                        found.append(_found(graph.producer(name), name, known[name], array, difference, self._source))
+                found += self._unequal(graph, known, inner.fetch(feeds, chunk))  # freed before the next is fetched
         except (ExportModelError, OSError):
             return found
+        return found
+
+    def _unequal(self, graph: Graph, known: Feeds, got: Feeds) -> list[Bisection]:
+        found = []
+        for name, array in got.items():
+            if array.dtype == known[name].dtype and np.array_equal(array, known[name]):
+                continue
+            difference = compare(known[name], array, Tolerance(0, 0))
+            if not difference.passed:
+                found.append(_found(graph.producer(name), name, known[name], array, difference, self._source))
         return found
 
     def graph(self) -> Graph | None:

@@ -24,8 +24,8 @@ from converters.graph.ops.reducing import reduced
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
 
 T = type_attr()
-#: Elements of a matrix that are made float64 at a time.
-_AT_ONCE = 1 << 22
+#: Elements of a matrix from which on it is made float64 in pieces, and those of a piece, which fits into caches.
+_LARGE, _AT_ONCE = 1 << 22, 1 << 16
 
 
 def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -40,12 +40,20 @@ def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """In float64; of a large matrix some columns at a time, so that it is never held in twice its bytes."""
-    if b.size <= _AT_ONCE or b.ndim > 2:
+    """In float64; of a large matrix a piece at a time, as it lies in memory: it is never held in twice its bytes
+    (which takes longer, too).
+    """
+    if b.size <= _LARGE or b.ndim > 2:
         return np.asarray(a @ b.astype(np.float64))
-    step = max(1, _AT_ONCE // len(b))
-    parts = [a @ b[:, i : i + step].astype(np.float64) for i in range(0, b.shape[1], step)]
-    return np.concatenate(parts, axis=-1)
+    if b.strides[0] < b.strides[1]:  # transposed
+        step = max(1, _AT_ONCE // len(b))
+        columns = [a @ b[:, i : i + step].astype(np.float64) for i in range(0, b.shape[1], step)]
+        return np.concatenate(columns, axis=-1)
+    step = max(1, _AT_ONCE // b.shape[1])
+    total = np.zeros((*a.shape[:-1], b.shape[1]))
+    for i in range(0, len(b), step):
+        total += a[..., i : i + step] @ b[i : i + step].astype(np.float64)
+    return total
 
 
 def _infer_matmul(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
