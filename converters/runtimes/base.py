@@ -27,19 +27,20 @@ class RuntimeInfo:
 
 @dataclass(frozen=True, slots=True)
 class Runtime:
-    """A runtime: what it runs, whether it is here, how its child process is started and how it is installed.
+    """A runtime: whether it is here, how its child process is started and how it is installed.
 
-    ``formats`` are the formats of a bundle that it loads, ``source`` in addition where it reads originals by itself.
+    What it loads of a bundle, each format says (``Format.runtimes``).
     ``find`` says whether it is here, without importing it: the import takes seconds, and this is only a question.
     ``command`` gives the argument list of a child process that speaks the frames of converters/runtimes/wire.py; it
     raises RuntimeUnavailableError. ``install`` fetches it, None where pip or the system's packages do that.
     """
 
     name: str
-    formats: tuple[str, ...]
     find: Callable[[], RuntimeInfo]
     command: Callable[[], list[str]]
     install: Callable[[Progress], object] | None = None
+    #: It reads the files of sources by itself.
+    originals: bool = False
     #: It computes by itself; numpy and js are this project's own.
     independent: bool = True
     #: How it approximates functions (converters/graph/ops/approximations.py).

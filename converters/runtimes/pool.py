@@ -13,7 +13,7 @@ from signatures.errors import RuntimeUnavailableError, UsageError, meant
 #: Runtimes that compute by themselves; numpy and js are this project's own.
 INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
 #: Runtimes that read originals by themselves.
-_ORIGINALS = tuple(r.name for r in RUNTIMES if "source" in r.formats)
+_ORIGINALS = tuple(r.name for r in RUNTIMES if r.originals)
 #: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for, and js shows little beside others.
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
 #: Runtimes that have a sandbox of their own: browsers.

@@ -18,14 +18,15 @@ from converters.runtimes.base import Runtime, RuntimeInfo
 
 
 def package_runtime(
-    name: str, formats: tuple[str, ...], how: str, distributions: tuple[str, ...], *, independent: bool = True
+    name: str, how: str, distributions: tuple[str, ...], *, independent: bool = True, originals: bool = False
 ) -> Runtime:
     """The runtime of the package ``name``, whose child is the module ``child`` of the folder of that name here.
 
     Several of the ``distributions`` may provide the package: the first that is installed tells the version.
     """
     command = partial(child_command, f"converters.runtimes.{name}.child")
-    return Runtime(name, formats, partial(_find, name, how, distributions), command, independent=independent)
+    find = partial(_find, name, how, distributions)
+    return Runtime(name, find, command, independent=independent, originals=originals)
 
 
 #: Modules come from this very copy of the packages, installed or not, and none (-P) from the folder that the user

@@ -68,7 +68,7 @@ def artefacts(bundle: Path) -> Iterator[tuple[str, str, Path]]:
     """(format, runtime, path): each runtime once."""
     installed = {r.name for r in available_runtimes() if r.installed}
     for runtime in RUNTIMES:
-        key = next((k for k in runtime.formats if k in ("bytes", "onnx", "tfjs")), None)
+        key = next((k for k in ("bytes", "onnx", "tfjs") if runtime.name in WRITTEN[k].runtimes), None)
         if runtime.independent and key is not None and runtime.name in installed and "@" not in runtime.name:
             yield key, runtime.name, bundle / WRITTEN[key].main_of("functions")
 

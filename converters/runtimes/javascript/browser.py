@@ -103,7 +103,7 @@ def _command(name: str) -> list[str]:
 def _runtime(name: str, kind: str, *packages: str, arithmetic: Arithmetic = "processor") -> Runtime:
     find, command = partial(_find, name, packages), partial(_command, name)
     return Runtime(
-        *(name, (kind,), find, command, install_packages),
+        *(name, find, command, install_packages),
         automatic=False,
         confined=False,
         arithmetic=arithmetic,

@@ -199,7 +199,7 @@ def _command(name: str) -> list[str]:
 def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Runtime:
     find, command = partial(_find, name, packages, how), partial(_command, name)
     return Runtime(
-        *(name, (format_,), find, command, install_packages),
+        *(name, find, command, install_packages),
         sessions_alike=format_ == "onnx",
         products_per_second=SPEEDS.get(name, 1e9),
     )

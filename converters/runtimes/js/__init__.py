@@ -32,7 +32,7 @@ def _command() -> list[str]:
 
 RUNTIMES = (
     Runtime(
-        *("js", ("tfjs",), _find, _command),
+        *("js", _find, _command),
         independent=False,
         products_per_second=2e8,
         automatic=False,

@@ -2,4 +2,4 @@
 
 from converters.runtimes.python import package_runtime
 
-RUNTIMES = (package_runtime("numpy", ("bytes", "nn"), "pip install export-model", ("numpy",), independent=False),)
+RUNTIMES = (package_runtime("numpy", "pip install export-model", ("numpy",), independent=False),)

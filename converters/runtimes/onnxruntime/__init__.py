@@ -7,6 +7,4 @@ DISTRIBUTIONS = (
     *("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino", "onnxruntime-qnn"),
     "ort-nightly",
 )
-RUNTIMES = (
-    package_runtime("onnxruntime", ("source", "onnx"), "pip install 'export-model[onnxruntime]'", DISTRIBUTIONS),
-)
+RUNTIMES = (package_runtime("onnxruntime", "pip install 'export-model[onnxruntime]'", DISTRIBUTIONS, originals=True),)

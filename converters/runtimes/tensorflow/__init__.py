@@ -7,8 +7,4 @@ DISTRIBUTIONS = (
     *("tensorflow", "tensorflow-cpu", "tensorflow-gpu", "tensorflow-intel", "tensorflow-macos"),
     *("tensorflow-rocm", "tensorflow-cpu-aws", "intel-tensorflow", "tf-nightly", "tf-nightly-cpu"),
 )
-RUNTIMES = (
-    package_runtime(
-        "tensorflow", ("source", "bytes", "saved_model"), "pip install 'export-model[tensorflow]'", DISTRIBUTIONS
-    ),
-)
+RUNTIMES = (package_runtime("tensorflow", "pip install 'export-model[tensorflow]'", DISTRIBUTIONS, originals=True),)

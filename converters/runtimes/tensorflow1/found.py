@@ -44,9 +44,7 @@ def _install(release: Release, progress: Progress) -> Path:
 
 def _runtime(release: Release) -> Runtime:
     # A library of an old TensorFlow reads frozen graphs; SavedModels would need the wheel's Python code.
-    return Runtime(
-        release.runtime, ("bytes",), partial(_find, release), partial(_command, release), partial(_install, release)
-    )
+    return Runtime(release.runtime, partial(_find, release), partial(_command, release), partial(_install, release))
 
 
 RUNTIMES = tuple(_runtime(release) for release in RELEASES)
