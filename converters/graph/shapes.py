@@ -118,8 +118,10 @@ def _arguments(node: Node, types: Mapping[str, TensorType]) -> list[TensorType]:
 def _results(
     op: OpDef, node: Node, args: Sequence[TensorType], symbols: Symbols, allowance: Allowance
 ) -> Sequence[TensorType]:
-    if op.kernel is not None and len(args) > _most_inputs(op.kernel):
-        raise shape_error(node, args, f"it takes {_most_inputs(op.kernel):.0f} inputs")
+    if op.kernel is not None:
+        least, most = _inputs_of(op.kernel)
+        if not least <= len(args) <= most:
+            raise shape_error(node, args, f"it takes {most if len(args) > most else least:.0f} inputs")
     try:
         results = op.infer(node, args, symbols)
     except ExportModelError:
@@ -146,10 +148,11 @@ def _results(
 
 
 @cache
-def _most_inputs(kernel: Kernel) -> float:
-    """How many tensors a kernel takes: an infer rule does not ask for those behind the ones that it reads."""
+def _inputs_of(kernel: Kernel) -> tuple[int, float]:
+    """(at least, at most) how many tensors a kernel takes: an infer rule does not ask for all of them."""
     given = list(inspect.signature(kernel).parameters.values())[1:]
-    return inf if any(p.kind is p.VAR_POSITIONAL for p in given) else len(given)
+    named = [p for p in given if p.kind is not p.VAR_POSITIONAL]
+    return sum(p.default is p.empty for p in named), len(named) if len(named) == len(given) else inf
 
 
 def elements_of(kind: TensorType) -> int:

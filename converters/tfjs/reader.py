@@ -104,7 +104,7 @@ def read_model(given: Fetched) -> WebModel:
         extra = model.get("userDefinedMetadata") or {}
         signature = _signature(model.get("signature") or extra.get("signature") or {})
         return WebModel(graph, signature, (path, *shards), extra.get("contract"))
-    except (AttributeError, KeyError, TypeError, ValueError, binascii.Error) as error:
+    except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, binascii.Error) as error:
         raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
 
 
@@ -114,7 +114,7 @@ def held(path: Path) -> Any:
         return (json.loads(read_bytes(path / MODEL if path.is_dir() else path)).get("userDefinedMetadata") or {}).get(
             "contract"
         )
-    except (AttributeError, ValueError, RecursionError) as error:
+    except (AttributeError, ArithmeticError, ValueError, RecursionError) as error:
         raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
 
 
@@ -125,7 +125,7 @@ def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
         signature = model.get("signature") or (model.get("userDefinedMetadata") or {}).get("signature") or {}
         nodes = {str(n["name"]): str(n["op"]) for n in model["modelTopology"]["node"]}
         return _signature(signature), nodes
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
 
 

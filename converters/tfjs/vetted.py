@@ -46,7 +46,7 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
         for node in nodes:
             node["input"] = [i for i in node.get("input") or () if not i.startswith("^")]
         manifest, files = _manifest(model.get("weightsManifest") or (), path)
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise DamagedFileError(
             "model.json is not in TensorFlow.js's form", why=f"{type(error).__name__}: {error}"[:200], fix=_FIX
         ) from error

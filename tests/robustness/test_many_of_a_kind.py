@@ -98,6 +98,14 @@ def test_a_manifest_of_another_form_is_refused(manifest: object, tmp_path: Path)
             read_source(tmp_path)
 
 
+@pytest.mark.parametrize("attribute", ['{"i": 1e999}', '{"shape": {"dim": [{"size": 1e999}]}}'])
+def test_an_endless_number_in_a_model_json_is_damage(attribute: str, tmp_path: Path) -> None:
+    one = f'{{"name": "a", "op": "Placeholder", "attr": {{"shape": {attribute}}}}}'
+    (tmp_path / "model.json").write_text(f'{{"modelTopology": {{"node": [{one}]}}, "weightsManifest": []}}')
+    with pytest.raises(DamagedFileError, match=r"not in TensorFlow\.js's form"):
+        read_source(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("made", "said"),
     [
@@ -105,6 +113,7 @@ def test_a_manifest_of_another_form_is_refused(manifest: object, tmp_path: Path)
         (node("odd", "Mean", "mu", "mu", keep_dims="yes"), "which is no truth value"),
         (node("odd", "Tanh", "mu", "mu"), "it takes 1 inputs"),
         (node("odd", "StridedSlice", *["mu"] * 5), "it takes 4 inputs"),
+        (node("odd", "OneHot", "mu", "mu", "mu"), "it takes 4 inputs"),
         (node("odd", "Squeeze", "mu", squeeze_dims=1.5), "which is no integer"),
         (node("odd", "LeakyRelu", "mu", alpha="x"), "which is no number|does not allow"),
     ],
