@@ -99,7 +99,7 @@ def whole(name: str, value: object, least: int, most: int | None = None) -> int:
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """``did you mean …? `` where one of those that are known is close to a name that is not; else nothing."""
+    """``did you mean …?`` and a space where one that is known is close to a name that is not; else nothing."""
     import difflib  # 2 ms, which nobody needs who mistypes nothing
 
     close = difflib.get_close_matches(name, [*known], n=1)
