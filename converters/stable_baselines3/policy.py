@@ -266,7 +266,7 @@ def _actor_critic(made: _Built, observed: Space | Mapping[str, Space]) -> None:
         return
     if len(net.state.shape("log_std")) == 1:
         net.at("action_net")
-        with np.errstate(over="ignore"):  # a damaged file's; a spread without end is one that verification finds
+        with np.errstate(over="ignore", invalid="ignore"):  # a damaged file: verification finds it
             spread = np.exp(net.state.array("log_std", net.width(out)).astype(np.float64)).astype(FLOAT32)
         _continuous(made, out, net.const(spread, "std"))
         return

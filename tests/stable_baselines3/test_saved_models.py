@@ -185,3 +185,9 @@ class _Runs:
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         return Path.touch, (self.path,)
+
+
+def test_a_spread_that_is_no_number_warns_of_nothing(tmp_path: Path) -> None:
+    """A signalling NaN, of which a cast makes a quiet one; verification finds it."""
+    spread = np.full(2, 0x7F800001, np.uint32).view(np.float32)
+    assert compiled(changed(tmp_path, "ppo_mixed", {"log_std": spread})).signature.outputs
