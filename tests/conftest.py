@@ -52,7 +52,6 @@ _FIXTURE = "processes"
 _TRACED = {"corpus": 8, "legacy": 8, "slow": 4}
 
 
-@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what ``make check`` leaves out, and of sweeps what coverage does; tell pytest-xdist the groups."""
     swept: Counter[str] = Counter()
@@ -67,7 +66,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.no_cover)
             swept[family] += 1
         groups = sorted({mark.args[0] for mark in item.iter_markers("xdist_group")})
-        if groups and config.getoption("loadgroup", False) and "@" not in item.nodeid.rpartition("]")[2]:
+        if groups and config.getoption("loadgroup", False) and hasattr(item, "_id"):
             # pytest-xdist 3.8 writes it to a field that pytest 9.2 no longer reads: each worker made all fixtures.
             item._id = type(item._id).parse(f"{item.nodeid}@{'_'.join(groups)}")  # type: ignore[attr-defined]
 
