@@ -118,6 +118,9 @@ Layer = Literal["", "dense", "convolution", "pool"]
 Start = Literal["", "fed", "constant"]
 #: The distribution that is drawn from.
 Sampler = Literal["", "normal", "truncated normal", "uniform", "categorical"]
+#: In arithmetic of two: what the second operand is to the first.
+Operand = Literal["", "factor", "divisor", "summand", "subtrahend"]
+Finite = Literal["", "always", "as its operands"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +171,10 @@ class OpDef:
     precision: Precision = "rounded"
     #: The result at an index depends on the operands at that index only.
     elementwise: bool = False
+    #: What a second operand is to the first.
+    operand: Operand = ""
+    #: Whether the result is finite: whatever the operands are, or where they are (as long as it fits into float32).
+    finite: Finite = ""
     #: The result depends on the shapes of the operands, not on their elements.
     of_shape: bool = False
     #: The number that every element of the result is, whatever the operand holds.

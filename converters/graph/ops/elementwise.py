@@ -351,8 +351,16 @@ UNARY = (
     _unary("Cos", _wide(np.cos), "Cos", precision="approximate"),
     _unary("Tan", _wide(np.tan), "Tan", precision="approximate"),
     _unary("Erf", _wide(_erf), _lower_erf, precision="approximate"),
-    _unary("Sigmoid", _wide(_sigmoid), "Sigmoid", precision="approximate", activation="sigmoid", tfjs_fuses=True),
-    _unary("Tanh", _wide(np.tanh), "Tanh", precision="approximate", activation="tanh"),
+    _unary(
+        "Sigmoid",
+        _wide(_sigmoid),
+        "Sigmoid",
+        precision="approximate",
+        activation="sigmoid",
+        finite="always",
+        tfjs_fuses=True,
+    ),
+    _unary("Tanh", _wide(np.tanh), "Tanh", precision="approximate", activation="tanh", finite="always"),
     _unary(
         "Relu",
         _plain(lambda x: np.maximum(x, x.dtype.type(0))),
@@ -421,14 +429,14 @@ UNARY = (
 )
 
 BINARY = (
-    _binary("Add", np.add, "Add", spellings=("AddV2",)),
-    _binary("Sub", np.subtract, "Sub"),
-    _binary("Mul", np.multiply, "Mul"),
-    _binary("RealDiv", _real_div, "Div", spellings=("Div",)),
+    _binary("Add", np.add, "Add", spellings=("AddV2",), operand="summand", finite="as its operands"),
+    _binary("Sub", np.subtract, "Sub", operand="subtrahend", finite="as its operands"),
+    _binary("Mul", np.multiply, "Mul", operand="factor", finite="as its operands"),
+    _binary("RealDiv", _real_div, "Div", spellings=("Div",), operand="divisor"),
     _binary("FloorDiv", _floor_div, _lower_floor_div),
     _binary("FloorMod", np.mod, _lower_floor_mod),
-    _binary("Maximum", np.maximum, "Max", precision="exact"),
-    _binary("Minimum", np.minimum, "Min", precision="exact"),
+    _binary("Maximum", np.maximum, "Max", precision="exact", finite="as its operands"),
+    _binary("Minimum", np.minimum, "Min", precision="exact", finite="as its operands"),
     OpDef(
         "Pow",
         broadcast_of(count=2),

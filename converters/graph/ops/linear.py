@@ -328,6 +328,7 @@ OPS = (
         (T,),
         precision="approximate",
         activation="softmax",
+        finite="always",
     ),
     OpDef(
         "LogSoftmax",

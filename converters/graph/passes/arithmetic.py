@@ -96,19 +96,20 @@ def _pruned(graph: Graph, outputs: Iterable[str]) -> Graph:
 
 def _operand(graph: Graph, node: Node) -> tuple[str, str, np.ndarray] | None:
     """("Mul" or "Add", tensor, constant in float64) of a node that multiplies a tensor by a constant, or adds one."""
-    if node.op not in ("Mul", "RealDiv", "Add", "Sub"):
+    kind = op_of(node).operand
+    if not kind:
         return None
     left, right = (graph.constant(r) for r in node.inputs)
-    if node.op in ("Mul", "Add") and right is None:
+    if kind in ("factor", "summand") and right is None:
         value, number = node.inputs[1], left
     else:
         value, number = node.inputs[0], right if left is None else None
     if number is None or number.dtype != FLOAT32 or number.size > _SMALL or not np.isfinite(number).all():
         return None
     wide = number.astype(np.float64)
-    if node.op == "RealDiv":
+    if kind == "divisor":
         return ("Mul", value, 1 / wide) if wide.all() else None
-    return ("Mul" if node.op == "Mul" else "Add"), value, -wide if node.op == "Sub" else wide
+    return ("Mul" if kind == "factor" else "Add"), value, -wide if kind == "subtrahend" else wide
 
 
 def _merged(kind: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:

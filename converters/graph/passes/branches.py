@@ -22,6 +22,8 @@ from converters.graph.types import FLOAT32, INT32
 
 #: Columns of all parts together, for sums of parts: they are a product with as many rows.
 _MOST_SUMMED = 64
+#: Ops between a sum and what is known to be finite.
+_DEEPEST = 8
 #: Elements of the weights that are copied into one matrix.
 _MOST_WEIGHTS = 1 << 16
 
@@ -194,15 +196,16 @@ class _Joining:
     def _product(self, nodes: Sequence[Node]) -> str | None:
         """Products of one tensor with constants as one product; their biases side by side."""
         first = nodes[0]
-        if first.op not in ("MatMul", "BiasAdd") or first.attrs.get("transpose_a") or first.attrs.get("transpose_b"):
+        if first.attrs.get("transpose_a") or first.attrs.get("transpose_b"):
             return None
-        constants = [self.graph.constant(n.inputs[1]) for n in nodes]
         if first.op == "BiasAdd":
             products = tuple(n.inputs[0] for n in nodes)
             value = self._together(products) if self.graph.producer(products[0]).op == "MatMul" else None
-        else:
+        elif first.op == "MatMul":
             value = first.inputs[0] if len({n.inputs[0] for n in nodes}) == 1 else None
-        known = [c for c in constants if c is not None]
+        else:
+            return None
+        known = [c for n in nodes if (c := self.graph.constant(n.inputs[1])) is not None]
         if value is None or len(known) < len(nodes) or sum(c.size for c in known) > _MOST_WEIGHTS:
             return None
         weights = self.editor.const(np.concatenate(known, axis=-1), f"{first.name}/weights")
@@ -271,11 +274,14 @@ class _Joining:
     def _is_number(self, reference: str, depth: int = 0) -> bool:
         """Whether a tensor cannot become infinite, as long as what is fed and the weights' products are finite."""
         node = self.graph.producer(reference)
-        if node.op in ("Softmax", "Sigmoid", "Tanh", "Placeholder") or node.value is not None:
-            return node.value is None or bool(np.isfinite(node.value).all())
-        if node.op in ("Add", "Sub", "Mul", "Maximum", "Minimum") and depth < 8:
-            return all(self._is_number(r, depth + 1) for r in node.inputs)
-        return bool(op_of(node).moves) and all(self._is_number(r, depth + 1) for r in op_of(node).moved(node.inputs))
+        entry = op_of(node)
+        if node.value is not None:
+            return bool(np.isfinite(node.value).all())
+        if entry.finite == "always" or entry.start == "fed":
+            return True
+        if depth == _DEEPEST or not (entry.moves or entry.finite):
+            return False
+        return all(self._is_number(r, depth + 1) for r in (entry.moved(node.inputs) if entry.moves else node.inputs))
 
     def _one_hot(self, nodes: Sequence[Node]) -> str | None:
         """Columns of one tensor of whole numbers, each one hot: those columns, repeated, compared with the numbers."""
