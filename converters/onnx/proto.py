@@ -179,29 +179,28 @@ def _is_set(attribute: Any, field: str) -> bool:
 # ------------------------------------------------------------------ external data
 
 
-def tensors(graph: Any) -> Iterator[Any]:
-    """Every TensorProto of a graph or function: initializers, constants, and those of its subgraphs."""
-    if hasattr(graph, "initializer"):
-        yield from graph.initializer
-        yield from _dense(graph.sparse_initializer)
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("t"):
-                yield attribute.t
-            if attribute.HasField("sparse_tensor"):
-                yield from _dense([attribute.sparse_tensor])
-            yield from attribute.tensors
-            yield from _dense(attribute.sparse_tensors)
-            if attribute.HasField("g"):
-                yield from tensors(attribute.g)
-            for inner in attribute.graphs:
-                yield from tensors(inner)
+def inside(message: Any, kind: str) -> Iterator[Any]:
+    """Every message of a kind in another, wherever it stands: in attributes, subgraphs, defaults of a function's
+    attributes. What is in a TensorProto is not looked at.
+    """
+    stack = [message]
+    while stack:
+        each = stack.pop()
+        name = each.DESCRIPTOR.name
+        if name == kind:
+            yield each
+        if name == "TensorProto":
+            continue
+        for _, value in each.ListFields():
+            if hasattr(value, "ListFields"):
+                stack.append(value)
+            elif hasattr(value, "add"):
+                stack.extend(value)
 
 
-def _dense(sparse: Iterable[Any]) -> Iterator[Any]:
-    """The tensors that sparse ones are made of."""
-    for tensor in sparse:
-        yield from (tensor.values, tensor.indices)
+def tensors(part: Any) -> Iterator[Any]:
+    """Every TensorProto of a graph or function: initializers, constants, those of subgraphs and defaults."""
+    return inside(part, "TensorProto")
 
 
 def load_external(parts: Iterable[Any], folder: Path, detached: Detached | None = None) -> list[Path]:

@@ -7,14 +7,14 @@ our own name beside it), others are refused, and so is every op that is not of O
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.onnx.files import files_of
-from converters.onnx.proto import decoded, load_external
+from converters.onnx.proto import decoded, inside, load_external
 from signatures.errors import UnsupportedOpError
 
 #: Domains whose operators compute, of ONNX and of onnxruntime.
@@ -42,7 +42,7 @@ def contained(path: Path, detached: Detached | None = None) -> Any:
     parts = (model.graph, *model.functions)
     load_external(parts, path.parent, detached)
     for part in parts:
-        for node in _nodes(part):
+        for node in inside(part, "NodeProto"):
             known = node.domain in _DOMAINS and node.op_type not in _LOADING
             if not known and (node.domain, node.op_type) not in own:
                 raise UnsupportedOpError(
@@ -56,15 +56,3 @@ def contained(path: Path, detached: Detached | None = None) -> Any:
             if length.HasField("dim_value") and length.dim_value <= 0:  # free, as the importer has it
                 length.ClearField("dim_value")
     return model
-
-
-def _nodes(part: Any) -> Iterator[Any]:
-    """The nodes of a graph or function, those of its subgraphs too."""
-    stack = [part]
-    while stack:
-        for node in stack.pop().node:
-            yield node
-            for attribute in node.attribute:
-                if attribute.HasField("g"):
-                    stack.append(attribute.g)
-                stack.extend(attribute.graphs)

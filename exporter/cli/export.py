@@ -11,7 +11,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import Command
-from exporter.cli.options import activating, comparing, read_options, trusting, understanding
+from exporter.cli.options import RULES, activating, as_given, comparing, read_options, trusting, understanding
 from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
@@ -177,4 +177,5 @@ def export_command(
 def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:
     from exporter.reports.entry import of_result
 
-    return [entry for entry in (of_result(result, steps) for result in results) if entry is not None]
+    words = as_given(RULES)
+    return [entry for entry in (of_result(result, steps, words) for result in results) if entry is not None]

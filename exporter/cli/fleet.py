@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from converters.fetch import shown
 from exporter.cli.console import Console
+from exporter.cli.options import RULES, as_given
 from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
@@ -40,6 +42,7 @@ def run_fleet(
     wanted = Wanted(console.as_json, console.wants_reports)
     tally = _Tally(len(paths))
     entries: list[Entry] = []
+    words = as_given(RULES)
     answers: list[Any] = []
     refused: list[Any] = []
     count = 1 if jobs is None else jobs
@@ -56,7 +59,9 @@ def run_fleet(
         for outcome in outcomes:
             tally.count(outcome)
             bar.advance(Path(shown(outcome.path)).name, tally.rate)
-            entries.extend(p.entry for p in outcome.policies if p.entry is not None)
+            entries.extend(
+                replace(p.entry, command=(*p.entry.command, *words)) for p in outcome.policies if p.entry is not None
+            )
             answers.extend(p.answer for p in outcome.policies if p.answer is not None)
             if outcome.error is not None and console.as_json:
                 refused.append(outcome.error.to_dict())

@@ -45,6 +45,8 @@ def one_bundle(place: Path, command: str) -> Path | None:
 
 def as_given(names: Container[str]) -> list[str]:
     """The options of this call whose parameters ``names`` has, word for word, where the command line had them."""
+    from converters.fetch import shown
+
     context = click.get_current_context()
     words: list[str] = []
     for option in context.command.params:
@@ -57,28 +59,20 @@ def as_given(names: Container[str]) -> list[str]:
             words.append(option.opts[0])
             continue
         values = context.params[name] if option.multiple else [context.params[name]]
-        words += [word for value in values for word in (option.opts[0], str(value))]
+        told = (shown(value) if isinstance(value, Path) else str(value) for value in values)
+        words += [word for value in told for word in (option.opts[0], value)]
     return words
 
 
 #: What decides how a policy is read and judged. A report that says how to compare again has these as they were given.
 JUDGING = frozenset(
-    [
-        "mapped",
-        "brain",
-        "inputs",
-        "outputs",
-        "values",
-        "trust_source",
-        "source",
-        "step",
-        "golden",
-        "sizes",
-        "tolerances",
-        "atol",
-        "rtol",
-    ]
+    (
+        *("mapped", "brain", "inputs", "outputs", "values", "trust_source", "source", "step"),
+        *("golden", "sizes", "tolerances", "atol", "rtol"),
+    )
 )
+#: What of it a bundle is verified with that an export was judged by.
+RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol"))
 
 
 def sensors_of(text: str) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from converters.bundle.bundle import distinct_names, writing
 from signatures.contract import safe_name
-from signatures.errors import UsageError
+from signatures.errors import BundleError, UsageError
 
 if TYPE_CHECKING:
     from exporter.inspect.inspection import Inspection
@@ -36,6 +36,17 @@ def write_pictures(inspection: Inspection, logdir: Path | None = None, svg: Path
             own = safe_name(policy.name).removeprefix(f"{svg.stem}-")
             place = svg.with_name(f"{svg.stem}-{own}{svg.suffix}") if several else svg
             files[place] = picture(policy).encode()
+    for path in files:
+        # What was asked for by its whole path is the user's own link; a name that the source says may be a trap.
+        named = [p for p in (path, path.parent) if p not in (svg, logdir) and (p is path or p.parent == logdir)]
+        link = next((p for p in named if p.is_symlink()), None)
+        if link is not None:
+            raise BundleError(
+                "is a link",
+                where=str(link),
+                why="links in a folder that anyone may have made are not written through",
+                fix="remove it, or name another folder",
+            )
     for path, data in files.items():
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -51,12 +51,12 @@ class Entry:
         return next((c.feeds for c in cases if c.name == case), {})
 
 
-def of_result(result: ExportResult, steps: int) -> Entry | None:
-    """The entry of an export; None where nothing was verified."""
+def of_result(result: ExportResult, steps: int, words: Sequence[str] = ()) -> Entry | None:
+    """The entry of an export; None where nothing was verified. ``words``: options to verify its bundle with."""
     if result.report is None:
         return None
     policy = result.policy
-    return Entry(result.report, policy.signature, policy.graph, result.agreed, steps, _verify(result.folder))
+    return Entry(result.report, policy.signature, policy.graph, result.agreed, steps, (*_verify(result.folder), *words))
 
 
 def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int, words: Sequence[str] = ()) -> Entry:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from converters.tensorboard.events import FILE_NAME
 from exporter.fleet import ledger
 from fixtures import path as fixture
 from tests.commands import export_model
@@ -40,6 +41,22 @@ def test_nothing_is_written_through_it(kind: str, name: str, tmp_path: Path) -> 
     assert ran.status == 2
     assert "Traceback" not in ran.err
     assert kept.read_text() == "kept"
+
+
+@pytest.mark.parametrize("linked", ["continuous", f"continuous/{FILE_NAME}"])
+def test_a_graph_for_tensorboard_is_not_written_through_a_link(linked: str, tmp_path: Path) -> None:
+    kept, logs = tmp_path / "kept", tmp_path / "logs"
+    place = logs / linked
+    place.parent.mkdir(parents=True)
+    if linked.endswith(FILE_NAME):
+        kept.write_text("kept")
+    else:
+        kept.mkdir()
+    place.symlink_to(kept)
+    ran = export_model("inspect", fixture("continuous"), "--logdir", logs)
+    assert ran.status == 2
+    assert f"{place}: is a link" in ran.err
+    assert kept.read_text() == "kept" if kept.is_file() else not list(kept.iterdir())
 
 
 @pytest.mark.parametrize("files", [{"/dev/zero": [0, 0, "-"]}, {"pipe": [0, 0, "-"]}])

@@ -14,7 +14,7 @@ from converters.fetch import Fetched
 from converters.onnx import proto
 from converters.onnx.reader import read_onnx
 from converters.onnx.vetted import contained, vetted
-from signatures.errors import DamagedFileError
+from signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import constant, floats, model, node
 
 W = floats(8, 256).astype(np.float16)
@@ -100,6 +100,34 @@ def test_functions_that_name_one_file_hold_it_once(tmp_path: Path, monkeypatch: 
     (tmp_path / "m.onnx").write_bytes(message.SerializeToString())
     with pytest.raises(DamagedFileError, match="again and again"):
         contained(tmp_path / "m.onnx")
+
+
+@pytest.mark.parametrize("field", ["t", "tensors", "sparse_tensor"])
+def test_a_default_of_a_functions_attribute_names_no_file_elsewhere(field: str, tmp_path: Path) -> None:
+    """onnxruntime 1.20 reads it, wherever it lies; at "*/_ORT_MEM_ADDR_/*" any of its own memory."""
+    message, default = with_default(tmp_path)
+    held = external("w", [2], "../elsewhere.bin", 8)
+    place = getattr(default, field)
+    place.append(held) if field == "tensors" else (place if field == "t" else place.values).CopyFrom(held)
+    (tmp_path / "m.onnx").write_bytes(message.SerializeToString())
+    with pytest.raises(DamagedFileError, match=r"elsewhere\.bin"):
+        contained(tmp_path / "m.onnx")
+
+
+def test_a_default_of_a_functions_attribute_has_no_custom_operator(tmp_path: Path) -> None:
+    message, default = with_default(tmp_path)
+    default.g.node.append(node("Evil", ["obs"], "z", domain="evil.lib"))
+    (tmp_path / "m.onnx").write_bytes(message.SerializeToString())
+    with pytest.raises(UnsupportedOpError, match="evil"):
+        contained(tmp_path / "m.onnx")
+
+
+def with_default(folder: Path) -> tuple[Any, Any]:
+    """A model with a function, and the default of its attribute."""
+    message = model([node("Identity", ["obs"], "action")], IN, ["action"])
+    body = [node("Identity", ["x"], "y")]
+    message.functions.append(helper.make_function("own", "f", ["x"], ["y"], body, [helper.make_opsetid("", 15)]))
+    return message, message.functions[0].attribute_proto.add(name="value", type=4)
 
 
 def test_what_no_reader_knows_is_handed_to_no_runtime(tmp_path: Path) -> None:

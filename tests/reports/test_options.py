@@ -13,6 +13,8 @@ import pytest
 
 from exporter.cli.app import app
 from exporter.cli.console import Console, Progress
+from exporter.cli.options import JUDGING, as_given
+from exporter.cli.verify import verify_command
 from fixtures import path as fixture
 from tests.commands import Ran, export_model, is_refused
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
@@ -47,6 +49,18 @@ def test_all_reports_are_written_whatever_the_verdict(exporting: Exporting, tmp_
     assert int(ET.parse(folder / "j.xml").getroot().get("failures", "")) == (0 if good else 1)
     assert ("PASSED" if good else "FAILED") in (folder / "m.md").read_text(encoding="utf-8")
     assert ("Passed" if good else "What disagrees") in (folder / "h.html").read_text(encoding="utf-8")
+
+
+def test_the_reports_of_an_export_say_how_it_was_judged(exporting: Exporting, tmp_path: Path) -> None:
+    assert exporting("--html", tmp_path / "h.html", "--atol", "0.5", "--max-size", "1GB").status == 0
+    again = (tmp_path / "h.html").read_text(encoding="utf-8").partition("To compare again")[2].partition("</p>")[0]
+    assert "--atol 0.5" in again and "--max-size 1GB" in again
+
+
+def test_an_address_is_told_without_its_password() -> None:
+    secret = "https://user:pw@example.org/x.onnx?signature=s"
+    with verify_command.make_context("verify", ["bundle", "--source", secret]):
+        assert as_given(JUDGING) == ["--source", "https://example.org/x.onnx"]
 
 
 def test_verify_writes_the_same_reports(exporting: Exporting, tmp_path: Path) -> None:
