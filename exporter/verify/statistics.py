@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -122,22 +123,23 @@ def _ahead(a: np.ndarray, b: np.ndarray, atol: float, rtol: float) -> int:
     return int((np.arange(1, a.size + 1) - below).max(initial=0))
 
 
-def dependent(deviations: np.ndarray) -> int:
+def dependent(deviations: Sequence[np.ndarray], largest: float = 3.0) -> int:
     """How many draws apart two are that tell something of each other, 0 where all are independent.
 
-    ``deviations`` [inputs, draws, …] are what was drawn less what is expected. The products of two at a distance are
-    uncorrelated and at most 3, so Bernstein's inequality says how far their sum may be from 0.
+    ``deviations``, of each input [draws, components], are what was drawn less what is expected. The products of two at
+    a distance are uncorrelated and at most ``largest``, so Bernstein's inequality says how far their sum may be from 0.
     """
-    count = deviations.shape[1]
-    flat = deviations.reshape(*deviations.shape[:2], -1)
-    spectrum = np.fft.rfft(flat, 2 * count, axis=1)
-    together = np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=(0, 2)), 2 * count)[:count]
-    covariance = np.einsum("nic,nid->ncd", flat, flat) / max(1, count)
-    pairs = np.arange(count, 0, -1)
-    variance = pairs * float(np.square(covariance).sum())
-    sums = np.abs(together)
+    count = len(deviations[0])
+    together, squares = np.zeros(count), 0.0
+    for each in deviations:
+        spectrum = np.abs(np.fft.rfft(each, 2 * count, axis=0)) ** 2
+        together += np.fft.irfft(spectrum.sum(axis=1), 2 * count)[:count]
+        # the covariance's norm, which is that of the smaller product
+        products = each.T @ each if each.shape[1] < count else each @ each.T
+        squares += float(np.square(products).sum()) / count**2
+    variance, sums = np.arange(count, 0, -1) * squares, np.abs(together)
     with np.errstate(divide="ignore", invalid="ignore"):
-        exponents = np.where(sums > 0, sums**2 / (2 * (variance + sums)), 0.0)
+        exponents = np.where(sums > 0, sums**2 / (2 * (variance + sums * largest / 3)), 0.0)
     wrong = (exponents > math.log(2 * count / FALSE_ALARM)) & (sums > _SHARE * together[0])
     return int(np.flatnonzero(wrong[1:])[0]) + 1 if wrong[1:].any() else 0
 
@@ -147,15 +149,19 @@ def related(reference: np.ndarray, draws: np.ndarray) -> bool:
     if reference.shape[1] < 2 or not np.isfinite(draws).all():
         return False
     count = len(draws)
-    one, other = (np.einsum("ni,nj->ij", r, r) for r in (ranks(reference), ranks(draws)))
+    one, other = (r.T @ r for r in (ranks(reference), ranks(draws)))
     off = np.abs(one - other)
+    np.fill_diagonal(off, 0)  # what a column does alone is another test's
     # a product of two ranks is at most 3, its square 1.8 on average
     exponents = off**2 / (2 * (2 * 1.8 * count + 2 * off))
     return bool((exponents > math.log(off.size / FALSE_ALARM)).any())
 
 
 def ranks(values: np.ndarray) -> np.ndarray:
-    """The place of each value in its column [n, columns], centred, of variance 1 (0 where all are equal)."""
+    """The place of each value in its column [n, columns], centred, of variance 1 (0 where all are equal).
+
+    None is further than √3, as without ties: where an action saturates, the few that do not would outweigh all.
+    """
     made = np.empty(values.shape)
     for column, each in enumerate(values.T):
         _, place, counts = np.unique(each, return_inverse=True, return_counts=True)
@@ -163,4 +169,5 @@ def ranks(values: np.ndarray) -> np.ndarray:
         made[:, column] = middle[place.reshape(-1)]
     made -= made.mean(axis=0)
     spread = made.std(axis=0)
-    return np.asarray(np.divide(made, spread, out=np.zeros_like(made), where=spread > 0))
+    made = np.divide(made, spread, out=np.zeros_like(made), where=spread > 0).clip(-math.sqrt(3), math.sqrt(3))
+    return np.asarray(made - made.mean(axis=0))

@@ -21,7 +21,7 @@ from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify import work
 from exporter.verify.checks.densities import _joint
-from exporter.verify.checks.draws import least_likely, with_zeros
+from exporter.verify.checks.draws import least_likely, repeats, with_zeros
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.report import ParityReport
@@ -274,6 +274,31 @@ def test_numbers_that_hang_on_each_other_are_seen() -> None:
     assert _joint(right, other) is None
     for spoiled in (np.repeat(other[::2], 2, axis=0), np.resize(other[:2048], other.shape), other[:, [0, 0, 2]]):
         assert _joint(right, spoiled) is not None
+
+
+@pytest.mark.parametrize("middles", [(0.2, 6.25), (5.0,), (6.3,), (0.2, 6.3, 6.5, -6.3)])
+def test_saturated_numbers_hang_together_by_chance(middles: Sequence[float]) -> None:
+    """Clipped nearly always, one draw in a thousand is another number; runtimes round the bound as they like."""
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        one, other = ((np.array(middles) + rng.standard_normal((4096, len(middles)))).clip(-3, 3) / 3 for _ in range(2))
+        assert _joint(one, other) is None, seed
+    bound = np.ones((4096, 2))
+    assert _joint(bound, np.nextafter(bound, 0)) is None
+
+
+def test_numbers_that_honestly_share_their_noise_are_independent_draws() -> None:
+    for seed in range(12):
+        one, other = (np.random.default_rng([seed, k]).standard_normal((512, 1)).repeat(8, axis=1) for k in (1, 2))
+        assert _joint(one, other) is None, seed
+
+
+def test_thousands_of_classes_are_told_from_those_that_were_drawn() -> None:
+    rng = np.random.default_rng(5)
+    log_probs = log_softmax(rng.standard_normal((2, 20_000)))
+    classes = drawn(rng, log_probs)[:, :, None]
+    assert repeats(classes, log_probs, (20_000,)) == 0
+    assert repeats(np.repeat(classes[:, ::2], 2, axis=1), log_probs, (20_000,)) == 1
 
 
 @pytest.mark.parametrize("action", [1, 4, 8])

@@ -63,7 +63,7 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
 
 def _joint(reference: np.ndarray, drawn: np.ndarray) -> Difference | None:
     """What is wrong with numbers [draws, columns] together, whatever each is by itself."""
-    if np.isfinite(drawn).all() and (apart := dependent(ranks(drawn).T[:, :, None])):
+    if np.isfinite(drawn).all() and (apart := dependent([ranks(drawn)], 3.0 * drawn.shape[1])):
         return wrong(DEPENDENT.format(apart))
     if related(reference, drawn):
         return wrong("its numbers hang together otherwise than the reference's: one draw serves several")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
@@ -162,10 +163,20 @@ def repeats(drawn: np.ndarray, log_probs: np.ndarray, branches: Sequence[int]) -
     for branch, part in enumerate(parts):
         probs = np.exp(part.astype(np.float64))
         probs /= probs.sum(axis=1, keepdims=True)
-        found = dependent(np.eye(part.shape[1])[drawn[:, :, branch].astype(int)] - probs[:, None])
+        found = dependent([_deviations(d, p) for d, p in zip(drawn[:, :, branch].astype(int), probs, strict=True)])
         if found:
             return found
     return 0
+
+
+def _deviations(drawn: np.ndarray, probs: np.ndarray) -> np.ndarray:
+    """Classes [draws] less what is expected, [draws, components]: a column for each that was drawn, one for all others,
+    which differ from no draw to another. There may be many thousands of these.
+    """
+    classes = np.unique(drawn)
+    rest = max(0.0, float(np.square(probs).sum() - np.square(probs[classes]).sum()))
+    made = (drawn[:, None] == classes) - probs[classes]
+    return np.column_stack([made, np.full(len(drawn), math.sqrt(rest))])
 
 
 def likely(p_value: float) -> Difference:
