@@ -32,7 +32,8 @@ def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[st
     for name, array in (tensors or {}).items():
         dtype, little = _dtypes(array.dtype)
         entries.append({"name": name, "dtype": dtype, "shape": list(array.shape)})
-        parts.append(np.ascontiguousarray(array, little))
+        # As bytes, before the first is sent: numpy shows some dtypes (bfloat16) to no stream.
+        parts.append(np.ascontiguousarray(array, little).reshape(-1).view(np.uint8))
     text = json.dumps({**header, "tensors": entries} if tensors is not None else dict(header)).encode()
     stream.write(struct.pack("<I", len(text)) + text)
     for part in parts:

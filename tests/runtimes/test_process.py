@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import struct
 import subprocess
 from pathlib import Path
 
+import ml_dtypes
 import numpy as np
 import pytest
 
+from converters.runtimes.wire import write_frame
 from tests.runtimes.graph_models import (
     batch,
     info,
@@ -167,3 +170,14 @@ def _only_node(folder: str, names: list[str]) -> list[str]:
     if Path(folder).name == "dist":
         return [name for name in names if not name.endswith(".node.js")]
     return [name for name in names if name not in ("dist", "package.json")]
+
+
+@pytest.mark.parametrize("dtype", ["float16", ">f4", "M8[s]", "bfloat16"])
+def test_a_frame_is_whole_whatever_its_tensors_are(dtype: str) -> None:
+    """What numpy shows to no stream is sent as bytes: half a frame would be read on with the next one's."""
+    kind = np.dtype(ml_dtypes.bfloat16 if dtype == "bfloat16" else dtype)
+    stream = io.BytesIO()
+    write_frame(stream, {"ok": True}, {"x": np.zeros((2, 3), kind), "none": np.zeros(0, kind)})
+    size = stream.tell()
+    (length,) = struct.unpack("<I", stream.getvalue()[:4])
+    assert size == 4 + length + 6 * kind.itemsize
