@@ -90,6 +90,30 @@ def one_hots(*depths: int, column: int = 0) -> Graph:
     )
 
 
+def beside(*parts: tuple[str, int, int], then: Sequence[Node] = (), joined: Sequence[str] = ()) -> Graph:
+    """Columns of one matrix, or what is made of them, side by side."""
+    names = list(joined) or [name for name, _, _ in parts]
+    return graph(
+        *(placeholder("x", (None, 4)), const("axis", 1)),
+        *(n for name, first, last in parts for n in columns(name, "x", first, last)),
+        *then,
+        node("all", "ConcatV2", *names, "axis", N=len(names)),
+        node("y", "Tanh", "all"),
+    )
+
+
+def spread_column() -> Graph:
+    """One column times constants: nothing but these says how wide the parts are."""
+    twos = [const(f"twos{n}", np.full(n, 2, np.float32)) for n in (3, 2)]
+    spread = [node(f"spread{n}", "Mul", "one", f"twos{n}") for n in (3, 2)]
+    return beside(("one", 1, 2), then=[*twos, *spread], joined=["spread3", "spread2"])
+
+
+def sums_of_two_and_of_three() -> Graph:
+    sums = [node("two", "AddN", "a", "b"), node("three", "AddN", "b", "a", "c")]
+    return beside(("a", 0, 2), ("b", 2, 4), ("c", 1, 3), then=sums, joined=["two", "three"])
+
+
 def policy(made: Graph, outputs: Sequence[str], action: str = "action") -> Policy:
     def spec(name: str, values: Array) -> TensorSpec:
         role = Role.LOG_PROBS if name == action else Role.OTHER
@@ -129,6 +153,8 @@ CONSTANTS = {
     "ones": np.ones((4, 1, 1), np.float32),
     "high": f32(1.5).reshape(()),
     "low": f32(-0.5).reshape(()),
+    "hundred": f32(100).reshape(()),
+    "epsilon": f32(1e-6).reshape(()),
 }
 
 
@@ -157,12 +183,18 @@ def arithmetic(steps: str) -> Graph:
         # ---- the last action
         (one_hots(3, 2), ["y"], {"GatherV2": 1, "Equal": 1, "Cast": 1, "ConcatV2": 1}),
         (one_hots(3, 2, column=1), ["y", "hot0"], {"OneHot": 2, "StridedSlice": 2, "ConcatV2": 1}),
+        (one_hots(1000, 1000), ["y"], {"OneHot": 2}),  # constants as long as all classes
+        # ---- what only looks alike
+        (spread_column(), ["y"], {"Mul": 2}),
+        (beside(("a", 0, 2), ("b", 2, 1), ("c", 1, 3)), ["y"], {"StridedSlice": 3}),
+        (sums_of_two_and_of_three(), ["y"], {"AddN": 2}),
         # ---- constants
         (arithmetic("a = Mul x two; y = RealDiv a half"), ["y"], {"Mul": 1, "RealDiv": 0}),
         (arithmetic("a = Sub x row; y = Sub a two"), ["y"], {"Add": 1, "Sub": 0}),
         (arithmetic("a = Mul two x; y = RealDiv two a"), ["y"], {"Mul": 1, "RealDiv": 1}),
         (arithmetic("a = Mul x two; y = Mul a half"), ["y", "a"], {"Mul": 2}),
         (arithmetic("a = Add x magic; y = Sub a magic"), ["y"], {"Add": 1, "Sub": 1}),  # it rounds
+        (arithmetic("a = Sub x hundred; y = Add a epsilon"), ["y"], {"Sub": 1, "Add": 1}),  # a logarithm's, maybe
         (arithmetic("a = Mul x one; b = Add a zero; y = Add b z"), ["y"], {"Mul": 0, "Add": 1}),
         (arithmetic("a = Mul x ones; y = Add a z"), ["y"], {"Mul": 1, "Add": 1}),  # it repeats
         # ---- the same twice
@@ -180,6 +212,28 @@ def test_fewer_ops_give_the_same(before: Graph, outputs: Sequence[str], expected
     wanted, found = (run_graph(g, feeds(before), outputs) for g in (before, made))
     for name in outputs:
         np.testing.assert_allclose(found[name], wanted[name], rtol=2e-6, atol=1e-6, strict=True)
+
+
+@pytest.mark.parametrize("kind", ["deep", "doubling"])
+def test_what_a_stranger_piled_up_takes_no_time_and_no_stack(kind: str) -> None:
+    """Chains longer than Python's stack; tensors joined with themselves and cut again, 2³⁰ ways to their source."""
+    nodes, ends = [const("over", np.array([1], np.int32))], []
+    for side in ("a", "b"):
+        at, count = f"{side}/t0", 400 if kind == "deep" else 30
+        nodes.append(node(at, "Softmax", side))
+        for i in range(1, count):
+            before, at = at, f"{side}/t{i}"
+            if kind == "deep":
+                nodes.append(node(at, "Tanh", before))
+            else:
+                twice = f"{side}/twice{i}"
+                nodes += [node(twice, "ConcatV2", before, before, "axis", N=2), *columns(at, twice, 1, 3)]
+        whole, share = f"{side}/whole", f"{side}/share"
+        nodes += [node(whole, "Sum", at, "over", keep_dims=True), node(share, "RealDiv", at, whole)]
+        ends.append(share)
+    made = beside(("a", 0, 2), ("b", 2, 4), then=nodes, joined=ends)
+    wanted, found = (run_graph(g, feeds(made), ["y"]) for g in (made, leaned(policy(made, ["y"]))))
+    np.testing.assert_allclose(found["y"], wanted["y"], rtol=2e-6, atol=1e-6)
 
 
 def test_a_product_with_zeros_spreads_nothing_that_is_no_number() -> None:

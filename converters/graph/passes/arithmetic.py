@@ -20,6 +20,8 @@ from converters.graph.types import FLOAT32
 _SMALL = 1 << 12
 #: What two summands may cancel of each other: whoever adds 2²³ and takes it away again wants the rounding.
 _CANCELLED = 8
+#: How much of the smaller one may be lost: where a tensor takes the larger away again, a logarithm hangs on the rest.
+_LOST = 2.0**-20
 
 
 def share(graph: Graph, roots: Iterable[str]) -> Graph:
@@ -64,7 +66,8 @@ def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
                 value, number = before[1], merged
         chains[node.name] = (kind, value, number)
         neutral = bool((number == (1 if kind == "Mul" else 0)).all())
-        if neutral and types[value].shape == types[node.name].shape and node.name not in outputs:
+        shape = types[value].shape
+        if neutral and shape is not None and shape == types[node.name].shape and node.name not in outputs:
             editor.redirect(node.name, editor.resolve(value))
         elif value == found[1]:
             editor.keep(node)
@@ -125,5 +128,7 @@ def _merged(kind: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | No
         limits = np.finfo(FLOAT32)
         fine = (size == 0) | ((size > limits.tiny) & (size < limits.max))
     else:
+        least = np.minimum(np.abs(first), np.abs(second))
         fine = size * _CANCELLED >= np.maximum(np.abs(first), np.abs(second))
+        fine &= np.abs(made.astype(FLOAT32) - made) <= least * _LOST
     return made if bool(fine.all()) else None

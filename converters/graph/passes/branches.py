@@ -23,7 +23,11 @@ from converters.graph.types import FLOAT32, INT32
 #: Columns of all parts together, for sums of parts: they are a product with as many rows.
 _MOST_SUMMED = 64
 #: Ops between a sum and what is known to be finite.
-_DEEPEST = 8
+_FURTHEST = 8
+#: Ops on top of one another that are joined; concatenations that are tried.
+_DEEPEST, _MOST_TRIED = 40, 64
+#: Classes of all one hots together.
+_MOST_HOT = 1 << 10
 #: Elements of the weights that are copied into one matrix.
 _MOST_WEIGHTS = 1 << 16
 
@@ -34,12 +38,23 @@ def join_branches(graph: Graph, roots: Iterable[str], actions: Collection[str]) 
     ``actions`` are those of ``roots`` that are joined of branches.
     """
     outputs = frozenset(node_of(r) for r in roots)
+    tried, depths = 0, _depths(graph)
     for name in [n.name for n in reversed(graph.nodes) if n.op == "ConcatV2" and len(n.inputs) > 2]:
-        if name in graph:  # an earlier one may have swallowed it
-            made = _Joining(graph, outputs).made(graph[name], name in actions)
-            if made is not None and _size(made) < _size(graph):
-                graph = made
+        # An earlier one may have swallowed it; a policy has a handful.
+        if name not in graph or tried == _MOST_TRIED or not _is_alike(graph, graph[name], depths):
+            continue
+        tried += 1
+        made = _Joining(graph, outputs, depths).made(graph[name], name in actions)
+        if made is not None and _size(made) < _size(graph):
+            graph, depths = made, _depths(made)
     return _flat(graph, outputs)
+
+
+def _is_alike(graph: Graph, root: Node, depths: Mapping[str, int]) -> bool:
+    """Whether the parts of a concatenation may have anything in common."""
+    nodes = [graph.producer(r) for r in root.inputs[:-1]]
+    same = {n.op for n in nodes} == {nodes[0].op}
+    return same and (nodes[0].op == "StridedSlice" or len({depths[n.name] for n in nodes}) == 1)
 
 
 def _size(graph: Graph) -> int:
@@ -76,15 +91,17 @@ def _pruned(graph: Graph, outputs: Iterable[str]) -> Graph:
 class _Joining:
     """One concatenation along the last axis, and what it is made of."""
 
-    def __init__(self, graph: Graph, outputs: frozenset[str]) -> None:
+    def __init__(self, graph: Graph, outputs: frozenset[str], depths: Mapping[str, int]) -> None:
         self.graph, self.outputs = graph, outputs
         self.types: Types = infer_types(graph)
         self.editor = Editor(graph)
-        self.depths = _depths(graph)
+        self.depths, self.level = depths, 0
         #: parts that are computed together → the tensor in which they lie side by side
         self.groups: dict[tuple[str, ...], str] = {}
         #: parts that are put side by side, sums that are a product → the same
         self.made_of: dict[tuple[str, ...], str] = {}
+        #: parts that have nothing in common
+        self.apart: set[tuple[str, ...]] = set()
 
     def made(self, root: Node, action: bool) -> Graph | None:
         """The graph, if there is anything to join."""
@@ -99,8 +116,11 @@ class _Joining:
         for node in self.graph.nodes:
             if action or node.name != root.name:
                 self.editor.keep(node)
+        swallowed = {node_of(r) for group in (*self.groups, *self.made_of) for r in group}
+        swallowed |= set() if action else {root.name}
+        readers = self.graph.consumers()
         for group, value in list(self.groups.items()):
-            self._hand_out(group, value, "" if action else root.name)
+            self._hand_out(group, value, [r for part in group for r in readers[node_of(part)]], swallowed)
         return _pruned(self.editor.graph(), self.outputs)
 
     def _instead(self, root: Node, parts: tuple[str, ...]) -> bool:
@@ -124,16 +144,14 @@ class _Joining:
             return False
         return self._together(given) is not None
 
-    def _hand_out(self, group: tuple[str, ...], value: str, root: str) -> None:
+    def _hand_out(
+        self, group: tuple[str, ...], value: str, readers: Sequence[Node], swallowed: Collection[str]
+    ) -> None:
         """Let what reads one part of a group read a piece of the whole."""
-        swallowed = {node_of(r) for g in (*self.groups, *self.made_of) for r in g} | {root}
-        readers = self.graph.consumers()
-        if all(reader.name in swallowed for r in group for reader in readers[node_of(r)]):
+        if all(reader.name in swallowed for reader in readers):
             return
         # Grappler (TensorFlow 2.21) pulls ops of one operand out of a SplitV, and then finds another ArgMax.
-        alone = any(
-            op_of(reader).elementwise and len(reader.inputs) == 1 for r in group for reader in readers[node_of(r)]
-        )
+        alone = any(op_of(reader).elementwise and len(reader.inputs) == 1 for reader in readers)
         widths = [self._width(r) or 0 for r in group]
         if not alone:
             sizes = self.editor.const(np.array(widths, INT32), f"{value}/sizes")
@@ -166,14 +184,24 @@ class _Joining:
 
     def _together(self, parts: tuple[str, ...]) -> str | None:
         """The same without a ConcatV2; None where the parts have nothing in common."""
-        if parts in self.groups:
-            return self.groups[parts]
+        if parts in self.groups or parts in self.apart or self.level == _DEEPEST:
+            return self.groups.get(parts)
+        self.level += 1
+        made = self._found(parts)
+        self.level -= 1
+        if made is None:
+            self.apart.add(parts)
+        return made
+
+    def _found(self, parts: tuple[str, ...]) -> str | None:
         whole = self._cut_from(parts)
         if whole is not None:
             return whole
         nodes = [self.graph.producer(r) for r in parts]
         first = nodes[0]
-        if any(n.op != first.op or n.attrs != first.attrs or n.name in self.outputs for n in nodes):
+        if any(n.op != first.op or n.attrs != first.attrs or len(n.inputs) != len(first.inputs) for n in nodes):
+            return None
+        if any(n.name in self.outputs for n in nodes):
             return None
         # What is as deep in the graph as another does not depend on it, nor does what is made of both on either.
         if len({self.depths[n.name] for n in nodes}) > 1 or any(split_ref(r)[1] for r in parts):
@@ -216,9 +244,13 @@ class _Joining:
         entry = op_of(first)
         if not entry.elementwise or self.types[first.name].dtype != FLOAT32:
             return None
+        columns = [[n.inputs[position] for n in nodes] for position in range(len(first.inputs))]
+        shapes = [self.types[p].shape for p in parts]
+        if not any([self.types[r].shape for r in given] == shapes for given in columns):
+            return None  # a column that constants spread
         operands = []
-        for position in range(len(first.inputs)):
-            found = self._operand(parts, [n.inputs[position] for n in nodes], bool(entry.activation))
+        for given in columns:
+            found = self._operand(parts, given, bool(entry.activation))
             if found is None:
                 return None
             operands.append(found)
@@ -248,7 +280,7 @@ class _Joining:
                 return None
             rows.append(np.broadcast_to(value.reshape(-1), [self._width(part) or 0]))
         row = np.concatenate(rows)
-        same = bool((row == row[0]).all())
+        same = bool(row.size and (row == row[0]).all())
         return self.editor.const(row[0] if same else row, f"{node_of(given[0])}/joined")
 
     def _sums(self, parts: Sequence[str], given: Sequence[str]) -> str | None:
@@ -279,7 +311,7 @@ class _Joining:
             return bool(np.isfinite(node.value).all())
         if entry.finite == "always" or entry.start == "fed":
             return True
-        if depth == _DEEPEST or not (entry.moves or entry.finite):
+        if depth == _FURTHEST or not (entry.moves or entry.finite):
             return False
         return all(self._is_number(r, depth + 1) for r in (entry.moved(node.inputs) if entry.moves else node.inputs))
 
@@ -293,12 +325,16 @@ class _Joining:
             if found is None or node.name in self.outputs:
                 return None
             source, column, depth = found
+            if len(classes) + depth > _MOST_HOT:
+                return None
             sources.add(source)
             columns += [column] * depth
             classes += range(depth)
         if len(sources) > 1 or len({self.depths[n.name] for n in nodes}) > 1:
             return None
         (source,) = sources
+        if max(classes, default=0) > np.iinfo(self.types[source].dtype).max:
+            return None
         editor, name = self.editor, nodes[0].name
         axis = editor.const(np.array(1, INT32), f"{name}/axis")
         indices = editor.const(np.array(columns, INT32), f"{name}/columns")

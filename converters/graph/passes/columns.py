@@ -75,4 +75,4 @@ def _slice(graph: Graph, types: Types, node: Node, axis: int) -> tuple[int, int,
     if steps[at][0] != "slice" or steps[at][3] != 1 or not isinstance(whole, int):
         return None
     first, last, _ = slice(*steps[at][1:]).indices(whole)
-    return at, first, last
+    return at, first, max(first, last)
