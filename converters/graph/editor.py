@@ -10,6 +10,8 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, topological
+from converters.graph.ops.base import Shape
+from converters.graph.shapes import infer_types
 
 
 class Editor(Builder):
@@ -38,6 +40,17 @@ class Editor(Builder):
     def producer(self, reference: str) -> Node:
         """The node of the old graph that makes a tensor."""
         return self._old.producer(reference)
+
+    def shape_of(self, reference: str) -> Shape:
+        """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
+        made = self.resolve(reference)
+        sofar = Graph(tuple(self._fed(n) for n in self.nodes))
+        try:
+            upstream = sofar.pruned([made])
+        except KeyError:  # in a loop: what comes round is made later
+            return None
+        kind = infer_types(upstream, partial=True).get(made)
+        return None if kind is None else kind.shape
 
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""

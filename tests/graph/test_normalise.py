@@ -316,6 +316,45 @@ def test_statistics_of_a_batch_are_told_from_those_of_a_row() -> None:
         normalised(layer_norm(scale=2.0)[0])
 
 
+def rows_as_channels(turned: bool) -> list[Any]:
+    """The image [1, rows, n, 1] of x [B, 2], whose lengths are computed; or [1, n, rows, 1] of x turned round."""
+    zero, one = constant("zero", [0]), constant("next", [1])
+    return [
+        placeholder("x", (None, 2)),
+        *(zero, one, constant("past", [2]), constant("one", 1), constant("order", [1, 0])),
+        *(constant("empty", np.zeros(0, F32)), constant("f1", 1.0), constant("f0", 0.0)),
+        node("turned", "Transpose", "x", "order", T=F32, Tperm=np.int32),
+        node("lengths", "Shape", "x", T=F32, out_type=np.int32),
+        *(node(n, "StridedSlice", "lengths", a, b, "next", T=np.int32, Index=np.int32, shrink_axis_mask=1)
+          for n, a, b in (("rows", "zero", "next"), ("n", "next", "past"))),
+        node("shape", "Pack", "one", *(("n", "rows") if turned else ("rows", "n")), "one", T=np.int32, N=4, axis=0),
+        node("image", "Reshape", "turned" if turned else "x", "shape", T=F32, Tshape=np.int32),
+        node("count", "Pack", "n" if turned else "rows", T=np.int32, N=1, axis=0),
+        *(node(n, "Fill", "count", v, T=F32, index_type=np.int32) for n, v in (("scale", "f1"), ("offset", "f0"))),
+        node("y", "FusedBatchNormV3", "image", "scale", "offset", "empty", "empty", T=F32, U=F32, epsilon=0.001,
+             data_format="NCHW", is_training=True, exponential_avg_factor=1.0),
+    ]  # fmt: skip
+
+
+def test_agents_are_told_from_what_a_row_has() -> None:
+    x = floats(5, 2)
+    made = run_graph(normalised(rows_as_channels(turned=False)), {"x": x}, ["out"])["out"]
+    centred = x - x.mean(1, keepdims=True)
+    expected = centred / np.sqrt(x.var(1, keepdims=True) + 0.001)
+    np.testing.assert_allclose(made, expected[None, :, :, None], 1e-5, 1e-6)
+    with pytest.raises(UnsupportedOpError, match="in training mode"):
+        normalised(rows_as_channels(turned=True))
+
+
+def test_channels_that_mix_agents_are_no_rows() -> None:
+    nodes = rows_as_channels(turned=False)
+    mixed = [
+        node("image", "Reshape", "turned", "shape", T=F32, Tshape=np.int32) if n.name == "image" else n for n in nodes
+    ]
+    with pytest.raises(UnsupportedOpError, match="in training mode"):
+        normalised(mixed)
+
+
 def test_all_unknown_ops_are_named() -> None:
     nodes = [placeholder("x"), node("a", "Cholesky", "x"), node("b", "Lu", "a"), node("y", "Neg", "b", T=F32)]
     with pytest.raises(UnsupportedOpError, match=r"Cholesky \(node 'a'\), Lu \(node 'b'\)") as caught:

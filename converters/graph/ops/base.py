@@ -91,6 +91,10 @@ class GraphBuilder(NodeBuilder, Protocol):
         """The node of the old graph that makes a tensor."""
         ...
 
+    def shape_of(self, reference: str) -> Shape:
+        """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
+        ...
+
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
         ...

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from converters.graph.nodes import Node, TensorShape, normal_ref, ref
@@ -118,7 +120,23 @@ def _is_layer_norm(builder: GraphBuilder, node: Node) -> bool:
         *((fill.inputs[1], value) for fill, value in ((scale, 1), (offset, 0)) if fill.op == "Fill"),
     ]
     constants = [(builder.constant_of(normal_ref(r)), value) for r, value in known]
-    return len(known) == 4 and all(c is not None and c.size == 1 and c.item() == value for c, value in constants)
+    ones = len(known) == 4 and all(c is not None and c.size == 1 and c.item() == value for c, value in constants)
+    return ones and _channels_are_rows(builder, normal_ref(node.inputs[0]), normal_ref(image.inputs[0]))
+
+
+def _channels_are_rows(builder: GraphBuilder, image: str, tensor: str) -> bool:
+    """Whether an image [1, B, n, 1] of a tensor has no numbers of two agents in one channel: n is a number, and what
+    lies behind the axis of the agents (the last that is free) is one such row, or several. [1, n, B, 1] of the tensor
+    turned round is a batch norm over the agents.
+    """
+    shown, dims = builder.shape_of(image), builder.shape_of(tensor)
+    if shown is None or dims is None or len(shown) != 4 or not isinstance(shown[2], int):
+        return False
+    free = [i for i, d in enumerate(dims) if isinstance(d, str)]
+    if not free:
+        return True  # made for one agent, or so many that only a trial tells (passes/any_number.py)
+    behind = math.prod(d for d in dims[free[-1] + 1 :] if isinstance(d, int))
+    return shown[2] > 0 and behind % shown[2] == 0
 
 
 def _layer_norm(builder: GraphBuilder, node: Node) -> str:
