@@ -186,8 +186,9 @@ def dims_of(value: Any) -> Dims:
 
 
 def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) -> SignatureError | None:
-    """The error that names the first output which is wrong for more rows than one, draws left out; ``said``: the file
-    says that it takes one row, so that one too large to be tried is believed. Else SignatureError is raised for it.
+    """The error that names the first output which is wrong for more rows than one, or draw that they share; ``said``:
+    the file says that it takes one row, so that one too large to be tried is believed. Else SignatureError is raised
+    for it.
     """
     if too_large(importer.graph()):
         if said:

@@ -280,9 +280,11 @@ def _joined(count: int, rest: Sequence[int]) -> list[Dim]:
 
 
 def _draw(rows: Rows, node: Node) -> str:
+    """A first axis of 1 is that of the agents: what the file draws is then what each agent's row of the draw is."""
     dims = [int(d) for d in rows.constant(node, 0)]
-    shape = rows.b.vector((BATCH, *dims))
-    return rows.b.add(node.op, [shape], origin=node.origin, **_attrs(node))
+    own = dims[1:] if len(dims) > 1 and dims[0] == 1 else dims
+    drawn = rows.b.add(node.op, [rows.b.vector((BATCH, *own))], origin=node.origin, **_attrs(node))
+    return drawn if own is dims else rows.b.reshape(drawn, (BATCH, *dims))
 
 
 def _multinomial(rows: Rows, node: Node) -> str:

@@ -82,4 +82,5 @@ def _turned(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) ->
     if len(rows) == 1 and rows == first != {1}:
         return None  # several agents, which change one another
     ends = {o: 0 for o in outputs if len(shape := types[o].shape or ()) > 1 and shape[0] == 1}
-    return for_every_row(graph, outputs, dict.fromkeys(inputs, 0 if rows == {1} else None), ends), 1
+    agents = {name: 0 if rows == {1} and dims[:1] == (1,) else None for name, dims in inputs.items()}
+    return for_every_row(graph, outputs, agents, ends), 1
