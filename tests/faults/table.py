@@ -103,6 +103,8 @@ def _rename(old: str, new: str) -> Callable[[Artefact], None]:
 
 
 _FED = dict.fromkeys(("saved_model", "tfjs"), (("state",), "Placeholder"))
+#: All branches are masked at once, whose logarithm is the first that these have of the source.
+_MASKED = dict.fromkeys(("tfjs", "onnx"), (("Log",), "Log"))
 _MASKS = ("strided_slice_3", "strided_slice_4", "strided_slice_5")
 
 FAULTS = (
@@ -131,8 +133,16 @@ FAULTS = (
         "",
         elsewhere=_FED,
     ),
-    Fault("a mask that forbids", "discrete", _forbids, "action", _MASKS, "StridedSlice"),
-    Fault("a mask with its branches turned", "discrete", _branches_turned, "action", _MASKS, "StridedSlice"),
+    Fault("a mask that forbids", "discrete", _forbids, "action", _MASKS, "StridedSlice", elsewhere=_MASKED),
+    Fault(
+        "a mask with its branches turned",
+        "discrete",
+        _branches_turned,
+        "action",
+        _MASKS,
+        "StridedSlice",
+        elsewhere=_MASKED,
+    ),
     Fault(
         "an output dropped",
         "continuous",

@@ -279,8 +279,9 @@ def _nn_parts(data: bytes) -> list[tuple[str, bytes]]:
         def _take(self, count: int) -> bytes:
             return bytes(self._whole("bytes", lambda: super(Cutting, self)._take(count)))
 
-        def _integer(self, form: str) -> int:
-            return int(self._whole(form, lambda: super(Cutting, self)._integer(form)))
+        def _integer(self, *form: struct.Struct) -> int:
+            kind = form[0].format if form else "<i"
+            return int(self._whole(kind, lambda: super(Cutting, self)._integer(*form)))
 
         def _text(self) -> str:
             return str(self._whole("text", super()._text))

@@ -98,7 +98,7 @@ def test_a_page_shows_all_that_is_known_of_a_policy(recurrent: tuple[Entry, Path
     parsed = Page(source)
     is_self_contained(source, parsed)
     for words in (
-        *("What disagrees", "Agreement", "How the differences are distributed", "Memory", "The policy", "Worst inputs"),
+        *("What disagrees", "Agreement", "How differences are distributed", "Memory", "The policy", "Worst inputs"),
         *("Tolerances", "Runtimes", "Sizes", "LSTM 16", "dense 32, swish", "recurrent_out differs by 0.001"),
         *("First difference:", "Smallest tolerance that would pass", "onnx in onnxruntime", "discrete, 3 + 2"),
     ):

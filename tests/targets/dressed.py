@@ -19,6 +19,7 @@ from converters.format import WriteOptions
 from converters.formats import written
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
+from converters.onnx import messages
 from converters.onnx.edit import lifted
 from converters.policy import Policy
 from converters.source import ReadOptions
@@ -144,7 +145,10 @@ class Pair:
     def _run_made(self) -> Callable[[Mapping[str, Any]], Feeds]:
         """What was made, with its one draw as an input where the policy has noise, and with what is drawn from."""
         fed = len(self._draws) == 1 and len(self.policy.signature.noise) == 1
-        model = lifted(_copied(self.made), self._draws) if fed else _copied(self.made)
+        model = _copied(self.made)
+        if fed:
+            own = lifted(messages.ModelProto.FromString(model.SerializeToString()), self._draws)
+            model = onnx.ModelProto.FromString(own.SerializeToString())
         known = {o.name for o in model.graph.output}
         inner = (n for n in dict.fromkeys(self._scores) if n not in known)
         model.graph.output.extend(onnx.ValueInfoProto(name=n) for n in inner)
