@@ -28,7 +28,7 @@ from exporter.cli.verify import verify_command
     expose_value=False,
     is_eager=True,
     callback=show_version,
-    help="Show the version, and the runtimes that are here.",
+    help="Show the version and the installed runtimes.",
 )
 def app() -> None:
     """The group; its commands do the work."""

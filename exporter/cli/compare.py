@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @click.command(
     "compare",
     cls=Command,
-    short_help="Compare files that any tool made with a reference.",
+    short_help="Compare files made by any tool with a reference.",
     examples=(
         ("export-model compare 3DBall.bytes theirs.onnx", ""),
         ("export-model compare 3DBall.bytes tfjs --map action=Identity", ""),
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 )
 @click.argument("reference", type=click.Path(path_type=Path))
 @click.argument("candidates", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CANDIDATE...")
-@click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call a name.")
+@click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
 @trusting
 @click.option(
     "--runtimes", default="auto", show_default=True, metavar="WHERE", help="auto, full, browser, or runtimes by name."
 )
-@click.option("--allow-unverified", is_flag=True, help="Succeed although no runtime of theirs is installed.")
+@click.option("--allow-unverified", is_flag=True, help="Succeed even if none of their runtimes is installed.")
 @reporting
 @understanding
 @comparing
@@ -49,7 +49,7 @@ def compare_command(
     console: Console,
     options: VerifyOptions,
 ) -> None:
-    """Compare files that any tool made with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    """Compare files made by any tool with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
     from converters.fetch import shown
     from converters.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts

@@ -252,8 +252,8 @@ def reporting(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--markdown", type=file, metavar="FILE", help="Write a Markdown summary; '-' is stdout."),
         click.option("--html", type=file, metavar="FILE", help="Write one page with tables and pictures."),
         click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
-        click.option("-q", "--quiet", is_flag=True, help="Say only what disagrees."),
-        click.option("-v", "--verbose", is_flag=True, help="Say every step and every comparison."),
+        click.option("-q", "--quiet", is_flag=True, help="Print only what disagrees."),
+        click.option("-v", "--verbose", is_flag=True, help="Print every step and every comparison."),
     ):
         collected = option(collected)
     return collected

@@ -26,9 +26,9 @@ from exporter.cli.terminal import say
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder for it all."
 )
-@click.option("--no-open", is_flag=True, help="Open nothing; end when all is written.")
+@click.option("--no-open", is_flag=True, help="Do not open the page; exit once everything is written.")
 def demo_command(out: Path, no_open: bool) -> None:
-    """Export a trained 3DBall that comes with the package, compare the formats in the runtimes that are here, and open
+    """Export a trained 3DBall that comes with the package, compare the formats in the installed runtimes, and open
     the page on which it acts.
     """
     from converters.bundle.bundle import writing

@@ -75,9 +75,9 @@ if TYPE_CHECKING:
     type=click.Choice(["float32", "float16"]),
     default="float32",
     show_default=True,
-    help="What weights are kept in.",
+    help="The type that weights are stored in.",
 )
-@click.option("--quantize", type=click.Choice(["int8"]), help="Keep weights in a byte each.")
+@click.option("--quantize", type=click.Choice(["int8"]), help="Store each weight in one byte.")
 @click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @click.option(
@@ -90,8 +90,8 @@ if TYPE_CHECKING:
 )
 @click.option("--jobs", type=int, metavar="N", help="Export N sources at a time (default: 1).")
 @click.option("--cluster", metavar="ADDRESS", help="Export on the workers of a Dask cluster.")
-@click.option("--again", is_flag=True, help="Of many sources, export the unchanged ones too.")
-@click.option("--fail-fast", is_flag=True, help="Of many sources, stop at the first that fails.")
+@click.option("--again", is_flag=True, help="With many sources, export unchanged ones too.")
+@click.option("--fail-fast", is_flag=True, help="With many sources, stop at the first failure.")
 @reporting
 @understanding
 @comparing
@@ -118,9 +118,9 @@ def export_command(
     console: Console,
     options: VerifyOptions,
 ) -> None:
-    """Export policies, and compare what was written in the runtimes that are here.
+    """Export policies, and compare what was written in the installed runtimes.
 
-    This is the command that is meant where none is named.
+    This is the default command: 'export-model SOURCE' runs it.
     """
     from converters.fetch import address_of
     from exporter.export.options import ExportOptions, storage

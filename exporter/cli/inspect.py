@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.command(
     "inspect",
     cls=Command,
-    short_help="Show what is in a file, or what Unity would say to it.",
+    short_help="Show what is in a file, or what Unity would say about it.",
     examples=(
         ("export-model inspect 3DBall.nn", "inputs, outputs, layers"),
         ("export-model inspect 3DBall.onnx --unity all", "what ML-Agents says to it"),
@@ -43,7 +43,11 @@ if TYPE_CHECKING:
 @click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
 @activating
 @click.option(
-    "--unity", "releases", multiple=True, metavar="RELEASE", help="What Unity says to it: R20, R22, R23, R23-2.4, all."
+    "--unity",
+    "releases",
+    multiple=True,
+    metavar="RELEASE",
+    help="What Unity says about it: R20, R22, R23, R23-2.4, all.",
 )
 @click.option("--actions", default="", metavar="KINDS", help="With --unity: continuous:2, discrete:3,2, or both by +.")
 @click.option(
@@ -69,7 +73,7 @@ def inspect_command(
 ) -> None:
     """Show what is in a file: generation, brains, inputs and what to feed, outputs, layers, targets.
 
-    With --unity, what ML-Agents in Unity says to it instead: the status is 1 where a release does not accept it.
+    With --unity, what ML-Agents in Unity says about it instead; the status is 1 if a release does not accept it.
     """
     from converters.fetch import shown
     from converters.graph.options import CompileOptions

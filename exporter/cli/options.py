@@ -101,7 +101,7 @@ def read_options(step: int | None, sensors: str, trust_source: bool, activation:
 
 def activating(command: Callable[..., Any]) -> Callable[..., Any]:
     """The option for files that have the weights of layers and not what stands between them."""
-    said = "What stands between the layers of a bare .pt: elu, tanh, …"
+    said = "Activation between the layers of a bare .pt: elu, tanh, …"
     return click.option("--activation", metavar="NAME", help=said)(command)
 
 
@@ -118,7 +118,7 @@ def _numbers(values: Sequence[str]) -> dict[str, float]:
 
 def trusting(command: Callable[..., Any]) -> Callable[..., Any]:
     """The option for sources that only a loader of their own can read, which runs what they say."""
-    said = "Let Keras load what is not read as data; it can run code."
+    said = "Let Keras load what is no plain data; this can run code."
     return click.option("--trust-source", is_flag=True, help=said)(command)
 
 

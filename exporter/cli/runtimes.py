@@ -20,7 +20,7 @@ _SAID = {
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def runtimes_command(ctx: click.Context, as_json: bool) -> None:
-    """Which runtimes are here, in which version, and how to install the others."""
+    """List the installed runtimes with their versions, and how to install the others."""
     if ctx.invoked_subcommand is not None:
         return
     from converters.runtimes.confinement import in_force

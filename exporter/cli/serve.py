@@ -41,7 +41,7 @@ _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "non
     type=click.Choice(_SCENES),
     default="auto",
     show_default=True,
-    help="The environment; auto goes by name, sizes and actions.",
+    help="The environment; auto chooses by name, sizes and actions.",
 )
 def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | None, scene: str) -> None:
     """A page where the policy acts in your browser: its environment if it is a known one, else a panel of sliders."""

@@ -22,7 +22,7 @@ from signatures.errors import UsageError
     ),
 )
 @click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE")
-@click.option("--for", "target", metavar="NAME", help="Only this one (or all that begin so), ready to be piped.")
+@click.option("--for", "target", metavar="NAME", help="Only this one (or all that start with it), ready to pipe.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
     """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""

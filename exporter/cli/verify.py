@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 @click.option(
     "--runtimes", default="auto", show_default=True, metavar="WHERE", help="auto, full, browser, or runtimes by name."
 )
-@click.option("--allow-unverified", is_flag=True, help="Succeed although no independent runtime is installed.")
+@click.option("--allow-unverified", is_flag=True, help="Succeed even if no independent runtime is installed.")
 @reporting
 @comparing
 def verify_command(
@@ -52,7 +52,7 @@ def verify_command(
 ) -> None:
     """Verify bundles again: hashes first, then every format in the runtimes.
 
-    A folder of bundles stands for all of them.
+    Given a folder of bundles, it verifies all of them.
     """
     from converters.bundle.bundle import bundles_in
     from exporter.export.again import verify_folder
