@@ -179,12 +179,15 @@ class Console:
             ]
             self.json({"profiles": entries})
             return
+        from exporter.tables import paragraph
+
         width = max(len(p.name) for p in PROFILES)
+        indent = " " * (width + 2)
         for profile in PROFILES:
-            say(f"{profile.name:{width}}  {profile.purpose}")
+            say_lines(paragraph(profile.purpose, f"{profile.name:{width}}  ", indent))
             details = [f"writes {', '.join(profile.formats)}"]
             details += [f"also called {', '.join(profile.aliases)}"] if profile.aliases else []
-            say(f"{'':{width}}  {'; '.join(details)}")
+            say_lines(paragraph("; ".join(details), indent, indent))
 
     def next_step(self, results: Sequence[ExportResult], names: str, profile: str | None = None) -> None:
         """What to do next, in a line or two."""
@@ -205,7 +208,10 @@ class Console:
             say(f"next: {typed('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
-            say("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
+            from exporter.tables import paragraph
+
+            note = "note: Unity looks up other names: export with --for unity6 (--for help: the others)"
+            say_lines(paragraph(note, rest="  "))
         say(f"next: {_next(results)}")
 
     def json(self, content: Mapping[str, Any]) -> None:
