@@ -84,6 +84,7 @@ WRITES = 6
 
 
 def exported(out: Path, *flags: str) -> Ran:
+    exchange._next_look.clear()  # as in a process of its own: one that just looked through the folder rests
     return export_model(fixture("continuous"), "-o", out, "--verify", "none", *flags)
 
 
