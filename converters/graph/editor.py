@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import operator
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
+from converters.graph.allowance import Allowance
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.base import Shape
-from converters.graph.shapes import infer_types
+from converters.graph.ops.table import is_fed
+from converters.graph.shapes import add_types
+from converters.graph.types import Symbols, TensorType
+from signatures.errors import ExportModelError
 
 
 class Editor(Builder):
     """A builder whose names keep off an old graph's; tensors of that may be redirected on the way.
 
-    It knows no types: the ops of a graph that is not normalised yet need not be in the op table.
+    It knows types only where it is asked: the ops of a graph that is not normalised yet need not be in the op table.
     """
 
     typed = False
@@ -26,6 +31,9 @@ class Editor(Builder):
         super().__init__(NameScope(n.name for n in graph.nodes))
         self._old = graph
         self._redirected: dict[str, str] = {}
+        #: Of how many of the new nodes the shapes were asked for, and what is known of them.
+        self._told, self._shapes = 0, dict[str, TensorType]()
+        self._symbols, self._allowance = Symbols(), Allowance()
 
     def resolve(self, reference: str) -> str:
         """Where a tensor of the old graph is now."""
@@ -43,13 +51,12 @@ class Editor(Builder):
 
     def shape_of(self, reference: str) -> Shape:
         """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
-        made = self.resolve(reference)
-        sofar = Graph(tuple(self._fed(n) for n in self.nodes))
-        try:
-            upstream = sofar.pruned([made])
-        except KeyError:  # in a loop: what comes round is made later
-            return None
-        kind = infer_types(upstream, partial=True).get(made)
+        while self._told < len(self.nodes):
+            node = self._fed(self.nodes[self._told])
+            self._told += 1
+            with contextlib.suppress(ExportModelError, KeyError):  # of a loop, or of what nothing may need: not known
+                add_types(self._shapes, node, self._symbols, self._allowance)
+        kind = self._shapes.get(self.resolve(reference))
         return None if kind is None else kind.shape
 
     def redirect(self, reference: str, to: str) -> None:
@@ -87,6 +94,11 @@ class Editor(Builder):
     def replace_const(self, name: str, array: np.ndarray, origin: str | tuple[str, ...] | None) -> str:
         """A Const under the name of the node of the old graph that it stands for."""
         return self.append(Node(name, "Const", value=array, origin=origin))
+
+    def pruned(self, outputs: Iterable[str]) -> Graph:
+        """``graph``, where anything changed only what the outputs need, and what is fed."""
+        made = self.graph()
+        return made if made is self._old else made.pruned([*outputs, *(n.name for n in made.nodes if is_fed(n))])
 
     def graph(self) -> Graph:
         """The new graph, redirections applied to all nodes, in topological order; the old one where nothing changed."""

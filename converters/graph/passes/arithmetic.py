@@ -44,8 +44,7 @@ def share(graph: Graph, roots: Iterable[str]) -> Graph:
         else:
             for reference in {r for reader in readers[node.name] for r in reader.inputs if node_of(r) == node.name}:
                 editor.redirect(reference, ref(same, split_ref(reference)[1]))
-    made = editor.graph()
-    return graph if made is graph else _pruned(made, outputs)
+    return editor.pruned(outputs)
 
 
 def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
@@ -74,8 +73,7 @@ def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
         else:
             operand = editor.const(number.astype(FLOAT32), f"{node.name}/constant")
             editor.keep(Node(node.name, kind, (value, operand), origin=node.origin))
-    made = editor.graph()
-    return graph if made is graph else _pruned(made, outputs)
+    return editor.pruned(outputs)
 
 
 def square_differences(graph: Graph, roots: Iterable[str]) -> Graph:
@@ -88,13 +86,7 @@ def square_differences(graph: Graph, roots: Iterable[str]) -> Graph:
             editor.keep(node)
         else:
             editor.keep(Node(node.name, "SquaredDifference", inner.inputs, origin=node.origin))
-    made = editor.graph()
-    return graph if made is graph else _pruned(made, outputs)
-
-
-def _pruned(graph: Graph, outputs: Iterable[str]) -> Graph:
-    """What the outputs need, and inputs that nothing reads."""
-    return graph.pruned([*outputs, *(n.name for n in graph.nodes if n.op == "Placeholder")])
+    return editor.pruned(outputs)
 
 
 def _operand(graph: Graph, node: Node) -> tuple[str, str, np.ndarray] | None:

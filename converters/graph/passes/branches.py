@@ -79,13 +79,7 @@ def _flat(graph: Graph, outputs: frozenset[str]) -> Graph:
             if inner:
                 node = node.with_inputs((*parts[node.name], node.inputs[-1]))
         editor.keep(node)
-    made = editor.graph()
-    return graph if made is graph else _pruned(made, outputs)
-
-
-def _pruned(graph: Graph, outputs: Iterable[str]) -> Graph:
-    """What the outputs need, and inputs that nothing reads."""
-    return graph.pruned([*outputs, *(n.name for n in graph.nodes if n.op == "Placeholder")])
+    return editor.pruned(outputs)
 
 
 class _Joining:
@@ -121,7 +115,7 @@ class _Joining:
         readers = self.graph.consumers()
         for group, value in list(self.groups.items()):
             self._hand_out(group, value, [r for part in group for r in readers[node_of(part)]], swallowed)
-        return _pruned(self.editor.graph(), self.outputs)
+        return self.editor.pruned(self.outputs)
 
     def _instead(self, root: Node, parts: tuple[str, ...]) -> bool:
         """Whether another tensor takes the place of the concatenation."""
