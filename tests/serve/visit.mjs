@@ -51,13 +51,13 @@ try {
     fill: (selector, value) => page.fill(selector, value),
     focus: (selector) => page.focus(selector),
     press: (key) => page.keyboard.press(key),
-    /** From one place of an element to another, in shares of its size. */
+    /** From one place of an element to another, in shares of its size; in one move, as a busy browser reports a hand. */
     async drag(selector, from, to) {
       const box = await page.locator(selector).boundingBox();
       const at = ([x, y]) => [box.x + x * box.width, box.y + y * box.height];
       await page.mouse.move(...at(from));
       await page.mouse.down();
-      await page.mouse.move(...at(to), { steps: 5 });
+      await page.mouse.move(...at(to));
       await page.mouse.up();
     },
     /** Files ([name, base64], …) are dropped on the page. */

@@ -42,7 +42,7 @@ export class Hand {
     this.canvas.setPointerCapture(event.pointerId);
     this.stage.choose(found.agent);
     this.#held = { ...found, begin: performance.now(), from: point, dragged: false };
-    this.#trail = [];
+    this.#trail = [{ at: this.#held.begin, place: found.place }];
   }
 
   #move(event) {
@@ -51,7 +51,9 @@ export class Hand {
     this.#held.dragged ||= Math.hypot(point[0] - this.#held.from[0], point[1] - this.#held.from[1]) > FAR;
     this.#held.place = this.view.at(size, this.stage.lane().after, point, this.#held.agent).place;
     const now = performance.now();
-    this.#trail = [...this.#trail.filter(({ at }) => now - at < FLICK), { at: now, place: this.#held.place }];
+    // The place before this one counts however old it is: a busy machine may report one move in all.
+    const recent = this.#trail.filter(({ at }, k) => now - at < FLICK || k === this.#trail.length - 1);
+    this.#trail = [...recent, { at: now, place: this.#held.place }];
     this.hold();
   }
 
@@ -64,8 +66,8 @@ export class Hand {
       return;
     }
     const [first, last] = [this.#trail[0], this.#trail.at(-1)];
-    const seconds = first === undefined ? 0 : (performance.now() - first.at) / 1000;
-    const speed = seconds > 0.01 ? held.place.map((_, k) => (last.place[k] - first.place[k]) / seconds) : held.place.map(() => 0);
+    const seconds = Math.max((performance.now() - first.at) / 1000, 0.01);
+    const speed = last.place.map((end, k) => (end - first.place[k]) / seconds);
     this.stage.change((env) => env.release?.(held.agent, speed));
   }
 }
