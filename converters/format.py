@@ -1,12 +1,13 @@
 """What a format is: one object, declared in the ``__init__`` of its room, that answers every question about it.
 
 How its files are recognised, read and written, what an artefact of it takes and gives, which runtimes run it, what it
-is called everywhere (``--to``, parity.json, tolerances, budgets). What is heavy is imported inside its functions, so
+is called everywhere (``--to``, parity.json, tolerances, budgets). The modules of its functions are ``deferred``, so
 that the list of formats (converters/formats.py) costs nothing.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import field
@@ -27,6 +28,21 @@ if TYPE_CHECKING:
     from signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
+
+
+class _Deferred:
+    """A module whose functions are named before it is imported: it is when the first of them is called."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __getattr__(self, function: str) -> Callable[..., Any]:
+        return lambda *given: getattr(importlib.import_module(self._module), function)(*given)
+
+
+def deferred(room: str, *modules: str) -> list[Any]:
+    """Modules of a room, for what its ``Format`` is made of; the type checker is given them as they are."""
+    return [_Deferred(f"{room}.{module}") for module in modules]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from converters.barracuda.graph import to_graph
 from converters.barracuda.slices import with_slices
 from converters.barracuda.writer import CONTRACT_KEY, PRODUCER
 from converters.fetch import Fetched
-from converters.source import SourceModel
+from converters.source import ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.roles import ACTION_NAMES
 from signatures.spec import PolicySignature
@@ -21,7 +21,7 @@ _PARTS = ("_c", "_h")
 _BEFORE_NN = 1
 
 
-def read(given: Fetched) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The one model in a file. Raises DamagedFileError, UnsupportedOpError, GraphError or SignatureError."""
     model, sliced = with_slices(parse(given.data))
     reading = to_graph(model)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from converters.barracuda.encode import encode
 from converters.barracuda.format import Trailer, parse
@@ -28,6 +29,6 @@ def write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     return {f"{policy.name}.nn": Pieces(encode(replace(policy_model(policy), trailer=trailer)))}
 
 
-def contract_text(data: bytes) -> str:
-    """The contract that a ``.nn`` carries, empty where it has none. Raises DamagedFileError."""
-    return parse(data).metadata(CONTRACT_KEY) or ""
+def held(path: Path) -> str:
+    """The contract that a ``.nn`` carries, empty where it has none. Raises OSError, DamagedFileError."""
+    return parse(path.read_bytes()).metadata(CONTRACT_KEY) or ""

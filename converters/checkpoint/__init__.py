@@ -6,12 +6,16 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.format import Format, Member
+from converters.format import Format, deferred
 
 if TYPE_CHECKING:
+    from converters.checkpoint import listing as _listing
+    from converters.checkpoint import run_folder as _run_folder
+    from converters.checkpoint import source as _source
     from converters.content import Content
-    from converters.fetch import Fetched
-    from converters.source import ReadOptions, SourceModel
+else:
+    _listing, _run_folder, _source = deferred(__name__, "listing", "run_folder", "source")
+
 
 #: The last bytes of a table (tensorflow/core/lib/io/format.h), which a checkpoint's index is.
 _TABLE_MAGIC = (0xDB4775248B80FB57).to_bytes(8, "little")
@@ -31,53 +35,37 @@ def _is_prefix(path: Path) -> bool:
     return bool(path.name) and not path.is_dir() and path.with_name(path.name + ".index").is_file()
 
 
-def _is_run(path: Path) -> bool:
-    from converters.checkpoint.listing import behaviors
-
-    return path.is_dir() and bool(behaviors(path))
-
-
-def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    from converters.checkpoint.source import read
-
-    return read(given.path, options)
-
-
-def _members(folder: Path, options: ReadOptions) -> list[Member]:
-    from converters.checkpoint.run_folder import members
-
-    return members(folder, options)
-
-
 _STEPS = frozenset({"step"})
+
+
 FORMATS = (
     Format(
         key="checkpoint",
         label="a TensorFlow checkpoint",
         sniff=_is_checkpoint,
         at=_is_prefix,
-        read=_read,
+        read=_source.read,
         takes=_STEPS,
     ),
     Format(
         key="raw_graph",
         label="a graph with variables, as training begins with (raw_graph_def.pb)",
         sniff=lambda file: file.is_graph and _VARIABLE.search(file.data) is not None,
-        read=_read,
+        read=_source.read,
         takes=_STEPS,
     ),
     Format(
         key="meta_graph",
         label="a checkpoint's graph (.meta)",
         sniff=lambda file: file.numbers >= {(1, 2), (2, 2)} and file.fields[0][:2] == (1, 2) and not file.is_graph,
-        read=_read,
+        read=_source.read,
         takes=_STEPS,
     ),
     Format(
         key="run_folder",
         label="a folder that training left",
-        at=_is_run,
-        members=_members,
+        at=lambda path: path.is_dir() and bool(_listing.behaviors(path)),
+        members=_run_folder.members,
         takes=frozenset({"step", "sensors"}),
     ),
 )

@@ -14,6 +14,7 @@ from converters.checkpoint.table import MAGIC
 from converters.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
 from converters.checkpoint.training_graph import read_training_graph
 from converters.detached import Detached
+from converters.fetch import Fetched
 from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
 from signatures.errors import ExportModelError, SourceError, UsageError
@@ -21,12 +22,13 @@ from signatures.errors import ExportModelError, SourceError, UsageError
 _PARTS = re.compile(r"(?P<prefix>.+)\.(index|meta|data-\d{5}-of-\d{5})")
 
 
-def read(path: Path, options: ReadOptions) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The policy of one checkpoint.
 
     A prefix, ``.index``, ``.data`` or ``.meta`` names it; ``checkpoint`` and a graph (raw_graph_def.pb) stand for the
     newest in their folder, or the one of ``--step``.
     """
+    path = given.path
     named = _prefix(path)
     if named is not None:
         step = listing.step_of(named.name)[1]

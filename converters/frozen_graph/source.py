@@ -7,10 +7,10 @@ from converters.bundle.embed import facts_of, recalled
 from converters.detached import Detached
 from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
-from converters.source import OriginalRun, SourceModel
+from converters.source import OriginalRun, ReadOptions, SourceModel
 
 
-def read(given: Fetched) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The one graph in a file; one that this tool wrote is what its contract says."""
     detached = Detached()
     definition = schema.parse(schema.GraphDef, given.data, "TensorFlow graph", detached)

@@ -4,30 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.format import Format
+from converters.format import Format, deferred
 
 if TYPE_CHECKING:
-    from converters.fetch import Fetched
-    from converters.source import ReadOptions, SourceModel
-
-
-def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    from converters.keras.source import read
-
-    return read(given, options)
-
+    from converters.keras import source as _source
+else:
+    (_source,) = deferred(__name__, "source")
 
 FORMATS = (
     Format(
         key="keras",
         label="a Keras model",
         sniff=lambda file: bool({"model.weights.h5", "config.json"} & {*file.entries}),
-        read=_read,
+        read=_source.read,
     ),
     Format(
         key="hdf5",
         label="a Keras model in HDF5 (.h5)",
         sniff=lambda file: file.starts(b"\x89HDF"),
-        read=_read,
+        read=_source.read,
     ),
 )

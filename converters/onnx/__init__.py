@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from converters.format import Format, Ports, WriteOptions
+from converters.format import Format, deferred
 
 if TYPE_CHECKING:
     from converters.content import Content
-    from converters.fetch import Fetched
-    from converters.inner import InnerTensors, Loaded
-    from converters.pieces import Pieces
-    from converters.policy import Policy
-    from converters.source import ReadOptions, SourceModel
+    from converters.onnx import artifact as _artifact
+    from converters.onnx import source as _source
+    from converters.onnx import vetted as _vetted
+    from converters.onnx import writer as _writer
+else:
+    _artifact, _source, _vetted, _writer = deferred(__name__, "artifact", "source", "vetted", "writer")
 
 
 def _sniff(file: Content) -> bool:
@@ -23,64 +21,22 @@ def _sniff(file: Content) -> bool:
     return bool(file.fields) and file.fields[0][:2] == (1, 0) and bool(file.numbers & {(7, 2), (8, 2)})
 
 
-def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    from converters.onnx.source import read
-
-    return read(given)
-
-
-def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
-    from converters.onnx.writer import write
-
-    return write(policy, options)
-
-
-def _held(path: Path) -> Any:
-    from converters.onnx.ports import held
-
-    return held(path)
-
-
-def _ports(path: Path) -> Ports:
-    from converters.onnx.ports import ports
-
-    return ports(path)
-
-
-def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
-    from converters.onnx.vetted import vetted
-
-    return vetted(path, wanted, folder)
-
-
-def _inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
-    from converters.onnx.inner import inner
-
-    return inner(loaded)
-
-
-def _origins(path: Path) -> Mapping[str, str]:
-    from converters.onnx.inner import origins
-
-    return origins(path)
-
-
 FORMATS = (
     Format(
         key="onnx",
         label="an ONNX model",
         sniff=_sniff,
-        read=_read,
-        write=_write,
+        read=_source.read,
+        write=_writer.write,
         main="{name}.onnx",
         beside="{name}.onnx.data",
         default=True,
         narrow=True,
-        held=_held,
-        ports=_ports,
-        vetted=_vetted,
-        inner=_inner,
-        origins=_origins,
+        held=_artifact.held,
+        ports=_artifact.ports,
+        vetted=_vetted.vetted,
+        inner=_artifact.inner,
+        origins=_artifact.origins,
         runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium"),
     ),
 )

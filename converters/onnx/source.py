@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from converters.fetch import Fetched
 from converters.onnx.reader import read_onnx
-from converters.source import OriginalRun, SourceModel
+from converters.source import OriginalRun, ReadOptions, SourceModel
 from converters.understand.onnx_trainers import understood
 
 
-def read(given: Fetched) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The one model in a file. Raises SourceError, GraphError and their kinds.
 
     The model itself is run by onnxruntime, the draws of its samplers fed from outside (``lift``).

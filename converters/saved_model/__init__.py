@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from converters.format import Format, Ports, WriteOptions
+from converters.format import Format, deferred
 
 if TYPE_CHECKING:
     from converters.content import Content
-    from converters.fetch import Fetched
-    from converters.inner import InnerTensors, Loaded
-    from converters.pieces import Pieces
-    from converters.policy import Policy
-    from converters.source import ReadOptions, SourceModel
+    from converters.saved_model import artifact as _artifact
+    from converters.saved_model import source as _source
+    from converters.saved_model import vetted as _vetted
+    from converters.saved_model import writer as _writer
+else:
+    _artifact, _source, _vetted, _writer = deferred(__name__, "artifact", "source", "vetted", "writer")
 
 
 def _sniff(file: Content) -> bool:
@@ -25,57 +23,21 @@ def _sniff(file: Content) -> bool:
     return bytes(file.fields[0][2]) == b"\x01"
 
 
-def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    from converters.saved_model.source import read
-
-    return read(given)
-
-
-def _write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
-    from converters.saved_model.writer import write
-
-    return write(policy, options)
-
-
-def _held(path: Path) -> Any:
-    from converters.saved_model.source import held
-
-    return held(path)
-
-
-def _ports(path: Path) -> Ports:
-    from converters.saved_model.ports import ports
-
-    return ports(path)
-
-
-def _vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
-    from converters.saved_model.vetted import vetted
-
-    return vetted(path, wanted, folder)
-
-
-def _inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
-    from converters.saved_model.inner import inner
-
-    return inner(loaded)
-
-
 FORMATS = (
     Format(
         key="saved_model",
         label="a SavedModel",
         sniff=_sniff,
         marker="saved_model.pb",
-        read=_read,
-        write=_write,
+        read=_source.read,
+        write=_writer.write,
         main="saved_model",
         default=True,
         narrow=True,
-        held=_held,
-        ports=_ports,
-        vetted=_vetted,
-        inner=_inner,
+        held=_source.held,
+        ports=_artifact.ports,
+        vetted=_vetted.vetted,
+        inner=_artifact.inner,
         runtimes=("tensorflow",),
         signatures=True,
     ),

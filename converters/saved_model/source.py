@@ -14,13 +14,13 @@ from converters.checkpoint.training_graph import Saved as Place
 from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
 from converters.content import Content
 from converters.fetch import Fetched, read_bytes
-from converters.frozen_graph import source as frozen_graph
 from converters.frozen_graph.reader import from_graph_def
+from converters.frozen_graph.source import read as read_frozen
 from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
 from converters.saved_model.reader import Saved, read_saved_model
 from converters.saved_model.signature import ModelSignature, exposed, fed_by_signature
-from converters.source import OriginalRun, SourceModel
+from converters.source import OriginalRun, ReadOptions, SourceModel
 from signatures.errors import NotAPolicyError
 from signatures.records import dataclass
 
@@ -31,13 +31,13 @@ _WITHOUT_VARIABLES = (
 )
 
 
-def read(given: Fetched) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The policy behind ``serving_default`` (else the first signature)."""
     path = given.path
     folder = path if path.is_dir() else path.parent
     file = folder / FILE if path.is_dir() else path
     if Content(given.bytes_of(file)).is_graph:  # some give a frozen graph this name
-        return frozen_graph.read(given.inside(file))
+        return read_frozen(given.inside(file), options)
     saved = read_saved_model(given.bytes_of(file))
     frozen = frozen_model(saved, values_beside(folder))
     graph, contract = recalled(frozen.graph)

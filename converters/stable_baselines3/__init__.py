@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.format import Format
+from converters.format import Format, deferred
 
 if TYPE_CHECKING:
-    from converters.fetch import Fetched
-    from converters.source import ReadOptions, SourceModel
-
-
-def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    from converters.stable_baselines3.source import read
-
-    return read(given, options)
-
+    from converters.stable_baselines3 import source as _source
+else:
+    (_source,) = deferred(__name__, "source")
 
 FORMATS = (
     Format(
@@ -23,7 +17,7 @@ FORMATS = (
         label="a saved model of Stable-Baselines3 (.zip)",
         sniff=lambda file: {"data", "policy.pth"} <= set(file.entries),
         marker="policy.pth",
-        read=_read,
+        read=_source.read,
         takes=frozenset({"activation"}),
     ),
 )

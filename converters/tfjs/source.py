@@ -13,13 +13,13 @@ from converters.fetch import Fetched
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.renaming import renamed
 from converters.saved_model.signature import exposed
-from converters.source import SourceModel
+from converters.source import ReadOptions, SourceModel
 from converters.tfjs.reader import content_of, model_file, read_model, weights_of
 from converters.tfjs.unfuse import unfuse
 from signatures.contract import Contract
 
 
-def read(given: Fetched) -> list[SourceModel]:
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The model's signature as a policy; one that this tool wrote is what its contract says."""
     content = content_of(given)
     if "node" not in content["modelTopology"]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.format import Format
+from converters.format import Format, deferred
 
 if TYPE_CHECKING:
     from converters.content import Content
-    from converters.fetch import Fetched
-    from converters.source import ReadOptions, SourceModel
+    from converters.torch_checkpoint import source as _source
+else:
+    (_source,) = deferred(__name__, "source")
 
 
 def _sniff(file: Content) -> bool:
@@ -19,18 +20,12 @@ def _sniff(file: Content) -> bool:
     )
 
 
-def _read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    from converters.torch_checkpoint.source import read
-
-    return read(given, options)
-
-
 FORMATS = (
     Format(
         key="torch_checkpoint",
         label="a PyTorch checkpoint (.pt)",
         sniff=_sniff,
-        read=_read,
+        read=_source.read,
         takes=frozenset({"sensors", "activation"}),
     ),
 )

@@ -18,6 +18,7 @@ from converters.graph.options import CompileOptions
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.policy import Policy
+from converters.source import ReadOptions
 from signatures.errors import DamagedFileError, SignatureError
 from signatures.roles import Role
 from tests.barracuda.nn_files import Maker, write_nn
@@ -43,7 +44,7 @@ def policy_of(model: NnModel, **options: object) -> Policy:
 def source_of(model: NnModel, folder: Path) -> tuple[Graph, object]:
     path = folder / "Brain.nn"
     path.write_bytes(write_nn(model))
-    (source,) = read(Fetched(path))
+    (source,) = read(Fetched(path), ReadOptions())
     assert source.original is None
     assert source.files == (path,)
     return source.graph, source.facts

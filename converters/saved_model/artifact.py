@@ -1,12 +1,18 @@
-"""The inner tensors of a SavedModel: a signature gives its outputs only, so its graph is run in a session."""
+"""An artefact that is a SavedModel: what it takes and gives, by the signature for the policy, and its inner tensors.
+
+A signature gives its outputs only, so for the tensors inside its graph is run in a session.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
+from converters.fetch import read_bytes
+from converters.format import Ports
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import normal_ref
 from converters.inner import Feeds, InnerTensors, Loaded, own_names
@@ -14,6 +20,22 @@ from converters.runtimes.process import unloading
 from converters.saved_model.reader import read_saved_model
 from converters.saved_model.source import FILE, frozen_model, values_beside
 from converters.source import OriginalRun
+from signatures.errors import NotAPolicyError
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a folder, or of its saved_model.pb. Raises SourceError, NotAPolicyError, DamagedFileError."""
+    file = path / "saved_model.pb" if path.is_dir() else path
+    signature = read_saved_model(read_bytes(file)).signature
+    if signature.key is None:
+        raise NotAPolicyError(
+            "the SavedModel has no signature",
+            where=str(path),
+            why="nobody can call it by name",
+            fix="save it with signatures={'serving_default': …}",
+        )
+    options = {"kind": "saved_model", "signature": signature.key}
+    return Ports(file.parent, *signature.ports(), options)
 
 
 @contextmanager

@@ -1,21 +1,48 @@
-"""The inner tensors of an ONNX model, which gives its outputs only: a copy with further outputs is loaded beside it."""
+"""An artefact that is an ONNX model: what it takes and gives, the contract that it holds, its inner tensors.
+
+It gives its outputs only: for the tensors inside, a copy with further outputs is loaded beside it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from converters.detached import Detached
 from converters.fetch import read_bytes
 from converters.folders import scratch_folder
+from converters.format import Port, Ports
 from converters.inner import Feeds, InnerTensors, Loaded, View
 from converters.onnx.files import files_of
-from converters.onnx.proto import array_of, decoded, load_external
+from converters.onnx.messages import CONTRACT_KEY
+from converters.onnx.proto import array_of, decoded, dtype_name, load_external
 from converters.onnx.tensor_map import TENSORS_KEY, loads
 from converters.runtimes.process import unloading
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a file. Raises SourceError, DamagedFileError."""
+    graph = decoded(read_bytes(path), Detached()).graph
+    stored = {t.name for t in graph.initializer}
+    inputs = tuple(_port(v) for v in graph.input if v.name not in stored)
+    return Ports(path, inputs, tuple(_port(v) for v in graph.output))
+
+
+def _port(value: Any) -> Port:
+    """A length of 0 or below, and a named one, is free (as the importer reads it)."""
+    tensor = value.type.tensor_type
+    dims = tuple(int(d.dim_value) if d.dim_value > 0 else None for d in tensor.shape.dim)
+    return Port(value.name, dtype_name(tensor.elem_type), dims if tensor.HasField("shape") else None)
+
+
+def held(path: Path) -> str | None:
+    """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
+    model = decoded(read_bytes(path), Detached())
+    return next((str(p.value) for p in model.metadata_props if p.key == CONTRACT_KEY), None)
 
 
 @contextmanager

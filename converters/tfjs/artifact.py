@@ -1,23 +1,47 @@
-"""A TensorFlow.js model that anyone may have made, as far as a runtime may be given it.
+"""An artefact that is a TensorFlow.js graph model: what it takes and gives, by its signature, its inner tensors, what
+of it a runtime may be given.
 
-Its loader reads whatever path the manifest names. The copy has its weights in files of our own names, control inputs
-left out, and no op but those that compute.
+Its loader reads whatever path the manifest names: the copy for a runtime has its weights in files of our own names,
+control inputs left out, and no op but those that compute.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from converters.fetch import MAX_BYTES, read_bytes
+from converters.format import Port, Ports
 from converters.frozen_graph.subgraph import COMPUTING
 from converters.graph.nodes import Node
 from converters.graph.ops.outside import CALLING, ORDERING
 from converters.graph.ops.table import unsupported
-from converters.tfjs.reader import MODEL, shard
+from converters.inner import InnerTensors, Loaded, own_names
+from converters.tfjs.reader import MODEL, read_signature, shard
 from signatures.errors import DamagedFileError
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a folder, or of its model.json. Raises DamagedFileError."""
+    file = path / MODEL if path.is_dir() else path
+    signature, nodes = read_signature(file)
+    inputs, outputs = signature.ports()
+    if not inputs:  # the official converter writes none for a frozen graph: placeholders are fed
+        inputs = tuple(Port(name) for name, op in nodes.items() if op == "Placeholder")
+    return Ports(file.parent, inputs, outputs)
+
+
+def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
+    """Those of a folder with a model.json; what was fused with its bias or activation is not there."""
+    model = json.loads((loaded.path / "model.json").read_bytes())
+    return contextlib.nullcontext(
+        InnerTensors(own_names(n["name"] for n in model["modelTopology"]["node"]), loaded.run)
+    )
+
 
 #: What the official converter makes of other ops, and what TensorFlow 2 writes loops with: in memory, all of them.
 _OWN = frozenset(
