@@ -10,11 +10,10 @@ from converters.format import Format, deferred
 
 if TYPE_CHECKING:
     from converters.checkpoint import listing as _listing
-    from converters.checkpoint import run_folder as _run_folder
     from converters.checkpoint import source as _source
     from converters.content import Content
 else:
-    _listing, _run_folder, _source = deferred(__name__, "listing", "run_folder", "source")
+    _listing, _source = deferred(__name__, "listing", "source")
 
 
 #: The last bytes of a table (tensorflow/core/lib/io/format.h), which a checkpoint's index is.
@@ -65,7 +64,7 @@ FORMATS = (
         key="run_folder",
         label="a folder that training left",
         at=lambda path: path.is_dir() and bool(_listing.behaviors(path)),
-        members=_run_folder.members,
+        members=_source.members,
         takes=frozenset({"step", "sensors"}),
     ),
 )

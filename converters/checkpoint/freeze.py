@@ -15,8 +15,7 @@ import numpy as np
 from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
-from converters.graph.ops.outside import EFFECTS, VARIABLES
-from converters.graph.ops.table import hands_on
+from converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
 from converters.understand.brains import depends_on_input, find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.records import dataclass

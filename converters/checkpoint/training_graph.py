@@ -22,7 +22,7 @@ from converters.fetch import read_bytes
 from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.tensors import to_array
 from converters.graph.nodes import Graph, node_of, split_ref
-from converters.graph.ops.outside import ASSIGNS, RESTORES
+from converters.graph.ops.table import ASSIGNS, RESTORES
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass
 

@@ -15,8 +15,7 @@ from converters.detached import Detached
 from converters.frozen_graph.tensors import to_array
 from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
-from converters.graph.ops.outside import CALLS
-from converters.graph.ops.table import is_fed
+from converters.graph.ops.table import CALLS, is_fed
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).

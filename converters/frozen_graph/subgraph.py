@@ -15,8 +15,7 @@ from typing import Any
 
 from converters import schema
 from converters.graph.nodes import Node, node_of
-from converters.graph.ops.outside import ORDERING
-from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, SPELLINGS, TABLE, unsupported
+from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, ORDERING, SPELLINGS, TABLE, unsupported
 from signatures.errors import GraphError
 
 #: Ops that compute a value from their inputs (or draw one) and do nothing else.

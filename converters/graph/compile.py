@@ -24,12 +24,10 @@ from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.passes.unroll import MAX_NODES, unroll
 from converters.policy import Policy
 from converters.understand.brains import Brain, find_brains
-from converters.understand.derived_outputs import derive_outputs, without_chance
 from converters.understand.facts import SourceFacts
-from converters.understand.further_outputs import leave_out_without_rows
 from converters.understand.inputs import classify_inputs
-from converters.understand.signature import sign, understand_actions
-from converters.understand.source_map import source_map
+from converters.understand.outputs import derive_outputs, leave_out_without_rows, without_chance
+from converters.understand.signature import sign, source_map, understand_actions
 from signatures.errors import NotAPolicyError, UsageError
 
 FOLD = Pass("fold", on_graph(fold), (has.no_control_flow,), (has.constants_folded,))

@@ -18,9 +18,8 @@ from converters.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph
 from converters.graph.ops.base import MISFIT
 from converters.graph.ops.table import is_fed
+from converters.keras.children import frozen_by_tensorflow, stored_in
 from converters.keras.config import config_of, refuse_code, stateful_layer
-from converters.keras.frozen import frozen_by_tensorflow
-from converters.keras.hdf5 import stored_in
 from converters.keras.model import model_of
 from converters.keras.network import Network, UnknownLayerError
 from converters.keras.weights import Groups, Listed, Weights

@@ -17,7 +17,7 @@ from converters.checkpoint.freeze import freeze, wanted_variables
 from converters.checkpoint.policy_nodes import policy_nodes
 from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph, training_graph
-from converters.graph.ops.outside import VARIABLES
+from converters.graph.ops.table import VARIABLES
 from converters.runtimes.tensorflow.freeze import flattened
 from converters.source import OriginalRun, SourceModel
 from converters.understand.facts import SourceFacts

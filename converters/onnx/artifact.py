@@ -17,8 +17,7 @@ from converters.fetch import read_bytes
 from converters.folders import scratch_folder
 from converters.format import Port, Ports
 from converters.inner import Feeds, InnerTensors, Loaded, View
-from converters.onnx.files import files_of
-from converters.onnx.messages import CONTRACT_KEY
+from converters.onnx.messages import CONTRACT_KEY, files_of
 from converters.onnx.proto import array_of, decoded, dtype_name, load_external
 from converters.onnx.tensor_map import TENSORS_KEY, loads
 from converters.runtimes.process import unloading

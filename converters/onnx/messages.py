@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from converters.detached import Detached, is_readable
 from converters.messages import message_classes
+from converters.pieces import Pieces
 
 #: The key of the metadata that hold a contract of ours.
 CONTRACT_KEY = "export_model_contract"
@@ -178,3 +180,30 @@ def packaged(model: Any) -> Any:
     import onnx
 
     return model if isinstance(model, onnx.ModelProto) else onnx.ModelProto.FromString(model.SerializeToString())
+
+
+_EXTERNAL = 1  # TensorProto.DataLocation
+#: Runtimes map a file's weights into memory by whole pages.
+_PAGE = 1 << 12
+
+
+def files_of(model: Any, detached: Detached, name: str) -> dict[str, Pieces]:
+    """The files of a ModelProto, by their names: the model, and if it is too large for one, ``<name>.data``."""
+    whole = detached.whole(model.SerializeToString(deterministic=True))
+    if is_readable(whole):
+        return {name: whole}
+    parts: list[Any] = []
+    at = 0
+    for tensor in model.graph.initializer:
+        array = detached.array(tensor.raw_data)
+        if array is None:
+            continue
+        tensor.ClearField("raw_data")
+        tensor.data_location = _EXTERNAL
+        for key, value in (("location", f"{name}.data"), ("offset", at), ("length", array.nbytes)):
+            tensor.external_data.add(key=key, value=str(value))
+        padding = -array.nbytes % _PAGE
+        parts += [array, bytes(padding)]
+        at += array.nbytes + padding
+    whole = detached.whole(model.SerializeToString(deterministic=True))  # constants in nodes and bodies stay in it
+    return {name: whole, f"{name}.data": Pieces(*parts)}

@@ -13,7 +13,7 @@ from typing import Any
 
 from converters.detached import Detached
 from converters.fetch import read_bytes
-from converters.onnx.files import files_of
+from converters.onnx.messages import files_of
 from converters.onnx.proto import decoded, inside, load_external
 from signatures.errors import UnsupportedOpError
 

@@ -24,8 +24,7 @@ from converters.graph.shapes import Types, infer_types
 from converters.graph.types import FLOAT32, TensorType
 from converters.inner import View
 from converters.onnx import messages
-from converters.onnx.files import files_of
-from converters.onnx.messages import CONTRACT_KEY
+from converters.onnx.messages import CONTRACT_KEY, files_of
 from converters.onnx.shorten import pooled_first, shortened
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.pieces import Pieces, equal

@@ -15,8 +15,7 @@ from typing import Any
 from converters import schema
 from converters.frozen_graph.subgraph import COMPUTING, is_pivot
 from converters.graph.nodes import NameScope, Node, ref, split_ref
-from converters.graph.ops.outside import CALLING, EFFECTS, IFS, ORDERING, READS, WHILES
-from converters.graph.ops.table import RESULTS, unsupported
+from converters.graph.ops.table import CALLING, EFFECTS, IFS, ORDERING, READS, RESULTS, WHILES, unsupported
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 _ALLOWED = COMPUTING | READS | ORDERING | CALLING

@@ -13,7 +13,7 @@ from typing import Any
 from converters import schema
 from converters.detached import Detached
 from converters.graph.nodes import TensorShape, node_of
-from converters.graph.ops.outside import CALLING
+from converters.graph.ops.table import CALLING
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass

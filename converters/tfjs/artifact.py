@@ -18,8 +18,7 @@ from converters.fetch import MAX_BYTES, read_bytes
 from converters.format import Port, Ports
 from converters.frozen_graph.subgraph import COMPUTING
 from converters.graph.nodes import Node
-from converters.graph.ops.outside import CALLING, ORDERING
-from converters.graph.ops.table import unsupported
+from converters.graph.ops.table import CALLING, ORDERING, unsupported
 from converters.inner import InnerTensors, Loaded, own_names
 from converters.tfjs.reader import MODEL, read_signature, shard
 from signatures.errors import DamagedFileError

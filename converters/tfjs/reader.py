@@ -21,8 +21,7 @@ import numpy as np
 from converters import schema
 from converters.fetch import Fetched, read_bytes
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
-from converters.graph.ops.outside import IFS, WHILES
-from converters.graph.ops.table import is_fed
+from converters.graph.ops.table import IFS, WHILES, is_fed
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 from signatures.records import dataclass

@@ -7,8 +7,8 @@ from dataclasses import replace
 from converters.fetch import Fetched
 from converters.source import ReadOptions, SourceModel
 from converters.torch_checkpoint import cleanrl, rsl_rl
+from converters.torch_checkpoint.activations import activation_of
 from converters.torch_checkpoint.archive import Archive
-from converters.torch_checkpoint.configuration import activation_of
 from converters.torch_checkpoint.policy import to_graph
 from converters.torch_checkpoint.state import State
 from signatures.errors import UsageError

@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
-from converters.understand.state_names import looks_like_state
+from converters.understand.memories import looks_like_state
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.records import dataclass
 from signatures.roles import (

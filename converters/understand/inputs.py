@@ -12,7 +12,7 @@ import numpy as np
 from converters.graph.nodes import Graph, Node, TensorShape, node_of
 from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.brains import Brain, close_names
-from converters.understand.state_names import looks_like_state
+from converters.understand.memories import looks_like_state
 from signatures.errors import SignatureError, UsageError
 from signatures.roles import INPUT_PATTERNS, INPUT_ROLES, OBSERVATIONS, Role
 

@@ -8,21 +8,21 @@ from dataclasses import replace
 from typing import Any
 
 from converters.graph.compilation import Compilation
-from converters.graph.nodes import Graph, Node, TensorShape, node_of
+from converters.graph.nodes import Graph, Node, TensorShape, node_of, split_ref
+from converters.graph.passes.inputs import batch_size_rank, constant_value
+from converters.graph.passes.noise import tensor_of
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
 from converters.understand.action import ActionMeaning, action_meaning
 from converters.understand.brains import Head
-from converters.understand.derived_outputs import LOG_PROBS
 from converters.understand.generations import generation
-from converters.understand.images import highest_colour
 from converters.understand.memories import memory_layout
-from converters.understand.normaliser import normaliser
-from converters.understand.source_map import branch_origins
+from converters.understand.observations import highest_colour, normaliser
+from converters.understand.outputs import LOG_PROBS
 from signatures.errors import SignatureError
 from signatures.labels import remaining
 from signatures.roles import OBSERVATIONS, Role, canonical_name, numbers
-from signatures.spec import Memory, PolicySignature, TensorSpec
+from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
 
 _INPUT_ORDER = (*OBSERVATIONS, Role.MASKS, Role.PREV_ACTION, Role.MEMORY_IN, Role.NOISE, Role.PARAMETER)
 _HEAD_NAMES = ("action", "continuous_actions", "discrete_actions")
@@ -363,3 +363,37 @@ def _memory(
         notes.append(_lost_memory(taken.name))
     layout = compiled.facts.memory_layout or memory_layout(compiled.graph, feeds[taken.name])
     return Memory(int(taken.shape[-1] or 0), taken.name, None if given is None else given.name, layout)
+
+
+def branch_origins(c: Compilation, branches: Sequence[str]) -> tuple[str | None, ...]:
+    """The source's tensors that a sampled action is drawn from."""
+    known = {n.origin for n in c.source.nodes}
+    found: list[str | None] = []
+    for branch in branches:
+        origin = c.graph.producer(branch).origin if split_ref(branch)[1] == 0 else None
+        found.append(origin if isinstance(origin, str) and origin in known else None)
+    return tuple(found)
+
+
+def source_map(c: Compilation) -> SourceMap:
+    """How to run the source beside its export, of a compilation that is signed."""
+    assert c.signature is not None
+    inputs, outputs, source = c.signature.inputs, c.signature.outputs, c.source
+    fixed = {
+        tensor_of(source[n]): constant_value(source[n], 1) for n, r in c.roles.items() if r is Role.SEQUENCE_LENGTH
+    }
+    given = {tensor_of(c.original[n]): constant_value(c.original[n], v) for n, v in c.options.values.items()}
+    parts = {s.name: c.parts[s.role] for s in (*inputs, *outputs) if s.role in c.parts}
+    return SourceMap(
+        feeds=sources(inputs, parts),
+        fetches=sources(outputs, parts),
+        fixed={**fixed, **given},
+        batch_sizes={
+            tensor_of(source[n]): batch_size_rank(source, source[n]) for n, r in c.roles.items() if r is Role.BATCH_SIZE
+        },
+        noise=dict(c.noise),
+        noise_kept=c.options.noise == "keep" and not c.options.deterministic,
+        branches=c.branch_origins,
+        rows=c.facts.rows,
+        parts=parts,
+    )

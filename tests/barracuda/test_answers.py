@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from converters.barracuda.answers import NnPolicy, answered, contract_of
-from converters.barracuda.encode import encode
 from converters.barracuda.format import parse
-from converters.barracuda.writer import CONTRACT_KEY
+from converters.barracuda.writer import CONTRACT_KEY, encode
 from converters.format import WriteOptions
 from converters.formats import DEFAULTS, WRITTEN
 from converters.graph.options import CompileOptions

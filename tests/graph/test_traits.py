@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from converters.graph.nodes import Graph, Node
-from converters.graph.ops import outside
+from converters.graph.ops import table
 from converters.graph.ops.table import CONTROL_FLOW, FORBIDDEN, SPELLINGS, TABLE, hands_on, is_fed, passes_on, traits
 from converters.graph.run import run_graph
 from tests.commands import ROOT
@@ -17,7 +17,7 @@ from tests.graph.harness import Array
 from tests.graph.making import defaults
 from tests.graph.samples import SAMPLES, Sample
 
-OUTSIDE = outside.VARIABLES | outside.ASSIGNS | outside.RESTORES | outside.READS | outside.ORDERING | outside.CALLING
+OUTSIDE = table.VARIABLES | table.ASSIGNS | table.RESTORES | table.READS | table.ORDERING | table.CALLING
 NAMES = {*TABLE, *SPELLINGS, *CONTROL_FLOW, *FORBIDDEN, *OUTSIDE}
 #: Where names are a source's or a consumer's own words, which only sound like TensorFlow's: folder or file → whose.
 VOCABULARIES = {

@@ -13,8 +13,8 @@ from converters.frozen_graph.reader import read_graph
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.tensorflow1.found import RELEASES
-from converters.targets import tfsharp
 from converters.targets.profile import Profile
+from converters.targets.profiles import TFSHARP
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.errors import ProfileError
@@ -69,7 +69,7 @@ def held(path: Path, policies: Sequence[Policy], wanted: Profile, pool: RuntimeP
     return count
 
 
-@pytest.mark.parametrize("wanted", tfsharp.PROFILES, ids=lambda p: p.name)
+@pytest.mark.parametrize("wanted", TFSHARP, ids=lambda p: p.name)
 @pytest.mark.parametrize("name", FIXTURES)
 def test_a_fixture_acts_the_same(name: str, wanted: Profile, pool: RuntimePool, tmp_path: Path) -> None:
     assert held(fixture(name), compiled(fixture(name)), wanted, pool, tmp_path) > 0 or name in (
@@ -81,7 +81,7 @@ def test_a_fixture_acts_the_same(name: str, wanted: Profile, pool: RuntimePool, 
 
 def _in_turns() -> list[Any]:
     files = known.params([p for p in known.sources() if p.suffix != ".keras"])
-    turns = zip(files, itertools.cycle(tfsharp.PROFILES), strict=False)
+    turns = zip(files, itertools.cycle(TFSHARP), strict=False)
     return [pytest.param(file.values[0], wanted, id=f"{file.id}-{wanted.name}") for file, wanted in turns]
 
 
@@ -102,7 +102,7 @@ def test_a_known_policy_acts_the_same(
 
 def test_the_constants_of_0_6_are_int32_nodes(tmp_path: Path) -> None:
     (policy,) = compiled(fixture("discrete"))
-    pair = Pair.of(policy, next(p for p in tfsharp.PROFILES if p.name == "tfsharp-0.6"))
+    pair = Pair.of(policy, next(p for p in TFSHARP if p.name == "tfsharp-0.6"))
     graph = read_graph(pair.data)
     values = {n.name: n.value for n in graph.nodes if n.op == "Const"}
     found = {k: int(values[k]) for k in ("version_number", "memory_size", "is_continuous_control")}

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.barracuda.encode import encode
+from converters.barracuda.writer import encode
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.source import ReadOptions

@@ -13,7 +13,7 @@ from converters.graph.shapes import infer_types
 from converters.graph.types import INT64
 from converters.understand.action import ActionMeaning
 from converters.understand.brains import Head
-from converters.understand.derived_outputs import LOG_PROBS, add_companions
+from converters.understand.outputs import LOG_PROBS, add_companions
 from signatures.roles import Role
 from tests.graph.harness import Array
 from tests.graph.making import const, graph, node, ops, placeholder

@@ -12,7 +12,7 @@ from converters.frozen_graph.reader import read_graph
 from converters.graph.compile import compile_graph
 from converters.graph.nodes import Graph, Node
 from converters.understand.memories import memory_layout
-from converters.understand.normaliser import normaliser
+from converters.understand.observations import normaliser
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.samples import f32
 

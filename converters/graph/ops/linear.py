@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,9 +19,9 @@ from converters.graph.ops.base import (
     require_constant,
     same_as,
     shape_error,
+    squeezed,
     type_attr,
 )
-from converters.graph.ops.reducing import reduced
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
 
 T = type_attr()
@@ -187,8 +188,8 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
         keep = bool(node.attrs["keep_dims"])
         if kind.dtype == BOOL:  # ONNX does not reduce booleans
             value = builder.emit("Cast", [value], to=INT32)
-            return builder.emit("Cast", [reduced(builder, onnx_op, value, kind, axes, keep)], to=BOOL)
-        return reduced(builder, onnx_op, value, kind, axes, keep)
+            return builder.emit("Cast", [_reduced(builder, onnx_op, value, kind, axes, keep)], to=BOOL)
+        return _reduced(builder, onnx_op, value, kind, axes, keep)
 
     return lower
 
@@ -340,3 +341,64 @@ OPS = (
         activation="softmax",
     ),
 )
+
+
+def _reduced(
+    builder: OnnxBuilder, onnx_op: str, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool
+) -> str:
+    """``value``, of type ``kind``, reduced by ``onnx_op`` over ``axes`` (sorted, counted from the front), in forms that
+    every importer reads.
+
+    Barracuda 1.4 to 2.3.1 takes the axes of a reduction from its attribute alone and sums over the batch where they are
+    an input, as those of ReduceSum are since opset 13 and of the others since 18 (measured: ReduceSum_10 to _15,
+    ReduceMean_04 of Unity's importers). A sum over the last axis is therefore a product with a column of ones, which
+    onnxruntime computes as fast; over other axes it is the mean times the count.
+    """
+    if not axes:
+        return value
+    if onnx_op == "ReduceSum":
+        return _summed(builder, value, kind, axes, keepdims)
+    if builder.opset >= 18:
+        axes_value = builder.const(np.array(axes, np.int64), "axes")
+        result: str = builder.emit(onnx_op, [value, axes_value], keepdims=int(keepdims))
+    else:
+        result = builder.emit(onnx_op, [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
+    return result
+
+
+def _summed(builder: OnnxBuilder, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool) -> str:
+    assert kind.shape is not None
+    if builder.opset < 13:
+        summed: str = builder.emit("ReduceSum", [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
+        return summed
+    shape, last = list(kind.shape), len(kind.shape) - 1
+    lengths = [n for n in (shape[a] for a in axes) if isinstance(n, int)]
+    if list(axes) != [last] and kind.dtype.kind == "f" and len(lengths) == len(axes) and builder.opset < 18:
+        mean = _reduced(builder, "ReduceMean", value, kind, axes, keepdims)
+        counted: str = builder.emit("Mul", [mean, builder.const(np.array(math.prod(lengths), kind.dtype), "count")])
+        return counted
+    for axis in axes:
+        value = _column(builder, value, shape, axis, kind.dtype)
+        shape[axis] = 1
+    if keepdims:
+        return value
+    return squeezed(builder, value, axes, [d for i, d in enumerate(shape) if i not in axes])
+
+
+def _column(builder: OnnxBuilder, value: str, shape: Sequence[Dim], axis: int, dtype: np.dtype) -> str:
+    """The sum over one axis, which is kept with length 1: the axis goes last and is multiplied with ones."""
+    last, length = len(shape) - 1, shape[axis]
+    if isinstance(length, int):
+        ones = builder.const(np.ones((length, 1), dtype), "ones")
+    else:
+        index = builder.const(np.array([axis], np.int64), "axis")
+        rows = builder.emit("Gather", [builder.emit("Shape", [value]), index], axis=0)
+        column = builder.emit("Concat", [rows, builder.const(np.ones(1, np.int64), "one")], axis=0)
+        ones = builder.emit("ConstantOfShape", [column], value=np.ones(1, dtype))
+    order = [*(i for i in range(last + 1) if i != axis), axis]
+    if axis != last:
+        value = builder.emit("Transpose", [value], perm=order)
+    value = builder.emit("MatMul", [value, ones])
+    if axis != last:
+        value = builder.emit("Transpose", [value], perm=[int(i) for i in np.argsort(order)])
+    return value

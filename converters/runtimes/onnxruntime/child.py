@@ -52,7 +52,7 @@ def main() -> None:
             return dict(zip(fetch, values, strict=True))
 
     from converters.detached import Detached
-    from converters.onnx.files import files_of
+    from converters.onnx.messages import files_of
 
     class Source:
         """A foreign model: a session for each set of values that is asked for."""

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.ops.outside import VARIABLES
+from converters.graph.ops.table import VARIABLES
 from converters.runtimes.child import Model, claim_stdout, serve
 from converters.runtimes.tensorflow.freeze import frozen_function
 from converters.runtimes.wire import Tensors

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
-from converters.graph.ops.outside import FUNCTIONAL
+from converters.graph.ops.table import FUNCTIONAL
 from signatures.records import dataclass
 
 TypedTensor = tuple[str, str, list[int | None] | None]

@@ -1,4 +1,4 @@
-"""How large the colours of an image are that a policy takes.
+"""What a policy does with an observation before anything else: how it normalises it, how large its colours are.
 
 ML-Agents divides bytes by 255 outside of the policy, so its images are 0 to 1. Stable-Baselines3 (preprocessing.py,
 ``normalize_images``) and CleanRL (``x / 255.0``) divide inside: fed 0 to 1, such a policy sees black.
@@ -8,8 +8,40 @@ from __future__ import annotations
 
 import math
 
-from converters.graph.nodes import Graph, Node
+import numpy as np
+
+from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import passes_on, traits
+
+
+def normaliser(graph: Graph, name: str) -> dict[str, object] | None:
+    """Mean and standard deviation that the policy normalises an observation with, or None.
+
+    The form is the same in every ML-Agents version: clip((x − mean) / sqrt(variance / steps), −5, 5), its square root
+    folded to a constant here.
+    """
+    centred = [n for n in graph.nodes if n.op == "Sub" and node_of(n.inputs[0]) == name]
+    readers = graph.consumers() if centred else {}
+    for node in centred:
+        mean = graph.constant(node.inputs[1])
+        for reader in readers[node.name]:
+            std = graph.constant(reader.inputs[1]) if reader.op == "RealDiv" else None
+            if (
+                mean is not None
+                and std is not None
+                and mean.ndim == 1
+                and np.all(np.isfinite(std))
+                and np.all(np.isfinite(mean))
+            ):
+                width = np.broadcast_shapes(mean.shape, std.shape)
+                return {
+                    "kind": "normal",
+                    "mean": np.broadcast_to(mean, width).astype(float).tolist(),
+                    "std": np.broadcast_to(std, width).astype(float).tolist(),
+                    "clip": 5.0,
+                }
+    return None
+
 
 BYTE = 255.0
 #: A divisor may be repeated for each colour.
