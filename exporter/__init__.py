@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import importlib
 
-from exporter.version import __version__
+#: pyproject.toml reads it from here.
+__version__ = "0.1.0"
 
 # As typing has it, whose import is a third of what is done before an interrupt is answered (exporter/cli/__init__.py).
 TYPE_CHECKING = False

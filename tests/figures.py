@@ -25,8 +25,8 @@ from typing import Any
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes
 from exporter.export.pipeline import ExportOptions, export
+from exporter.verify.difference import added, by_decade
 from exporter.verify.findings import Finding
-from exporter.verify.histogram import added, to_dict
 from exporter.verify.report import ParityReport
 from signatures.roles import Role
 from signatures.spec import PolicySignature
@@ -87,7 +87,7 @@ class Cell:
         place[key] = max(place.get(key, 0.0), comparison.max_abs_diff)
         self.elements = added([self.elements, comparison.histogram])
 
-    def to_dict(self) -> dict[str, Any]:
+    def by_decade(self) -> dict[str, Any]:
         return {
             "policies": len(self.policies),
             "comparisons": self.comparisons,
@@ -98,7 +98,7 @@ class Cell:
             "rounding": self.rounding,
             "draws": self.draws,
             "least_p": _three(self.least_p),
-            "elements": to_dict(self.elements) if self.elements else {},
+            "elements": by_decade(self.elements) if self.elements else {},
         }
 
 

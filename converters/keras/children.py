@@ -63,8 +63,8 @@ def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
             fix="pip install 'export-model[tensorflow]'; or freeze the model where it was made, and give the GraphDef",
         )
     try:
-        with RuntimeProcess("tensorflow", child_command("converters.runtimes.tensorflow.freeze_child")) as process:
-            answer = process.load(str(path.resolve())).run({}, ["graph", "names"])
+        with RuntimeProcess("tensorflow", child_command("converters.runtimes.tensorflow.child")) as process:
+            answer = process.load(str(path.resolve()), kind="keras").run({}, ["graph", "names"])
     except RunFailedError as error:
         raise SourceError(
             "is a Keras model that TensorFlow cannot load",

@@ -1,19 +1,26 @@
-"""The commands, put together. Imports click only; everything else is imported by the command that needs it."""
+"""The commands, put together, and ``completion``. Imports click only; a command imports what else it needs."""
 
 from __future__ import annotations
 
 import click
+from click.shell_completion import get_completion_class
 
 from exporter.cli.compare import compare_command
-from exporter.cli.completion import completion_command
 from exporter.cli.demo import demo_command
 from exporter.cli.export import export_command
-from exporter.cli.group import SourceGroup, show_version
+from exporter.cli.group import PROGRAM, Command, SourceGroup, show_version
 from exporter.cli.inspect import inspect_command
 from exporter.cli.runtimes import runtimes_command
 from exporter.cli.serve import serve_command
 from exporter.cli.snippets import snippets_command
+from exporter.cli.terminal import say, say_lines
 from exporter.cli.verify import verify_command
+
+_SHELLS = {
+    "bash": 'add this to ~/.bashrc:  eval "$(export-model completion bash)"',
+    "zsh": 'add this to ~/.zshrc:  eval "$(export-model completion zsh)"',
+    "fish": "write it where fish looks:  export-model completion fish > ~/.config/fish/completions/export-model.fish",
+}
 
 
 @click.group(
@@ -32,6 +39,21 @@ from exporter.cli.verify import verify_command
 )
 def app() -> None:
     """The group; its commands do the work."""
+
+
+@click.command(
+    "completion",
+    cls=Command,
+    short_help="Print the script for completion in a shell.",
+    examples=(("export-model completion bash", "its last line says how to use it"),),
+)
+@click.argument("shell", type=click.Choice(tuple(_SHELLS)))
+def completion_command(shell: str) -> None:
+    """Print the script that completes commands, options and files; its last line says where it goes."""
+    found = get_completion_class(shell)
+    assert found is not None
+    say_lines(found(click.Command(PROGRAM), {}, PROGRAM, "_EXPORT_MODEL_COMPLETE").source())
+    say(f"# {_SHELLS[shell]}")
 
 
 for _command in (

@@ -13,8 +13,8 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from exporter import __version__
 from exporter.cli.terminal import say
-from exporter.version import __version__
 from signatures.errors import UsageError
 
 PROGRAM = "export-model"

@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from converters.bundle.bundle import Bundle
 from converters.bundle.embed import runnable
 from converters.folders import scratch_folder
 from converters.formats import WRITTEN
 from converters.frozen_graph.writer import frozen
-from converters.graph.nodes import Graph
+from converters.graph.nodes import Graph, Node, TensorShape
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from converters.saved_model.writer import signatures_of
@@ -24,18 +26,13 @@ from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
-from exporter.verify.outline import outline
 from exporter.verify.participants import PolicyUnderTest
 from exporter.verify.report import ParityReport
 from exporter.verify.verification import verify
 from signatures.contract import POLICY, Contract, safe_name
-from signatures.errors import (
-    BundleError,
-    RuntimeUnavailableError,
-    UsageError,
-    naming,
-)
+from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
 from signatures.fields import printable
+from signatures.roles import Role
 from signatures.spec import PolicySignature
 
 if TYPE_CHECKING:
@@ -92,7 +89,7 @@ def verify_folder(
         with naming(reference):
             found.check_graph(runnable(graph))
     else:
-        graph = outline(signature, noise_kept=contract.source.noise_kept)
+        graph = _outline(signature, noise_kept=contract.source.noise_kept)
     graph = graph if again is None else again.policy.graph
     policy = Policy(
         found.name,
@@ -209,6 +206,22 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
             fix="export the policy again",
         )
     return graph
+
+
+def _outline(signature: PolicySignature, *, noise_kept: bool) -> Graph:
+    """A graph where a bundle has none that we read: what is asked of it is which outputs are drawn. These are samplers,
+    the others constants.
+    """
+    size = Node("size", "Const", value=np.array([1, 1], np.int32))
+    nodes = [size]
+    for spec in signature.inputs:
+        attrs = {"dtype": np.dtype(spec.dtype), "shape": TensorShape(spec.shape)}
+        nodes.append(Node(spec.name, "Placeholder", attrs=attrs))
+    for spec in signature.outputs:
+        drawn = spec.role is Role.SAMPLED or (spec.role is Role.CONTINUOUS and noise_kept)
+        attrs = {"dtype": np.dtype(np.float32)} if drawn else {}
+        nodes.append(Node(spec.name, "RandomStandardNormal" if drawn else "Identity", ("size",), attrs))
+    return Graph(tuple(nodes))
 
 
 def _source_of(source: Path, contract: Contract, step: int | None, trust_source: bool) -> Source:

@@ -15,11 +15,18 @@ from converters.folders import scratch_folder
 from converters.format import Artifact, Format
 from converters.formats import DEFAULTS, WRITTEN, written
 from converters.policy import Policy
-from exporter.export.job import Job, artefacts_of, tested_in, under_test
+from exporter.export.job import (
+    Job,
+    artefacts_of,
+    check_weights,
+    sizes_unrounded,
+    smaller,
+    tested_in,
+    under_test,
+)
 from exporter.export.labels import check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
 from exporter.export.options import ExportOptions
-from exporter.export.rounding import check_weights, sizes_unrounded, smaller
 from exporter.export.sources import Source, read_source
 from exporter.remote.fetching import nearby
 from exporter.remote.sending import check_free, check_sendable, landing
@@ -63,7 +70,7 @@ class ExportResult:
         return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {shown(self.folder)!r}>"
 
     def _repr_html_(self) -> str:
-        from exporter.reports.notebook import notebook
+        from exporter.reports.markup import notebook
 
         return notebook(repr(self)) if self.report is None else notebook(repr(self)) + self.report._repr_html_()
 

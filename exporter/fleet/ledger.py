@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from converters.fetch import address_of, read_bytes, shown
+from exporter import __version__
 from exporter.export.labels import read_labels
 from exporter.export.options import ExportOptions
 from exporter.remote.fetching import version
 from exporter.remote.filesystem import remote
-from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.digest import sha256_hex
 from signatures.errors import BundleError, SourceError

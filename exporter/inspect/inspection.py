@@ -105,7 +105,7 @@ class Inspection:
         return f"<Inspection of {str(self.path)!r}: {self.kind}, {names}{more}>"
 
     def _repr_html_(self) -> str:
-        from exporter.reports.notebook import notebook
+        from exporter.reports.markup import notebook
 
         tables = [t for p in self.policies for t in _tables(p.policy.signature)]
         return notebook(f"{self.path}: {self.kind}, {size_text(self.size)}", *tables)

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from exporter.reports.layers import Block
 from exporter.reports.layout import layout
 from exporter.reports.markup import Markup, el
+from exporter.verify.difference import BINS, FIRST, LAST
 from exporter.verify.findings import Finding
-from exporter.verify.histogram import BINS, FIRST, LAST
 
 _BAR, _STRIP, _ZERO_GAP = 17.0, 46.0, 18.0
 #: Lines have this many colours; a second round of them is dashed.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 from signatures.fields import printable
 
 _VOID = frozenset({"meta", "br", "hr", "wbr"})
+#: What MathJax 2 and 3 leave alone: a notebook reads $…$ as mathematics, which has links of its own.
+_PLAIN = "tex2jax_ignore mathjax_ignore"
 
 
 class Markup(str):
@@ -18,6 +20,7 @@ class Markup(str):
 
 
 Child: TypeAlias = "str | int | Iterable[Child] | None"
+Rows: TypeAlias = Iterable[Sequence[str]]
 
 
 def escaped(child: Child) -> Markup:
@@ -40,3 +43,13 @@ def el(tag: str, /, *children: Child, **attributes: str | int | float | None) ->
             parts.append(f'{key.rstrip("_").replace("_", "-")}="{escaped(text)}"')
     opening = f"<{' '.join(parts)}>"
     return Markup(opening if tag in _VOID else f"{opening}{escaped(children)}</{tag}>")
+
+
+def notebook(title: str, *tables: tuple[Sequence[str], Rows]) -> Markup:
+    """A result as a notebook shows it, in its own style: a line of text, and tables of a head and rows."""
+    return el("div", el("p", title), [_table(head, rows) for head, rows in tables], class_=_PLAIN)
+
+
+def _table(head: Sequence[str], rows: Rows) -> Markup:
+    body = [el("tr", [el("td", cell) for cell in row]) for row in rows]
+    return el("table", el("thead", el("tr", [el("th", h) for h in head])), el("tbody", body))

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from exporter import __version__
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.markup import Markup, el
 from exporter.reports.matrix import Row, matrix
 from exporter.reports.summary import verdict
 from exporter.verify.findings import Finding
-from exporter.version import __version__
 
 _CHIPS = {
     "passed": ("passed", "Passed"),

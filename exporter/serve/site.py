@@ -16,10 +16,10 @@ from converters.formats import WRITTEN
 from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from converters.runtimes.js import KERNELS
 from converters.tfjs.reader import content_of
+from exporter import __version__
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, INDEX, TYPES
-from exporter.version import __version__
 from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
 from signatures.records import dataclass

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import re
 
-from exporter.snippets.contract import Bundle, branch_lines, class_name, folded, numbered
-from exporter.snippets.frames import filled
+from exporter.snippets.contract import Bundle, branch_lines, class_name, filled, folded, numbered
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from string import Template
 
 from converters.bundle import bundle
 from converters.formats import WRITTEN
@@ -15,6 +16,8 @@ from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
+#: The frames: a file each, under its own language's name, in the form of Python's string.Template.
+_FRAMES = Path(__file__).resolve().parent / "templates"
 _FEED = {
     Role.VECTOR: "vector observation",
     Role.ENTITIES: "variable-length observation",
@@ -172,3 +175,9 @@ def class_name(name: str) -> str:
     """A name for a class."""
     words = "".join(w[:1].upper() + w[1:] for w in re.findall("[A-Za-z0-9]+", name)) or "Exported"
     return f"{words}Policy" if words[0].isalpha() else f"Policy{words}"
+
+
+def filled(template: str, /, **parts: str) -> str:
+    """The frame called ``template`` with its parts put in; it ends with one line break."""
+    text = Template((_FRAMES / f"{template}.tmpl").read_text(encoding="utf-8")).substitute(parts)
+    return text.rstrip("\n") + "\n"

@@ -8,11 +8,11 @@ from exporter.snippets.contract import (
     action_meaning,
     class_name,
     example_shape,
+    filled,
     identifier,
     meaning,
     quoted,
 )
-from exporter.snippets.frames import filled
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 

@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-from exporter.snippets.contract import (
-    STEPS,
-    Bundle,
-    action_meaning,
-    example_shape,
-    meaning,
-    quoted,
-)
-from exporter.snippets.frames import filled
+from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, filled, meaning, quoted
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 

@@ -11,8 +11,7 @@ import json
 import math
 from typing import Any
 
-from exporter.snippets.contract import Bundle, action_meaning, example_shape, meaning, quoted
-from exporter.snippets.frames import filled
+from exporter.snippets.contract import Bundle, action_meaning, example_shape, filled, meaning, quoted
 from exporter.snippets.python import play
 from signatures.roles import Role
 from signatures.spec import TensorSpec

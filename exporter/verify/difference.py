@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from exporter.verify.histogram import decades, decades_by_group
 from exporter.verify.tolerances import Tolerance
 from signatures.records import dataclass
 
@@ -17,6 +16,10 @@ NARROWED = {("int64", "int32")}
 SHARE = 1e-3
 #: Logarithm of the smallest float32 that has all its digits.
 _UNDERFLOW = float(np.log(np.finfo(np.float32).tiny))
+#: Of histograms: decades run from 10^FIRST to 10^LAST; the first takes what is smaller, the last what is larger.
+FIRST, LAST = -12, 3
+#: Entry 0 counts equal elements, entry 1 + i those of the decade from 10^(FIRST + i) on.
+BINS = 1 + LAST - FIRST + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +32,7 @@ class Difference:
     reason: str = ""
     #: What rounding explains at the element that differs most, where that was asked for.
     rounding: float = 0.0
-    #: Elements per decade of |a − b| (exporter/verify/histogram.py); empty where there are no numbers to compare.
+    #: Elements per decade of |a − b| (``BINS``); empty where there are no numbers to compare.
     histogram: tuple[int, ...] = ()
     #: The smallest t with |a − b| ≤ t + t·|b| everywhere; None where no number would do.
     smallest_tolerance: float | None = None
@@ -205,3 +208,28 @@ def ties(
         with np.errstate(invalid="ignore"):
             columns.append(~(top[:, 1] - top[:, 0] > margin))
     return np.stack(columns, axis=1)
+
+
+def decades(differences: np.ndarray) -> tuple[int, ...]:
+    """How ``differences`` (any shape) are spread: counts of elements per decade of |a − b|."""
+    flat = np.asarray(differences, np.float64).reshape(-1)
+    return tuple(decades_by_group(flat, np.zeros(flat.size, int), 1)[0].tolist())
+
+
+def decades_by_group(differences: np.ndarray, groups: np.ndarray, count: int) -> np.ndarray:
+    """Counts of ``differences`` (finite, not negative, [n]) by group: [count, BINS]; ``groups`` says whose each is."""
+    positive = differences > 0
+    places = np.zeros(differences.shape, int)
+    places[positive] = np.clip(np.floor(np.log10(differences[positive])).astype(int), FIRST, LAST) - FIRST + 1
+    return np.bincount(groups * BINS + places, minlength=count * BINS).reshape(count, BINS)
+
+
+def added(histograms: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
+    """The sum of histograms; empty ones count nothing."""
+    return tuple(map(sum, zip(*filter(None, histograms), strict=True)))
+
+
+def by_decade(counts: tuple[int, ...]) -> dict[str, int]:
+    """For parity.json: the lower edge of each decade that has elements ("0" for equal ones) and their number."""
+    names = ["0", *(f"1e{exponent}" for exponent in range(FIRST, LAST + 1))]
+    return {name: n for name, n in zip(names, counts, strict=True) if n}

@@ -6,7 +6,7 @@ import math
 from typing import Any, ClassVar
 
 from converters.runtimes.process import RunFailedError
-from exporter.verify.histogram import to_dict
+from exporter.verify.difference import by_decade
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
 from signatures.records import dataclass
@@ -96,7 +96,7 @@ class Finding:
     reason: str = ""
     drift: tuple[float, ...] = ()
     rounding: float = 0.0
-    #: Elements of all inputs per decade of ``|a − b|``, see exporter/verify/histogram.py.
+    #: Elements of all inputs per decade of ``|a − b|``, see exporter/verify/difference.py.
     histogram: tuple[int, ...] = ()
     #: The smallest t that would pass as atol and rtol; None where no tolerance would, or none is needed.
     smallest_tolerance: float | None = None
@@ -166,7 +166,7 @@ class Finding:
         if self.drift:
             entry["drift"] = [_number(d) for d in self.drift]
         if any(self.histogram):
-            entry["histogram"] = to_dict(self.histogram)
+            entry["histogram"] = by_decade(self.histogram)
         if self.smallest_tolerance is not None and not self.passed:
             entry["smallest_tolerance"] = self.smallest_tolerance
         if self.bisection is not None:

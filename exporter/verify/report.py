@@ -56,7 +56,7 @@ class ParityReport:
         return f"<ParityReport {self.policy!r} {self.verdict}: {len(self.comparisons)} comparisons{self._worst}>"
 
     def _repr_html_(self) -> str:
-        from exporter.reports.notebook import notebook
+        from exporter.reports.markup import notebook
 
         rows = [(p.format, p.runtime, "✓ ok" if p.passed else "✗ FAIL", p.worst_text) for p in self.pairs]
         return notebook(f"{self.policy}: {self.verdict}", (("format", "runtime", "verdict", "worst |Δ|"), rows))

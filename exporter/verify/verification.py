@@ -10,8 +10,7 @@ from converters.runtimes.registry import RuntimeInfo
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
-from exporter.verify.checks.golden import recorded
-from exporter.verify.checks.numbers import numbers
+from exporter.verify.checks.numbers import numbers, recorded
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.checks.size import check_budget, sizes
 from exporter.verify.findings import Finding, failure

@@ -18,7 +18,7 @@ from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph
 from converters.onnx.messages import CONTRACT_KEY
 from converters.schema import SavedModel, parse
-from exporter.version import __version__
+from exporter import __version__
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.contract import EMBEDDED

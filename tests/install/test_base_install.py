@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from converters.formats import DEFAULTS
+from exporter import __version__
 from exporter.export.pipeline import ExportOptions, export
-from exporter.version import __version__
 from fixtures import path
 
 # One group: the environment is made once, whatever the number of test processes.

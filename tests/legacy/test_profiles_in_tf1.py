@@ -12,7 +12,7 @@ import pytest
 from converters.frozen_graph.reader import read_graph
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.tensorflow1.found import RELEASES
+from converters.runtimes.tensorflow1 import RELEASES
 from converters.targets.profile import Profile
 from converters.targets.profiles import TFSHARP
 from fixtures import FIXTURES

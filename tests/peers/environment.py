@@ -87,7 +87,7 @@ def _place() -> Path:
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     digest = hashlib.sha256(REQUIREMENTS.read_bytes() + SHIM.read_bytes() + version.encode()).hexdigest()
     # Imported here: converters.runtimes.registry is small, but the benchmark's own process should stay smaller still.
-    from converters.runtimes.cache import cache_folder
+    from converters.runtimes.installed import cache_folder
 
     return cache_folder() / f"peers-{digest[:12]}"
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from exporter.reports.entry import Entry
 from exporter.verify import findings
+from exporter.verify.difference import BINS
 from exporter.verify.findings import Bisection, Finding, Numbers
-from exporter.verify.histogram import BINS
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
 

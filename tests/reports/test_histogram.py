@@ -7,20 +7,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.verify.difference import compare
-from exporter.verify.histogram import BINS, added, decades, to_dict
+from exporter.verify.difference import BINS, added, by_decade, compare, decades
 from exporter.verify.tolerances import Tolerance
 
 
 def test_decades_by_hand() -> None:
     counts = decades(np.array([[0.0, 0.0, 1e-20], [2e-7, 9e-7, 5e4]]))
-    assert to_dict(counts) == {"0": 2, "1e-12": 1, "1e-7": 2, "1e3": 1}
+    assert by_decade(counts) == {"0": 2, "1e-12": 1, "1e-7": 2, "1e3": 1}
     assert decades(np.array([])) == (0,) * BINS
 
 
 @given(arrays.arrays(np.float64, st.integers(0, 50), elements=st.floats(0, 1e300)))
 def test_every_element_is_counted_once_where_it_belongs(values: np.ndarray) -> None:
-    counts = to_dict(decades(values))
+    counts = by_decade(decades(values))
     assert sum(counts.values()) == values.size
     for name, count in counts.items():
         low = 0.0 if name in ("0", "1e-12") else float(name)
@@ -34,11 +33,11 @@ def test_every_element_is_counted_once_where_it_belongs(values: np.ndarray) -> N
 def test_sums() -> None:
     one = decades(np.array([1.0]))
     assert added([one, ()]) == added([(), one]) == one
-    assert to_dict(added([one, one])) == {"1e0": 2}
+    assert by_decade(added([one, one])) == {"1e0": 2}
     assert added([()]) == ()
 
 
 def test_a_comparison_counts_its_elements_and_none_where_there_are_no_numbers() -> None:
     a, b = np.array([1, 2, np.nan], np.float32), np.array([1, 2.5, np.nan], np.float32)
-    assert to_dict(compare(a, b, Tolerance()).histogram) == {"0": 2, "1e-1": 1}
+    assert by_decade(compare(a, b, Tolerance()).histogram) == {"0": 2, "1e-1": 1}
     assert compare(a, b[:2], Tolerance()).histogram == ()

@@ -9,17 +9,16 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from converters.bundle.bundle import dumps
-from exporter.reports.schemas import schema
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model
 from tests.reports.made import FAILING, PASSING, UNVERIFIED
-from tests.reports.validation import check_parity, check_policy
+from tests.reports.validation import check_parity, check_policy, schema
 
 
 @pytest.mark.parametrize("name", ["parity", "policy"])
 def test_a_schema_is_one(name: str) -> None:
-    found = schema(name)  # type: ignore[arg-type]
+    found = schema(name)
     Draft202012Validator.check_schema(found)
     assert found["$schema"] == "https://json-schema.org/draft/2020-12/schema"
 
@@ -59,7 +58,7 @@ def test_contracts_fit(name: str, tmp_path: Path) -> None:
 def test_every_field_is_documented() -> None:
     text = (ROOT / "docs" / "parity.md").read_text(encoding="utf-8")
     for name in ("parity", "policy"):
-        found = schema(name)  # type: ignore[arg-type]
+        found = schema(name)
         parts = [found, *found["$defs"].values()]
         for field in {field for part in parts for field in part.get("properties", {})}:
             assert f"`{field}`" in text, field

@@ -8,7 +8,12 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from exporter.reports.schemas import schema
+from tests.commands import ROOT
+
+
+def schema(name: str) -> Any:
+    """The schema of parity.json or policy.json."""
+    return json.loads((ROOT / "exporter" / "reports" / f"{name}.schema.json").read_text(encoding="utf-8"))
 
 
 def closed(part: Any) -> Any:

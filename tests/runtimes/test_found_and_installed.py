@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.cache import cache_folder
+from converters.runtimes.installed import cache_folder
 from converters.runtimes.javascript import node as runtimes
 from converters.runtimes.javascript.node import install_packages, js_home, node_executable
 from converters.runtimes.registry import RuntimeInfo, available_runtimes

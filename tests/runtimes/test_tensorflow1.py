@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from converters.runtimes.registry import Runtime, RuntimeInfo
-from converters.runtimes.tensorflow1 import found
+from converters.runtimes.tensorflow1 import RUNTIMES, found
 from converters.runtimes.tensorflow1 import install as legacy_install
 from converters.runtimes.tensorflow1 import release as legacy
-from converters.runtimes.tensorflow1.found import RUNTIMES
 from converters.runtimes.tensorflow1.install import install, weaken_python_symbols
 from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
@@ -119,7 +118,7 @@ def test_what_lies_in_the_cache_is_installed(
     assert runtime.find() == RuntimeInfo(release.runtime, True, release.version, how)
     with pytest.raises(RuntimeUnavailableError, match="is not the file that was installed"):
         runtime.command()
-    monkeypatch.setattr("converters.runtimes.tensorflow1.found.check", lambda *known: None)
+    monkeypatch.setattr("converters.runtimes.tensorflow1.check", lambda *known: None)
     assert runtime.command()[-2:] == [release.runtime, str(folder / API_LIBRARY)]
 
 

@@ -15,8 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
-from converters.runtimes.cache import built_beside, cache_folder
-from converters.runtimes.checked import check
+from converters.runtimes.installed import built_beside, cache_folder, check
 from converters.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError

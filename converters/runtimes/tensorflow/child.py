@@ -3,13 +3,15 @@
 What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``values`` (the training graph of a session of
 the user's, its variables' values in the numpy archive ``archive``, in the order of ``names``), ``function`` (a
 SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model`` (a SavedModel called by
-``signature``).
+``signature``), ``keras`` (a Keras model of Keras' own layers, which is not run but given back as bytes: its GraphDef as
+``graph``, a JSON object of its inputs' and outputs' tensors as ``names``).
 
 ``python -m converters.runtimes.tensorflow.child``
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,8 +21,9 @@ import numpy as np
 
 from converters.graph.ops.table import VARIABLES
 from converters.runtimes.child import Model, claim_stdout, serve
-from converters.runtimes.tensorflow.freeze import frozen_function
+from converters.runtimes.tensorflow.freeze import FrozenFunction, frozen_function
 from converters.runtimes.wire import Tensors
+from signatures.errors import ExportModelError
 
 
 def main() -> None:
@@ -94,11 +97,29 @@ def main() -> None:
             return Saved(path, header.get("signature", "serving_default"))
         if kind == "values":
             return given(path, header["archive"], header["names"])
+        if kind == "keras":
+            from converters.keras.config import config_inside, refuse_code
+
+            refuse_code(config_inside(path))
+            return _Frozen(frozen_function(path, "keras"))
         if kind == "function":
             return InSession(imported(frozen_function(path, header["form"], header.get("signature")).graph_def))
         return frozen(path)
 
-    serve("tensorflow", tf.__version__, load, (tf.errors.OpError, AttributeError, RuntimeError), out)
+    faults = (tf.errors.OpError, AttributeError, RuntimeError, ImportError, ExportModelError)
+    serve("tensorflow", tf.__version__, load, faults, out)
+
+
+class _Frozen:
+    def __init__(self, function: FrozenFunction) -> None:
+        self.function = function
+
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        function = self.function
+        names = {"inputs": function.inputs, "outputs": function.outputs, "signature": function.signature}
+        graph = function.graph_def.SerializeToString(deterministic=True)
+        return {name: np.frombuffer(data, np.uint8) for name, data in
+                (("graph", graph), ("names", json.dumps(names).encode()))}  # fmt: skip
 
 
 def _tensor(name: str) -> str:

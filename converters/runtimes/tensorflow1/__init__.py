@@ -1,5 +1,50 @@
-"""TensorFlow 1.4 and 1.7: the C libraries that Unity's TensorFlowSharp drove."""
+"""TensorFlow 1.4 and 1.7, the C libraries that Unity's TensorFlowSharp drove: are they here, started, installed."""
 
-from converters.runtimes.tensorflow1.found import RUNTIMES
+from __future__ import annotations
 
-__all__ = ["RUNTIMES"]
+from functools import partial
+from pathlib import Path
+
+from converters.runtimes.base import Progress, Runtime, RuntimeInfo
+from converters.runtimes.installed import check
+from converters.runtimes.python import child_command
+from converters.runtimes.tensorflow1.release import (
+    API_LIBRARY,
+    RELEASES,
+    Release,
+    how,
+    is_whole,
+    library_folder,
+    unsupported_reason,
+)
+from signatures.errors import RuntimeUnavailableError
+
+
+def _find(release: Release) -> RuntimeInfo:
+    reason = unsupported_reason()
+    if reason is not None:
+        return RuntimeInfo(release.runtime, False, None, reason, supported=False)
+    here = is_whole(library_folder(release))
+    return RuntimeInfo(release.runtime, here, release.version if here else None, how(release))
+
+
+def _command(release: Release) -> list[str]:
+    folder = library_folder(release)
+    if not is_whole(folder):
+        raise RuntimeUnavailableError(f"the runtime {release.runtime} is not installed", fix=how(release))
+    check(folder, release.libraries, how(release))
+    return child_command("converters.runtimes.tensorflow1.child", release.runtime, str(folder / API_LIBRARY))
+
+
+def _install(release: Release, progress: Progress) -> Path:
+    from converters.runtimes.tensorflow1.install import install  # what unpacks is imported where that is done
+
+    return install(release, progress)
+
+
+def _runtime(release: Release) -> Runtime:
+    # A library of an old TensorFlow reads frozen graphs; SavedModels would need the wheel's Python code.
+    return Runtime(release.runtime, partial(_find, release), partial(_command, release), partial(_install, release))
+
+
+RUNTIMES = tuple(_runtime(release) for release in RELEASES)

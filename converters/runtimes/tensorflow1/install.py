@@ -12,7 +12,7 @@ import zipfile
 from pathlib import Path
 
 from converters.runtimes.base import Progress
-from converters.runtimes.cache import built_beside
+from converters.runtimes.installed import built_beside
 from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     LIBRARIES,

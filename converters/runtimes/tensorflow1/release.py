@@ -13,7 +13,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from converters.runtimes.cache import cache_folder
+from converters.runtimes.installed import cache_folder
 from signatures.records import dataclass
 
 API_LIBRARY = "_pywrap_tensorflow_internal.so"

@@ -1,4 +1,4 @@
-"""Every output's numbers, for inputs that are given one at a time."""
+"""Every output's numbers, for inputs that are given one at a time; and the reference's for what a user recorded."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from converters.formats import narrows
-from exporter.verify.difference import Difference, wrong
+from exporter.verify.difference import Difference, added, wrong
 from exporter.verify.findings import Bisection, Finding, Numbers, Shape
-from exporter.verify.histogram import added
 from exporter.verify.participants import Feeds, Participant
 from exporter.verify.trial import Trial
 from signatures.roles import Role
@@ -87,6 +86,26 @@ def plausible(
         if (got < 0).any() or (got >= sizes).any():
             return wrong("a class outside of its branch was drawn")
     return Difference(0.0, 0.0, True)
+
+
+def recorded(trial: Trial) -> Iterator[Finding]:
+    """The reference beside what a user recorded (exporter/verify/golden.py); what hangs on noise that was not is left
+    out.
+    """
+    golden, reference = trial.golden, trial.reference
+    names = [s.name for s in trial.signature.outputs if s.name not in reference.drawn]
+    noisy = trial.tested.graph.descendants(golden.noiseless)
+    names = [n for n in names if n not in noisy]
+    participant = Participant("golden", reference.runtime, reference.run, names, reference.model)
+    worst: dict[str, tuple[Difference, str]] = {}
+    answers = trial.expected[len(trial.cases) - len(golden.cases) :]
+    for case, expected, arrays in zip(golden.cases, answers, golden.answers, strict=True):
+        for name in (n for n in arrays if n in names and n in expected):
+            found = trial.difference(name, expected, arrays[name], participant)
+            if name not in worst or rank(found) > rank(worst[name][0]):
+                worst[name] = (found, case.name)
+    for name, (difference, where) in worst.items():
+        yield trial.finding(Numbers, participant, name, difference, where)
 
 
 def rank(difference: Difference) -> tuple[bool, float]:

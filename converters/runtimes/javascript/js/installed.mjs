@@ -1,6 +1,6 @@
 /**
  * Of the npm packages, nothing but the files of installed.json is run: their hashes were checked before this process was
- * started (converters/runtimes/checked.py), those of a file that somebody put beside them were not.
+ * started (converters/runtimes/installed.py), those of a file that somebody put beside them were not.
  */
 
 import { readFileSync, realpathSync } from "node:fs";
