@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterable, Sequence
 
 from exporter.reports.entry import Entry
-from exporter.reports.matrix import matrix
 from exporter.reports.summary import verdict
+from exporter.tables import sized
 from signatures.fields import printable
 
 #: Behind an @, so that no user is called by it.
@@ -35,13 +35,13 @@ def _policy(entry: Entry) -> list[str]:
         lines += [f"- ❌ {text(first)}", *(f"  - {text(line)}" for line in rest)]
     if report.failures:
         lines.append("")
-    found = matrix(report)
-    head = ("format", "runtime", "size", *(code(o) for o in found.outputs), "verdict")
+    head = ("format", "runtime", "size", *(code(o) for o in report.outputs), "verdict")
     rows = []
-    for row in sorted(found.rows, key=lambda r: r.passed):
-        cells = [row.cells.get(o) for o in found.outputs]
-        shown = ["–" if c is None else c.text if c.passed else f"**{c.text}**" for c in cells]
-        rows.append([code(row.format), code(row.runtime), row.size, *shown, "ok" if row.passed else "**FAIL**"])
+    for pair in sorted(report.pairs, key=lambda p: p.passed):
+        cells = [pair.worst.get(o) for o in report.outputs]
+        shown = ["–" if c is None else c.short() if c.passed else f"**{c.short()}**" for c in cells]
+        size = sized(pair.format, report.sizes, report.whole_sizes)
+        rows.append([code(pair.format), code(pair.runtime), size, *shown, "ok" if pair.passed else "**FAIL**"])
     lines += [*_table(head, rows), ""]
     tolerances = [
         f"- {code(c.output)} in {code(f'{c.format}/{c.runtime}')}: atol {c.tolerance.atol:g}, "

@@ -10,9 +10,9 @@ from exporter import __version__
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.markup import Markup, el
-from exporter.reports.matrix import Row, matrix
 from exporter.reports.summary import verdict
 from exporter.verify.findings import Finding
+from exporter.verify.report import Pair
 
 _CHIPS = {
     "passed": ("passed", "Passed"),
@@ -71,7 +71,7 @@ def page(entries: Sequence[Entry]) -> str:
 
 def _overview(entries: Sequence[Entry]) -> Markup:
     """Policies by format and runtime: how much of what is allowed the worst difference takes, as a colour."""
-    found = [{(row.format, row.runtime): row for row in matrix(e.report).rows} for e in entries]
+    found = [{(p.format, p.runtime): p for p in e.report.pairs} for e in entries]
     pairs = list(dict.fromkeys(pair for rows in found for pair in rows))
     table = [
         (
@@ -91,13 +91,13 @@ def _overview(entries: Sequence[Entry]) -> Markup:
     )
 
 
-def _heat(row: Row | None) -> Markup:
+def _heat(pair: Pair | None) -> Markup:
     """The worst of a format in a runtime; the colour says how much of the tolerance it takes."""
-    if row is None:
+    if pair is None:
         return el("td", "–", class_="number soft")
-    if not row.passed:
+    if not pair.passed:
         return el("td", el("span", "✗"), class_="heat over")
-    worst = max((cell.worst for cell in row.cells.values() if cell.worst.measured), key=_share, default=None)
+    worst = max((c for c in pair.worst.values() if c.measured), key=_share, default=None)
     if worst is None:
         return el("td", "✓", class_="heat equal")
     share = _share(worst)

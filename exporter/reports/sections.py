@@ -11,7 +11,6 @@ from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
-from exporter.reports.matrix import Cell, matrix
 from exporter.tables import sized, typed
 from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
@@ -137,14 +136,13 @@ def _failure(c: Finding) -> Markup:
 
 def agreement(entry: Entry) -> Markup:
     """Format × runtime × output, the worst difference of each."""
-    found = matrix(entry.report)
-    rows = []
-    for row in found.rows:
-        verdict = el("td", "✓ ok" if row.passed else "✗ fails", class_="ok" if row.passed else "fail")
-        cells: list[Child] = [_breakable(row.format), row.runtime, verdict, el("td", row.size, class_="number")]
-        cells += [_cell(row.cells.get(output)) for output in found.outputs]
-        rows.append(cells)
-    head = ("format", "runtime", "verdict", "size", *found.outputs)
+    report, rows = entry.report, []
+    for pair in report.pairs:
+        verdict = el("td", "✓ ok" if pair.passed else "✗ fails", class_="ok" if pair.passed else "fail")
+        size = el("td", sized(pair.format, report.sizes, report.whole_sizes), class_="number")
+        worst = [_cell(pair.worst.get(output)) for output in report.outputs]
+        rows.append([_breakable(pair.format), pair.runtime, verdict, size, *worst])
+    head = ("format", "runtime", "verdict", "size", *report.outputs)
     caption = "Worst absolute difference from the reference over all inputs, per output"
     return section("Agreement", table(caption, head, rows, range(3, len(head))))
 
@@ -155,10 +153,10 @@ def _breakable(name: str) -> Child:
     return [head, colon, el("wbr"), rest] if colon else name
 
 
-def _cell(cell: Cell | None) -> Markup:
-    if cell is None:
+def _cell(worst: Finding | None) -> Markup:
+    if worst is None:
         return el("td", "–", class_="number soft")
-    return el("td", el("span", cell.text), class_="number" if cell.passed else "number fail")
+    return el("td", el("span", worst.short()), class_="number" if worst.passed else "number fail")
 
 
 def spread(entry: Entry) -> Markup | None:
@@ -185,13 +183,8 @@ def spread(entry: Entry) -> Markup | None:
 def _equal_text(equal: Sequence[Finding], of: int) -> str | None:
     """Who was exactly the reference: they would be drawn as a line on the floor."""
     names = ", ".join(dict.fromkeys(c.where for c in equal))
-    return (
-        None
-        if not equal
-        else "Equal to the last bit in all."
-        if len(equal) == of
-        else f"Equal to the last bit: {names}."
-    )
+    all_of_it = "Equal to the last bit in all." if len(equal) == of else f"Equal to the last bit: {names}."
+    return all_of_it if equal else None
 
 
 def _figure(title: str, picture: Markup | None, caption: str | None) -> Markup:
@@ -282,25 +275,12 @@ def worst_inputs(entry: Entry) -> Markup | None:
             worst[c.output] = max(worst.get(c.output, c), c, key=lambda c: (not c.passed, c.max_abs_diff))
     if not worst:
         return None
-    rows = [
-        (
-            el("code", c.output),
-            c.where,
-            _number(c.max_abs_diff),
-            c.worst_input,
-            _wide(_fed(entry, c)),
-        )
-        for c in worst.values()
-    ]
+    rows = []
+    for c in worst.values():
+        fed = [el("div", el("code", n), f" {shortened(a)}") for n, a in entry.feeds(c.worst_input or "").items()]
+        rows.append((el("code", c.output), c.where, f"{c.max_abs_diff:.3g}", c.worst_input, _wide(fed or "–")))
     head = ("output", "where", "|Δ|", "input", "values of its first row")
     return section("Worst inputs", table("The input on which each output differs most", head, rows))
-
-
-def _fed(entry: Entry, c: Finding) -> Child:
-    lines = []
-    for name, array in entry.feeds(c.worst_input or "").items():
-        lines.append(el("div", el("code", name), f" {shortened(array)}"))
-    return lines or "–"
 
 
 def shortened(array: np.ndarray) -> str:
@@ -309,10 +289,6 @@ def shortened(array: np.ndarray) -> str:
     values = [f"{float(v):.4g}" for v in row[:_SHOWN_VALUES]]
     rest = f", … {row.size - _SHOWN_VALUES} more" if row.size > _SHOWN_VALUES else ""
     return f"[{', '.join(values)}{rest}]"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def tolerances(entry: Entry) -> Markup:
@@ -331,13 +307,7 @@ def tolerances(entry: Entry) -> Markup:
         bounds = ("output", "where", "bound", "reason")
         content.append(table("Tolerances other than the default, with their reasons", bounds, dict.fromkeys(special)))
     rounded = [
-        (
-            el("code", c.output),
-            c.where,
-            _number(c.max_abs_diff),
-            _number(c.rounding),
-            c.worst_input,
-        )
+        (el("code", c.output), c.where, f"{c.max_abs_diff:.3g}", f"{c.rounding:.3g}", c.worst_input)
         for c in comparisons
         if c.rounding and c.passed
     ]

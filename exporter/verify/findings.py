@@ -120,6 +120,14 @@ class Finding:
         """What is said of the output in a table."""
         return f"{self.max_abs_diff:.1e}" if self.max_abs_diff else "0"
 
+    def short(self) -> str:
+        """The same in a few characters, marked where it did not pass."""
+        if self.passed or (self.measured and not self.reason):
+            return self.cell()
+        if not self.measured:
+            return f"✗ {self.cell()}"
+        return f"✗ {self.reason.split(' instead of')[0]}" if len(self.reason) < 40 else "✗"
+
     def columns(self) -> tuple[str, str, str]:
         """The difference, the relative one and what is allowed, for a table; empty where there is no such number."""
         return "", "", ""

@@ -10,6 +10,10 @@ from exporter.verify.findings import Failure, Finding, Shape
 from signatures.records import dataclass
 
 
+def _badness(c: Finding) -> tuple[bool, bool, float]:
+    return not c.passed, c.measured, c.max_abs_diff
+
+
 @dataclass(frozen=True, slots=True)
 class Pair:
     """All findings on one format (of a SavedModel: one signature) in one runtime."""
@@ -24,10 +28,19 @@ class Pair:
         return all(c.passed for c in self.findings)
 
     @property
+    def worst(self) -> dict[str, Finding]:
+        """Output → the worst that was found of it; an output that has no answer is not in it."""
+        worst: dict[str, Finding] = {}
+        for c in self.findings:
+            if not isinstance(c, Failure):
+                worst[c.output] = max(worst.get(c.output, c), c, key=_badness)
+        return worst
+
+    @property
     def worst_text(self) -> str:
         """The largest difference with its output, of what failed where anything did; else what there is to say."""
         told = [c for c in self.findings if not isinstance(c, Failure)]
-        worst = max(told, key=lambda c: (not c.passed, c.measured, c.max_abs_diff), default=None)
+        worst = max(told, key=_badness, default=None)
         if worst is None:
             return "no answer"
         drawn = dict.fromkeys(c.output for c in told if isinstance(c, Shape) and c.output != worst.output)
@@ -76,6 +89,11 @@ class ParityReport:
         for c in self.comparisons:
             groups.setdefault((c.format, c.runtime), []).append(c)
         return tuple(Pair(kind, runtime, tuple(found)) for (kind, runtime), found in groups.items())
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The outputs that any runtime answered for."""
+        return tuple(dict.fromkeys(c.output for c in self.comparisons if not isinstance(c, Failure)))
 
     @property
     def verdict(self) -> str:

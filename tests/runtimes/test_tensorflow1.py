@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from converters.runtimes import tensorflow1 as found
 from converters.runtimes.registry import Runtime, RuntimeInfo
-from converters.runtimes.tensorflow1 import RUNTIMES, found
+from converters.runtimes.tensorflow1 import RUNTIMES
 from converters.runtimes.tensorflow1 import install as legacy_install
 from converters.runtimes.tensorflow1 import release as legacy
 from converters.runtimes.tensorflow1.install import install, weaken_python_symbols
