@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 from pathlib import Path
@@ -76,9 +77,35 @@ class Bundle:
         return next((s for s in self.signature.inputs if s.role is Role.PREV_ACTION), None)
 
     @property
+    def kept(self) -> dict[str, str]:
+        """Input → the variable that a snippet keeps for it from step to step."""
+        kept = {} if self.memory is None else {self.memory[0].name: "memory"}
+        return kept if self.previous is None else {**kept, self.previous.name: "previous"}
+
+    @property
     def heads(self) -> tuple[TensorSpec, ...]:
         """The outputs that are the actions: one, or two of a hybrid."""
         return tuple(head.spec for head in self.signature.heads)
+
+    @property
+    def kinds(self) -> list[str]:
+        """Of which kind each of ``heads`` is."""
+        return ["continuous" if head.is_continuous else "discrete" for head in self.heads]
+
+    @property
+    def variables(self) -> list[str]:
+        """What a snippet calls each of ``heads``."""
+        return ["action"] if len(self.heads) == 1 else self.kinds
+
+    @property
+    def fetched(self) -> dict[str, TensorSpec]:
+        """Variable → the output without chance (a draw from log-probabilities is for who knows how)."""
+        return {name: self.plain(head) for name, head in zip(self.variables, self.heads, strict=True)}
+
+    @property
+    def taken(self) -> str:
+        """The variable with the discrete actions, which the next step may be fed."""
+        return "action" if len(self.heads) == 1 else "discrete"
 
     def plain(self, head: TensorSpec) -> TensorSpec:
         """The output with ``head``'s action without chance; the head itself where there is none."""
@@ -100,6 +127,11 @@ def read_bundle(folder: Path) -> Bundle:
 def example_shape(spec: TensorSpec) -> tuple[int, ...]:
     """The shape for one agent; 1 for every other free axis, too."""
     return tuple(1 if n is None else n for n in spec.shape)
+
+
+def example_size(spec: TensorSpec) -> int:
+    """Numbers of one agent."""
+    return math.prod(example_shape(spec))
 
 
 def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:

@@ -8,6 +8,7 @@ from exporter.snippets.contract import (
     action_meaning,
     class_name,
     example_shape,
+    example_size,
     filled,
     identifier,
     meaning,
@@ -44,12 +45,9 @@ def tensorflowsharp(bundle: Bundle) -> str:
     if previous is not None:
         before.append(f"var previous = {_array(previous)};  // no action yet")
     for spec in bundle.signature.inputs:
-        value = (
-            "memory" if memory is not None and spec == memory[0] else "previous" if spec == previous else _array(spec)
-        )
         lines += [f"// {line}" for line in meaning(bundle, spec)]
-        lines.append(f"runner.AddInput(graph[{quoted(spec.name)}][0], {value});")
-    fetched = _fetched(bundle)
+        lines.append(f"runner.AddInput(graph[{quoted(spec.name)}][0], {bundle.kept.get(spec.name) or _array(spec)});")
+    fetched = bundle.fetched
     outputs = [*fetched.values()] if memory is None else [*fetched.values(), bundle.signature.output(memory[1])]
     lines += [f"runner.Fetch(graph[{quoted(spec.name)}][0]);" for spec in outputs]
     lines.append("TFTensor[] output = runner.Run();")
@@ -61,11 +59,10 @@ def tensorflowsharp(bundle: Bundle) -> str:
     if memory is not None:
         lines.append(f"memory = ({_kind(bundle.signature.output(memory[1]))})output[{len(fetched)}].GetValue();")
     if previous is not None:
-        taken = "discrete" if "discrete" in fetched else "action"
         place = "[branch]" if len(previous.shape) == 1 else "[0, branch]"
         lines += [
-            f"for (var branch = 0; branch < {taken}.GetLength(1); branch++)",
-            f"    previous{place} = ({_TYPES[previous.dtype]}){taken}[0, branch];",
+            f"for (var branch = 0; branch < {bundle.taken}.GetLength(1); branch++)",
+            f"    previous{place} = ({_TYPES[previous.dtype]}){bundle.taken}[0, branch];",
         ]
     lines += [
         f"for (var i = 0; i < {name}.GetLength(1); i++)\n    Console.WriteLine({name}[0, i]);" for name in fetched
@@ -77,13 +74,6 @@ def tensorflowsharp(bundle: Bundle) -> str:
     return filled(
         "tensorflowsharp.cs", type=class_name(bundle.name), path=quoted(bundle.path(f"{bundle.name}.bytes")), play=play
     )
-
-
-def _fetched(bundle: Bundle) -> dict[str, TensorSpec]:
-    """Variable → the output without chance (a draw from log-probabilities is the caller's)."""
-    single = len(bundle.heads) == 1
-    names = ("action" if single else "continuous" if h.is_continuous else "discrete" for h in bundle.heads)
-    return {name: bundle.plain(head) for name, head in zip(names, bundle.heads, strict=True)}
 
 
 def _kind(spec: TensorSpec) -> str:
@@ -107,15 +97,12 @@ def _array(spec: TensorSpec) -> str:
 
 def inference_engine(bundle: Bundle) -> str:
     """ModelLoader and Worker. The engine has float and int tensors; int64 becomes int."""
-    memory, previous = bundle.memory, bundle.previous
-    kept = {}
+    memory, previous, kept = bundle.memory, bundle.previous, bundle.kept
     fields = []
     if memory is not None:
-        kept[memory[0].name] = "memory"
-        fields.append(f"    float[] memory = new float[{_size(memory[0])}];  // the start of an episode")
+        fields.append(f"    float[] memory = new float[{example_size(memory[0])}];  // the start of an episode")
     if previous is not None:
-        kept[previous.name] = "previous"
-        fields.append(f"    int[] previous = new int[{_size(previous)}];  // no action yet")
+        fields.append(f"    int[] previous = new int[{example_size(previous)}];  // no action yet")
     parameters, body = [], []
     for spec in bundle.signature.inputs:
         variable = kept.get(spec.name) or identifier(spec.name)
@@ -124,14 +111,14 @@ def inference_engine(bundle: Bundle) -> str:
         shape = f"new TensorShape({', '.join(map(str, example_shape(spec)))})"
         tensor = f"{identifier(spec.name)}Tensor"
         if spec.role is Role.NOISE:
-            body.append(f"using var {tensor} = new Tensor<{kind}>({shape}, new {kind}[{_size(spec)}]);")
+            body.append(f"using var {tensor} = new Tensor<{kind}>({shape}, new {kind}[{example_size(spec)}]);")
         else:
             body.append(f"using var {tensor} = new Tensor<{kind}>({shape}, {variable});")
             if spec.name not in kept:
                 parameters.append(f"{kind}[] {variable}")
         body.append(f"worker.SetInput({quoted(spec.name)}, {tensor});")
     body.append("worker.Schedule();")
-    fetched = _fetched(bundle)
+    fetched = bundle.fetched
     for (name, spec), head in zip(fetched.items(), bundle.heads, strict=True):
         body += [f"// {line}" for line in action_meaning(bundle, head)]
         body.append(_read(spec, f"{name}Tensor"))
@@ -140,7 +127,7 @@ def inference_engine(bundle: Bundle) -> str:
         body.append(_read(bundle.signature.output(memory[1]), "memoryTensor"))
         body.append("memory = memoryTensor.DownloadToArray();")
     if previous is not None:
-        body.append(f"previous = {'discrete' if 'discrete' in fetched else 'action'};")
+        body.append(f"previous = {bundle.taken};")
     kinds = [f"{'float' if s.dtype == 'float32' else 'int'}[]" for s in fetched.values()]
     if len(fetched) == 1:
         result, answer = kinds[0], next(iter(fetched))
@@ -164,10 +151,3 @@ def inference_engine(bundle: Bundle) -> str:
 def _read(spec: TensorSpec, variable: str) -> str:
     kind = "float" if spec.dtype == "float32" else "int"
     return f"using var {variable} = (worker.PeekOutput({quoted(spec.name)}) as Tensor<{kind}>).ReadbackAndClone();"
-
-
-def _size(spec: TensorSpec) -> int:
-    size = 1
-    for n in example_shape(spec):
-        size *= n
-    return size

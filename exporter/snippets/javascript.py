@@ -6,8 +6,18 @@ A page lies beside the bundle's folder and takes its runtime from ``node_modules
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
-from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, filled, meaning, quoted
+from exporter.snippets.contract import (
+    STEPS,
+    Bundle,
+    action_meaning,
+    example_shape,
+    example_size,
+    filled,
+    meaning,
+    quoted,
+)
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
@@ -33,56 +43,35 @@ _ARRAYS = {
 
 def acting_tfjs(bundle: Bundle) -> str:
     """policy.mjs with TensorFlow.js."""
-    code = filled(
-        "acting_tfjs.mjs", module=_module(bundle), model=_url(bundle, "tfjs/model.json"), play=_agents(bundle)
-    )
-    return _page(bundle, _TFJS, code)
+    return _page(bundle, _TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle))
 
 
 def acting_ort(bundle: Bundle) -> str:
     """policy.mjs with onnxruntime-web."""
-    model = _url(bundle, f"{bundle.name}.onnx")
-    return _page(bundle, _ORT, filled("acting_ort.mjs", module=_module(bundle), model=model, play=_agents(bundle)))
+    return _page(bundle, _ORT, "acting_ort.mjs", f"{bundle.name}.onnx", _agents(bundle))
 
 
 def plain_tfjs(bundle: Bundle) -> str:
     """``tf.loadGraphModel`` alone."""
-    lines = _feeds(bundle, _tf_value)
-    fetched = _fetched(bundle)
-    lines.append("const outputs = model.predict(feeds);  // tensors by name; dispose of them in a long run: tf.dispose")
-    for name, output in fetched.items():
-        lines.append(f"const {name} = await outputs[{quoted(output)}].array();")
-    return _page(
-        bundle,
-        _TFJS,
-        filled("plain_tfjs.mjs", model=_url(bundle, "tfjs/model.json"), play=_steps(bundle, lines, _tf_value)),
-    )
+    run = "const outputs = model.predict(feeds);  // tensors by name; dispose of them in a long run: tf.dispose"
+    play = _plain(bundle, _tf_value, run, "const {} = await outputs[{}].array();")
+    return _page(bundle, _TFJS, "plain_tfjs.mjs", "tfjs/model.json", play)
 
 
 def plain_ort(bundle: Bundle) -> str:
     """onnxruntime-web alone."""
-    lines = _feeds(bundle, _ort_value)
-    fetched = _fetched(bundle)
-    lines.append("const outputs = await session.run(feeds);")
-    for name, output in fetched.items():
-        lines.append(f"const {name} = Array.from(outputs[{quoted(output)}].data, Number);")
-    return _page(
-        bundle,
-        _ORT,
-        filled("plain_ort.mjs", model=_url(bundle, f"{bundle.name}.onnx"), play=_steps(bundle, lines, _ort_value)),
-    )
+    run = "const outputs = await session.run(feeds);"
+    play = _plain(bundle, _ort_value, run, "const {} = Array.from(outputs[{}].data, Number);")
+    return _page(bundle, _ORT, "plain_ort.mjs", f"{bundle.name}.onnx", play)
 
 
-def _page(bundle: Bundle, runtime: tuple[str, str], code: str) -> str:
+def _page(bundle: Bundle, runtime: tuple[str, str], frame: str, model: str, play: str) -> str:
+    code = filled(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play)
     return filled("page.html", name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
 
 
 def _url(bundle: Bundle, relative: str) -> str:
     return quoted(f"./{bundle.name}/{relative}")
-
-
-def _module(bundle: Bundle) -> str:
-    return _url(bundle, "tfjs/policy.mjs")
 
 
 def _agents(bundle: Bundle) -> str:
@@ -101,8 +90,7 @@ def _agents(bundle: Bundle) -> str:
         extra.append("  },")
     lines += ["}, {", *extra, "});"] if extra else ["});"]
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
-    shown = ", ".join("decision.continuous" if h.is_continuous else "decision.discrete" for h in bundle.heads)
-    lines.append(f"console.log({shown});  // a row per agent")
+    lines.append(f"console.log({', '.join(f'decision.{kind}' for kind in bundle.kinds)});  // a row per agent")
     start = [
         "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): no draws",
         "const agents = policy.agent();",
@@ -110,46 +98,25 @@ def _agents(bundle: Bundle) -> str:
     return "\n".join([*start, *_looped(bundle, lines)])
 
 
-def _fetched(bundle: Bundle) -> dict[str, str]:
-    """Variable → output: the actions without chance (what draws from log-probabilities is in policy.mjs)."""
-    names = (
-        ["action"]
-        if len(bundle.heads) == 1
-        else ["continuous" if h.is_continuous else "discrete" for h in bundle.heads]
-    )
-    return {name: bundle.plain(head).name for name, head in zip(names, bundle.heads, strict=True)}
-
-
-def _feeds(bundle: Bundle, value: object) -> list[str]:
-    assert callable(value)
+def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: str) -> str:
+    """The lines from feeds to actions, with what goes from step to step; ``read`` takes a variable and an output."""
     lines = ["const feeds = {"]
     for spec in bundle.signature.inputs:
-        fed = value(spec)
-        if bundle.memory is not None and spec == bundle.memory[0]:
-            fed = "memory"
-        elif spec == bundle.previous:
-            fed = "previous"
-        lines += _entry(bundle, spec, fed)
-    return [*lines, "};"]
-
-
-def _steps(bundle: Bundle, lines: list[str], value: object) -> str:
-    """The lines with what goes from step to step."""
-    assert callable(value)
+        lines += _entry(bundle, spec, bundle.kept.get(spec.name) or value(spec))
+    lines += ["};", run]
+    lines += [read.format(name, quoted(output.name)) for name, output in bundle.fetched.items()]
     before: list[str] = []
-    fetched = _fetched(bundle)
     memory, previous = bundle.memory, bundle.previous
     if memory is not None:
         before.append(f"let memory = {value(memory[0])};  // the start of an episode; a row per agent")
         lines.append(f"memory = outputs[{quoted(memory[1])}];")
     if previous is not None:
         before.append(f"let previous = {value(previous)};  // no action yet")
-        taken = "discrete" if "discrete" in fetched else "action"
-        lines.append(_again(previous, taken, tensorflow=value is _tf_value))
+        lines.append(_again(previous, bundle.taken, tensorflow=value is _tf_value))
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
     chance = [f"outputs[{quoted(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]
     hint = f"  // deterministic; drawn: {', '.join(chance)}" if chance else ""
-    lines.append(f"console.log({', '.join(fetched)});{hint}")
+    lines.append(f"console.log({', '.join(bundle.fetched)});{hint}")
     return "\n".join([*before, *_looped(bundle, lines)])
 
 
@@ -195,9 +162,6 @@ def _ort_value(spec: TensorSpec) -> str:
 
 def _flat(spec: TensorSpec, kind: str | None = None) -> str:
     """A typed array of one agent's numbers; policy.mjs takes int64 as 32 bits."""
-    size = 1
-    for n in example_shape(spec):
-        size *= n
     kind = kind or ("Int32Array" if spec.dtype == "int64" else _ARRAYS[spec.dtype])
     one = "1n" if kind.startswith("Big") else "1"
-    return f"new {kind}({size})" + (f".fill({one})" if spec.role is Role.MASKS else "")
+    return f"new {kind}({example_size(spec)})" + (f".fill({one})" if spec.role is Role.MASKS else "")

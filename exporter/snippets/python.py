@@ -43,9 +43,7 @@ def load_policy(bundle: Bundle) -> str:
     lines.append(")")
     for head in bundle.heads:
         lines += [f"# {text}" for text in action_meaning(bundle, head)]
-    lines.append(
-        f"print({', '.join('decision.continuous' if h.is_continuous else 'decision.discrete' for h in bundle.heads)})"
-    )
+    lines.append(f"print({', '.join(f'decision.{kind}' for kind in bundle.kinds)})")
     return filled("load_policy.py", path=quoted(bundle.folder.as_posix()), play=looped(bundle, lines))
 
 
@@ -63,15 +61,14 @@ def play(bundle: Bundle, run: list[str]) -> str:
     for spec in bundle.signature.inputs:
         lines += _entry(bundle, spec, _fed(bundle, spec))
     lines += ["}", *run]
-    for head in bundle.heads:
-        lines += _action(bundle, head)
+    for variable, head in zip(bundle.variables, bundle.heads, strict=True):
+        lines += _action(bundle, variable, head)
     if memory is not None:
         lines.append(f"memory = outputs[{quoted(memory[1])}]")
     if previous is not None:
-        name = "discrete" if len(bundle.heads) > 1 else "action"
         shape = ".reshape(-1)" if len(previous.shape) == 1 else ""
-        lines.append(f"previous = {name}{shape}.astype({_dtype(previous)})")
-    lines.append(f"print({', '.join(_variable(bundle, head) for head in bundle.heads)})")
+        lines.append(f"previous = {bundle.taken}{shape}.astype({_dtype(previous)})")
+    lines.append(f"print({', '.join(bundle.variables)})")
     return "\n".join([*before, looped(bundle, lines)])
 
 
@@ -95,23 +92,15 @@ def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
 def _fed(bundle: Bundle, spec: TensorSpec) -> str:
     if spec.role is Role.NOISE:
         return f"rng.standard_normal({_shape(example_shape(spec))}, {_dtype(spec)})"
-    if bundle.memory is not None and spec == bundle.memory[0]:
-        return "memory"
-    return "previous" if spec == bundle.previous else array(spec)
+    return bundle.kept.get(spec.name) or array(spec)
 
 
 def _draws(bundle: Bundle) -> bool:
     return bool(bundle.signature.noise) or any(h.role in (Role.LOG_PROBS, Role.PROBS) for h in bundle.heads)
 
 
-def _variable(bundle: Bundle, head: TensorSpec) -> str:
-    if len(bundle.heads) == 1:
-        return "action"
-    return "continuous" if head.is_continuous else "discrete"
-
-
-def _action(bundle: Bundle, head: TensorSpec) -> list[str]:
-    variable, plain = _variable(bundle, head), bundle.plain(head)
+def _action(bundle: Bundle, variable: str, head: TensorSpec) -> list[str]:
+    plain = bundle.plain(head)
     lines = [f"# {text}" for text in action_meaning(bundle, head)]
     if plain != head:
         lines.append(f"# deterministic: outputs[{quoted(plain.name)}]")
