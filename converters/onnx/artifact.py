@@ -20,7 +20,6 @@ from converters.inner import Feeds, InnerTensors, Loaded, View
 from converters.onnx.messages import CONTRACT_KEY, files_of
 from converters.onnx.proto import array_of, decoded, dtype_name, load_external
 from converters.onnx.tensor_map import TENSORS_KEY, loads
-from converters.runtimes.process import unloading
 
 
 def ports(path: Path) -> Ports:
@@ -73,8 +72,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
                     open_model.graph.output.add(name=name)
             for name, data in files_of(open_model, detached, file.name).items():
                 data.write(file.with_name(name))
-            opened = loaded.pool.process(loaded.runtime).load(str(file), kind="graph")
-            with unloading(opened):
+            with loaded.pool.process(loaded.runtime).load(str(file), kind="graph") as opened:
                 values.update(opened.run({n: a for n, a in feeds.items() if n in fed}, wanted))
         return values
 

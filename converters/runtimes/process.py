@@ -316,15 +316,12 @@ class LoadedModel:
         return results
 
     def unload(self) -> None:
-        """Free it."""
-        self._process.unload(self._identity, self._size)
+        """Free it; a runtime that has died has freed it already."""
+        with contextlib.suppress(RunFailedError):
+            self._process.unload(self._identity, self._size)
 
+    def __enter__(self) -> LoadedModel:
+        return self
 
-@contextlib.contextmanager
-def unloading(model: LoadedModel) -> Iterator[None]:
-    """A model that is freed afterwards."""
-    try:
-        yield
-    finally:
-        with contextlib.suppress(RunFailedError):  # a runtime that has died has freed it already
-            model.unload()
+    def __exit__(self, *error: object) -> None:
+        self.unload()

@@ -16,7 +16,6 @@ from converters.format import Ports
 from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import normal_ref
 from converters.inner import Feeds, InnerTensors, Loaded, own_names
-from converters.runtimes.process import unloading
 from converters.saved_model.reader import read_saved_model
 from converters.saved_model.source import FILE, frozen_model, values_beside
 from converters.source import OriginalRun
@@ -54,5 +53,5 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         return model.run({fed[n]: a for n, a in feeds.items() if n in fed}, fetch)
 
-    with unloading(model):
+    with model:
         yield InnerTensors(own_names(n.name for n in definition.node), run)

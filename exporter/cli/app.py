@@ -8,7 +8,7 @@ from click.shell_completion import get_completion_class
 from exporter.cli.compare import compare_command
 from exporter.cli.demo import demo_command
 from exporter.cli.export import export_command
-from exporter.cli.group import PROGRAM, Command, SourceGroup, show_version
+from exporter.cli.group import PROGRAM, SourceGroup, command, show_version
 from exporter.cli.inspect import inspect_command
 from exporter.cli.runtimes import runtimes_command
 from exporter.cli.serve import serve_command
@@ -41,11 +41,10 @@ def app() -> None:
     """The group; its commands do the work."""
 
 
-@click.command(
+@command(
     "completion",
-    cls=Command,
-    short_help="Print the script for completion in a shell.",
-    examples=(("export-model completion bash", "its last line says how to use it"),),
+    "Print the script for completion in a shell.",
+    ("export-model completion bash", "its last line says how to use it"),
 )
 @click.argument("shell", type=click.Choice(tuple(_SHELLS)))
 def completion_command(shell: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.group import Command
+from exporter.cli.group import PATH, command
 from exporter.cli.options import JUDGING, as_given, comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
@@ -18,22 +18,17 @@ if TYPE_CHECKING:
     from exporter.verify.options import VerifyOptions
 
 
-@click.command(
+@command(
     "compare",
-    cls=Command,
-    short_help="Compare files made by any tool with a reference.",
-    examples=(
-        ("export-model compare 3DBall.bytes theirs.onnx", ""),
-        ("export-model compare 3DBall.bytes tfjs --map action=Identity", ""),
-    ),
+    "Compare files made by any tool with a reference.",
+    ("export-model compare 3DBall.bytes theirs.onnx", ""),
+    ("export-model compare 3DBall.bytes tfjs --map action=Identity", ""),
 )
-@click.argument("reference", type=click.Path(path_type=Path))
-@click.argument("candidates", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CANDIDATE...")
+@click.argument("reference", type=PATH)
+@click.argument("candidates", nargs=-1, required=True, type=PATH, metavar="CANDIDATE...")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
 @trusting
-@click.option(
-    "--runtimes", default="auto", show_default=True, metavar="WHERE", help="auto, full, browser, or runtimes by name."
-)
+@click.option("--runtimes", default="auto", metavar="WHERE", help="auto, full, browser, or runtimes by name.")
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if none of their runtimes is installed.")
 @reporting
 @understanding

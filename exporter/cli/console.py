@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from exporter.cli.group import FILE
 from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines
 from signatures.errors import UsageError
 from signatures.records import dataclass
@@ -251,12 +252,11 @@ def reporting(command: Callable[..., Any]) -> Callable[..., Any]:
         console = Console(**{name: options.pop(name) for name in names})
         return command(*args, console=console, **options)
 
-    file = click.Path(path_type=Path, dir_okay=False)
     for option in (
-        click.option("--tolerances", type=file, metavar="FILE", help="Other tolerances, each with its reason (TOML)."),
-        click.option("--junit", type=file, metavar="FILE", help="Write JUnit XML for a CI system."),
-        click.option("--markdown", type=file, metavar="FILE", help="Write a Markdown summary; '-' is stdout."),
-        click.option("--html", type=file, metavar="FILE", help="Write one page with tables and pictures."),
+        click.option("--tolerances", type=FILE, metavar="FILE", help="Other tolerances, each with its reason (TOML)."),
+        click.option("--junit", type=FILE, metavar="FILE", help="Write JUnit XML for a CI system."),
+        click.option("--markdown", type=FILE, metavar="FILE", help="Write a Markdown summary; '-' is stdout."),
+        click.option("--html", type=FILE, metavar="FILE", help="Write one page with tables and pictures."),
         click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
         click.option("-q", "--quiet", is_flag=True, help="Print only what disagrees."),
         click.option("-v", "--verbose", is_flag=True, help="Print every step and every comparison."),

@@ -9,23 +9,18 @@ from pathlib import Path
 import click
 
 from exporter.cli.export import export_command
-from exporter.cli.group import PROGRAM, Command
+from exporter.cli.group import PATH, PROGRAM, command
 from exporter.cli.serve import serve_command
 from exporter.cli.terminal import say
 
 
-@click.command(
+@command(
     "demo",
-    cls=Command,
-    short_help="Try it: export a trained policy, compare it, see it act.",
-    examples=(
-        ("export-model demo", "everything, and the page in your browser"),
-        ("export-model demo --no-open", "without the page"),
-    ),
+    "Try it: export a trained policy, compare it, see it act.",
+    ("export-model demo", "everything, and the page in your browser"),
+    ("export-model demo --no-open", "without the page"),
 )
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder for it all."
-)
+@click.option("-o", "--out", type=PATH, default=Path("demo"), help="Folder for it all.")
 @click.option("--no-open", is_flag=True, help="Do not open the page; exit once everything is written.")
 def demo_command(out: Path, no_open: bool) -> None:
     """Export a trained 3DBall that comes with the package, compare the formats in the installed runtimes, and open

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.group import Command
+from exporter.cli.group import PATH, command
 from exporter.cli.options import RULES, activating, as_given, comparing, read_options, trusting, understanding
 from exporter.cli.terminal import say_lines
 
@@ -22,69 +22,50 @@ if TYPE_CHECKING:
     from signatures.errors import ExportModelError
 
 
-@click.command(
+@command(
     "export",
-    cls=Command,
-    short_help="Export policies to every format, and compare them.",
-    examples=(
-        ("export-model 3DBall.bytes -o out", "four formats, compared"),
-        ("export-model results/first_run", "each behavior of a run"),
-        ("export-model 3DBall.nn --to onnx", "one format"),
-        ("export-model 3DBall.onnx --for unity6", "for the Model field"),
-        ("export-model 3DBall.bytes --verify full", "in every runtime"),
-    ),
+    "Export policies to every format, and compare them.",
+    ("export-model 3DBall.bytes -o out", "four formats, compared"),
+    ("export-model results/first_run", "each behavior of a run"),
+    ("export-model 3DBall.nn --to onnx", "one format"),
+    ("export-model 3DBall.onnx --for unity6", "for the Model field"),
+    ("export-model 3DBall.bytes --verify full", "in every runtime"),
 )
-@click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="SOURCE...")
-@click.option(
-    "-o",
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("exported"),
-    show_default=True,
-    help="Folder for the bundles, or an address.",
-)
-@click.option(
-    "--to",
-    "targets",
-    metavar="FORMATS",
-    help="bytes, saved_model, tfjs, onnx, nn (default: all but nn).",
-)
+@click.argument("sources", nargs=-1, type=PATH, metavar="SOURCE...")
+@click.option("-o", "--out", type=PATH, default=Path("exported"), help="Folder for the bundles, or an address.")
+@click.option("--to", "targets", metavar="FORMATS", help="bytes, saved_model, tfjs, onnx, nn (default: all but nn).")
 @click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
 @click.option(
     "--names",
     type=click.Choice(["canonical", "source"]),
     default="canonical",
-    show_default=True,
     help="Tensor names: canonical, or the trainer's own.",
 )
 @click.option(
     "--noise",
     type=click.Choice(["lift", "keep", "zero"]),
     default="lift",
-    show_default=True,
     help="Noise drawn in the graph: an input, kept, or removed.",
 )
 @click.option("--deterministic", is_flag=True, help="Make 'action' the deterministic one.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @trusting
-@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
+@click.option("--sensors", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
 @activating
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
     default="float32",
-    show_default=True,
     help="The type that weights are stored in.",
 )
 @click.option("--quantize", type=click.Choice(["int8"]), help="Store each weight in one byte.")
-@click.option("--labels", type=click.Path(path_type=Path), metavar="FILE", help="Names of observations and actions.")
+@click.option("--labels", type=PATH, metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @click.option(
     "--verify",
     "runtimes",
     default="auto",
-    show_default=True,
     metavar="WHERE",
     help="auto, full, browser, none, or runtimes by name.",
 )
@@ -104,7 +85,7 @@ def export_command(
     opset: int | None,
     runtimes: str,
     step: int | None,
-    sensors: str,
+    sensors: str | None,
     activation: str | None,
     trust_source: bool,
     labels: Path | None,

@@ -6,7 +6,7 @@ Imports click only.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from exporter.cli.terminal import say
 from signatures.errors import UsageError
 
 PROGRAM = "export-model"
+#: What options and arguments take that are paths: of any kind, of a file.
+PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 _OWN = frozenset(("--help", "-h", "--version"))
 
 
@@ -45,6 +47,7 @@ class Command(click.Command):
 
     def __init__(self, *args: Any, examples: Sequence[tuple[str, str]] = (), **rest: Any) -> None:
         super().__init__(*args, **rest)
+        self.context_settings.setdefault("show_default", True)
         self.examples = tuple(examples)
         width = max((len(typed) for typed, _ in examples), default=0)
         lines = [f"  {typed:{width}}  {what}" for typed, what in examples]
@@ -60,6 +63,11 @@ class Command(click.Command):
             if names:
                 with formatter.section(title):
                     formatter.write_dl([found[n] for n in sorted(names, key=_place)])
+
+
+def command(name: str, short_help: str, *examples: tuple[str, str]) -> Callable[[Callable[..., Any]], Command]:
+    """A function as the command ``name``."""
+    return click.command(name, cls=Command, short_help=short_help, examples=examples)
 
 
 def _place(name: str | None) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from exporter.cli.export import export_command
-from exporter.cli.group import Command
+from exporter.cli.group import FILE, PATH, command
 from exporter.cli.options import activating, as_given, read_options, trusting, understanding
 from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import ExportModelError, UsageError
@@ -19,28 +19,20 @@ if TYPE_CHECKING:
     from converters.source import ReadOptions
 
 
-@click.command(
+@command(
     "inspect",
-    cls=Command,
-    short_help="Show what is in a file, or what Unity would say about it.",
-    examples=(
-        ("export-model inspect 3DBall.nn", "inputs, outputs, layers"),
-        ("export-model inspect 3DBall.onnx --unity all", "what ML-Agents says to it"),
-        ("export-model inspect 3DBall.nn --svg 3DBall.svg", "a picture"),
-    ),
+    "Show what is in a file, or what Unity would say about it.",
+    ("export-model inspect 3DBall.nn", "inputs, outputs, layers"),
+    ("export-model inspect 3DBall.onnx --unity all", "what ML-Agents says to it"),
+    ("export-model inspect 3DBall.nn --svg 3DBall.svg", "a picture"),
 )
-@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SOURCE...")
+@click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SOURCE...")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
-@click.option("--logdir", type=click.Path(path_type=Path), metavar="DIR", help="Write its graph for TensorBoard.")
-@click.option(
-    "--svg",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Draw the policy (with --unity: Behavior Parameters).",
-)
+@click.option("--logdir", type=PATH, metavar="DIR", help="Write its graph for TensorBoard.")
+@click.option("--svg", type=PATH, metavar="FILE", help="Draw the policy (with --unity: Behavior Parameters).")
 @trusting
-@click.option("--sensors", default="", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
+@click.option("--sensors", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
 @activating
 @click.option(
     "--unity",
@@ -49,10 +41,10 @@ if TYPE_CHECKING:
     metavar="RELEASE",
     help="What Unity says about it: R20, R22, R23, R23-2.4, all.",
 )
-@click.option("--actions", default="", metavar="KINDS", help="With --unity: continuous:2, discrete:3,2, or both by +.")
+@click.option("--actions", metavar="KINDS", help="With --unity: continuous:2, discrete:3,2, or both by +.")
 @click.option(
     "--brain-parameters",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FILE,
     metavar="FILE",
     help="With --unity: the agent's sensors and actions, as JSON.",
 )
@@ -60,10 +52,10 @@ if TYPE_CHECKING:
 def inspect_command(
     sources: tuple[Path, ...],
     step: int | None,
-    sensors: str,
+    sensors: str | None,
     activation: str | None,
     releases: tuple[str, ...],
-    actions: str,
+    actions: str | None,
     brain_parameters: Path | None,
     trust_source: bool,
     as_json: bool,
@@ -144,15 +136,15 @@ def _inspected(
 def _unity(
     source: Path,
     releases: tuple[str, ...],
-    sensors: str,
-    actions: str,
+    sensors: str | None,
+    actions: str | None,
     parameters: Path | None,
     as_json: bool,
     svg: Path | None,
 ) -> tuple[int, dict[str, Any]]:
     from exporter.inspect.unity import accepted, check_for_unity, unity_report, unity_text
 
-    verdicts = check_for_unity(source, releases, sensors, actions, parameters)
+    verdicts = check_for_unity(source, releases, sensors or "", actions or "", parameters)
     if svg is not None:
         if len(verdicts) != 1:
             raise UsageError("--svg draws one verdict", fix="name one release and one file")

@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 from exporter.cli.console import Console
+from exporter.cli.group import FILE
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -75,11 +76,11 @@ JUDGING = frozenset(
 RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol"))
 
 
-def sensors_of(text: str) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
+def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
     """``"8,goal:3,20x4,3x84x84"``: the shapes of a vector, another, a list of entities and an image C, H, W; and the
     places of those that are goals.
     """
-    parts = [part.strip() for part in text.split(",") if part.strip()]
+    parts = [part.strip() for part in (text or "").split(",") if part.strip()]
     for part in parts:
         if not re.fullmatch("(goal:)?[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}){0,2}", part):
             raise UsageError(
@@ -91,7 +92,7 @@ def sensors_of(text: str) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]
     return shapes, tuple(i for i, part in enumerate(parts) if part.startswith("goal:"))
 
 
-def read_options(step: int | None, sensors: str, trust_source: bool, activation: str | None) -> ReadOptions:
+def read_options(step: int | None, sensors: str | None, trust_source: bool, activation: str | None) -> ReadOptions:
     """What a reader is told, of the command line's words. Raises UsageError."""
     from converters.source import ReadOptions
 
@@ -99,10 +100,12 @@ def read_options(step: int | None, sensors: str, trust_source: bool, activation:
     return ReadOptions(step, shapes, trust_source, goals, activation)
 
 
-def activating(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The option for files that have the weights of layers and not what stands between them."""
-    said = "Activation between the layers of a bare .pt: elu, tanh, …"
-    return click.option("--activation", metavar="NAME", help=said)(command)
+#: For files that have the weights of layers and not what stands between them.
+activating = click.option(
+    "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
+)
+#: For sources that only a loader of their own can read, which runs what they say.
+trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is no plain data; this can run code.")
 
 
 def _numbers(values: Sequence[str]) -> dict[str, float]:
@@ -114,12 +117,6 @@ def _numbers(values: Sequence[str]) -> dict[str, float]:
         except ValueError as error:
             raise UsageError(f"--set {name}={text}: a number, true or false is expected") from error
     return numbers
-
-
-def trusting(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The option for sources that only a loader of their own can read, which runs what they say."""
-    said = "Let Keras load what is no plain data; this can run code."
-    return click.option("--trust-source", is_flag=True, help=said)(command)
 
 
 def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -185,27 +182,14 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.IntRange(1),
             metavar="N",
             default=2,
-            show_default=True,
             help="Typical inputs per batch size.",
         ),
-        click.option("--seed", type=int, metavar="N", default=0, show_default=True, help="Seed of the inputs."),
-        click.option(
-            "--steps",
-            type=click.IntRange(1),
-            metavar="N",
-            default=4,
-            show_default=True,
-            help="Steps with the memory fed back.",
-        ),
+        click.option("--seed", type=int, metavar="N", default=0, help="Seed of the inputs."),
+        click.option("--steps", type=click.IntRange(1), metavar="N", default=4, help="Steps with the memory fed back."),
         click.option("--max-size", "sizes", multiple=True, metavar="[FORMAT=]SIZE", help="Fail above this size: 1MB."),
-        click.option(
-            "--golden",
-            type=click.Path(path_type=Path, dir_okay=False),
-            metavar="FILE",
-            help="Recorded inputs (and outputs), an .npz.",
-        ),
-        click.option("--atol", type=float, metavar="X", default=1e-5, show_default=True, help="Absolute tolerance."),
-        click.option("--rtol", type=float, metavar="X", default=1e-5, show_default=True, help="Relative tolerance."),
+        click.option("--golden", type=FILE, metavar="FILE", help="Recorded inputs (and outputs), an .npz."),
+        click.option("--atol", type=float, metavar="X", default=1e-5, help="Absolute tolerance."),
+        click.option("--rtol", type=float, metavar="X", default=1e-5, help="Relative tolerance."),
     ):
         collected = option(collected)
     return collected

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.group import Command
+from exporter.cli.group import PATH, command
 from exporter.cli.options import one_bundle
 from exporter.cli.terminal import say
 from signatures.errors import UsageError
@@ -16,31 +16,23 @@ from signatures.errors import UsageError
 _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "none")
 
 
-@click.command(
+@command(
     "serve",
-    cls=Command,
-    short_help="Open a page on which the policy acts.",
-    examples=(
-        ("export-model serve exported/3DBall --open", "in your browser"),
-        ("export-model serve 3DBall.onnx", "exported for the page"),
-        ("export-model serve exported/3DBall -o page.html", "one file, to open or send"),
-        ("export-model serve exported/3DBall -o site", "files for any web server"),
-    ),
+    "Open a page on which the policy acts.",
+    ("export-model serve exported/3DBall --open", "in your browser"),
+    ("export-model serve 3DBall.onnx", "exported for the page"),
+    ("export-model serve exported/3DBall -o page.html", "one file, to open or send"),
+    ("export-model serve exported/3DBall -o site", "files for any web server"),
 )
-@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE|SOURCE")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="Port; 0 takes a free one."
-)
+@click.argument("bundle", type=PATH, metavar="BUNDLE|SOURCE")
+@click.option("--host", default="127.0.0.1", help="Address to listen on.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8000, help="Port; 0 takes a free one.")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path), metavar="PAGE", help="Write the page and end; NAME.html: one file."
-)
+@click.option("-o", "--out", type=PATH, metavar="PAGE", help="Write the page and end; NAME.html: one file.")
 @click.option(
     "--scene",
     type=click.Choice(_SCENES),
     default="auto",
-    show_default=True,
     help="The environment; auto chooses by name, sizes and actions.",
 )
 def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | None, scene: str) -> None:

@@ -6,22 +6,19 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.group import Command
+from exporter.cli.group import PATH, command
 from exporter.cli.options import one_bundle
 from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import UsageError
 
 
-@click.command(
+@command(
     "snippets",
-    cls=Command,
-    short_help="Print code that calls the policy.",
-    examples=(
-        ("export-model snippets exported/3DBall", "all of it"),
-        ("export-model snippets exported/3DBall --for tfjs", "one, ready to be piped"),
-    ),
+    "Print code that calls the policy.",
+    ("export-model snippets exported/3DBall", "all of it"),
+    ("export-model snippets exported/3DBall --for tfjs", "one, ready to be piped"),
 )
-@click.argument("bundle", type=click.Path(path_type=Path), metavar="BUNDLE")
+@click.argument("bundle", type=PATH, metavar="BUNDLE")
 @click.option("--for", "target", metavar="NAME", help="Only this one (or all that start with it), ready to pipe.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.group import Command
+from exporter.cli.group import PATH, command
 from exporter.cli.options import JUDGING, as_given, comparing, trusting
 
 if TYPE_CHECKING:
@@ -20,23 +20,18 @@ if TYPE_CHECKING:
     from exporter.verify.report import ParityReport
 
 
-@click.command(
+@command(
     "verify",
-    cls=Command,
-    short_help="Verify bundles again: hashes, then every format.",
-    examples=(
-        ("export-model verify exported/3DBall", "one bundle"),
-        ("export-model verify exported --junit parity.xml", "all in a folder"),
-        ("export-model verify out/3DBall --source 3DBall.bytes", "against the original"),
-    ),
+    "Verify bundles again: hashes, then every format.",
+    ("export-model verify exported/3DBall", "one bundle"),
+    ("export-model verify exported --junit parity.xml", "all in a folder"),
+    ("export-model verify out/3DBall --source 3DBall.bytes", "against the original"),
 )
-@click.argument("bundles", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="BUNDLE...")
-@click.option("--source", type=click.Path(path_type=Path), help="The file the bundle was exported from.")
+@click.argument("bundles", nargs=-1, required=True, type=PATH, metavar="BUNDLE...")
+@click.option("--source", type=PATH, help="The file the bundle was exported from.")
 @click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
 @trusting
-@click.option(
-    "--runtimes", default="auto", show_default=True, metavar="WHERE", help="auto, full, browser, or runtimes by name."
-)
+@click.option("--runtimes", default="auto", metavar="WHERE", help="auto, full, browser, or runtimes by name.")
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if no independent runtime is installed.")
 @reporting
 @comparing

@@ -32,7 +32,7 @@ from exporter.remote.fetching import nearby
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, Run, loading, unload
+from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, Run, loading
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
@@ -413,7 +413,7 @@ def _participants(
                 candidate.fed,
                 again,
             )
-        unload(model)
+        model.unload()
 
 
 def _same_numbers(

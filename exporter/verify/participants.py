@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from functools import partial
@@ -124,7 +123,7 @@ def participants_of(
             # The numpy kernels draw from the seed of the verification, whatever the artefact.
             anew = None if runtime == "numpy" else again
             yield Participant(label, runtime, run, names, model, path=path, again=anew)
-            unload(model)
+            model.unload()
 
 
 def in_order(results: Iterable[Finding], tested: PolicyUnderTest) -> tuple[Finding, ...]:
@@ -150,12 +149,6 @@ def loading(
         return model, running(model)
 
     return load
-
-
-def unload(model: LoadedModel) -> None:
-    """Free a model; a runtime that has died has freed it already."""
-    with contextlib.suppress(RunFailedError):
-        model.unload()
 
 
 def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:

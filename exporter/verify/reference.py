@@ -14,7 +14,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel, RunFailedError
 from exporter.verify.findings import Failure, failure
 from exporter.verify.original import Original
-from exporter.verify.participants import PolicyUnderTest, unload
+from exporter.verify.participants import PolicyUnderTest
 
 Arrays = Mapping[str, np.ndarray]
 Answers = list[dict[str, np.ndarray]]
@@ -87,7 +87,7 @@ class Reference:
 
     def __exit__(self, *error: object) -> None:
         for model in self._loaded:
-            unload(model)
+            model.unload()
 
 
 def random_outputs(graph: Graph, names: Iterable[str]) -> frozenset[str]:

@@ -74,8 +74,14 @@ class Actor:
         return self.run_all(inputs, outputs)
 
     def unload(self) -> None:
-        self.process.must_live()
-        self.process.pool.unloaded.append((self.kind, self.process.name))
+        if self.process.alive:
+            self.process.pool.unloaded.append((self.kind, self.process.name))
+
+    def __enter__(self) -> Actor:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.unload()
 
 
 @dataclass

@@ -8,7 +8,7 @@ import numpy as np
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES
-from exporter.verify.participants import Participant, Run, unload
+from exporter.verify.participants import Participant, Run
 from exporter.verify.trial import Trial
 
 Arrays = dict[str, np.ndarray]
@@ -42,7 +42,5 @@ def repeated(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays
 def _first(participant: Participant, pool: RuntimePool, ask: Callable[[Run], Arrays]) -> Arrays:
     assert participant.again is not None
     model, run = participant.again(pool)
-    try:
+    with model:
         return ask(run)
-    finally:
-        unload(model)
