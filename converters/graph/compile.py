@@ -15,6 +15,7 @@ from converters.graph.passes.any_number import for_any_number, without_agents
 from converters.graph.passes.fold import fold
 from converters.graph.passes.inputs import complete_shapes, set_values, settle_inputs
 from converters.graph.passes.memories import join_memories
+from converters.graph.passes.mixtures import settle_mixtures
 from converters.graph.passes.naming import name_ports
 from converters.graph.passes.noise import settle_noise, settle_single_draws, unseeded
 from converters.graph.passes.normalise import normalise
@@ -44,6 +45,7 @@ PASSES = (
     DROP,
     Pass("collapse views", on_tensors(collapse_views), (has.no_identities,), (has.no_identities, has.no_dead_nodes)),
     Pass("cancel transposes", on_tensors(cancel_transposes), (has.constants_folded,), (has.no_dead_nodes,)),
+    Pass("settle mixtures", settle_mixtures, (has.no_identities,), (has.no_identities,)),
     Pass("understand actions", understand_actions, (has.no_identities,), (has.meanings,)),
     Pass("leave out", leave_out_without_rows, (has.meanings,), (has.meanings,)),
     Pass("settle single draws", settle_single_draws, (has.meanings,), (has.one_spelling,)),

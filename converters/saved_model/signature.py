@@ -112,7 +112,7 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
     graph = graph.pruned([*signature.roots, *keep])
     names = output_names(signature)
     taken = {n.name for n in graph.nodes}
-    scope = NameScope((*taken, *names.values()))
+    scope = NameScope((*taken, *names.values(), *_actions(signature)))
     pins: list[Node] = []
     moved: dict[str, str] = {}
     for key, tensor in signature.outputs.items():
@@ -125,20 +125,70 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
         origin = node.origin if index == 0 else f"{node.name}:{index}"
         pins.append(Node(name, "Identity", (reference,), origin=origin))
     roles = {node_of(t.name): role for k, t in signature.inputs.items() if (role := _role(graph, k, t)) is not None}
+    pins += _several_actions(signature, scope)
     nodes = [*renamed(graph, moved).nodes, *(p.with_inputs(_moved(r, moved) for r in p.inputs) for p in pins)]
     return Graph(topological(nodes)), {moved.get(n, n): role for n, role in roles.items()}
 
 
+def _actions(signature: ModelSignature) -> dict[str, list[str]]:
+    """What an action of several parts (TF-Agents: ``action/0``, ``action/jump``) becomes → the keys of its parts.
+
+    Numbers are one action, classes another; empty for other signatures, and for parts that are no rows.
+    """
+    parts = sorted((k for k in signature.outputs if k.startswith("action/")), key=_natural)
+    kinds: dict[str, list[str]] = {}
+    for key in parts:
+        tensor = signature.outputs[key]
+        dims, kind = tensor.shape.dims, "" if tensor.dtype is None else tensor.dtype.kind
+        if kind not in ("f", "i") or dims is None or len(dims) not in (1, 2) or None in dims[1:]:
+            return {}
+        kinds.setdefault("continuous_actions" if kind == "f" else "discrete_actions", []).append(key)
+    return {} if len(parts) < 2 or any(k in OUTPUT_NAMES for k in signature.outputs) else kinds
+
+
+def _natural(key: str) -> list[tuple[int, str]]:
+    """Numbers in a key in their order."""
+    return [(int(part or 0), "") if i % 2 else (0, part) for i, part in enumerate(re.split(r"(\d{1,9})", key))]
+
+
+def _several_actions(signature: ModelSignature, scope: NameScope) -> list[Node]:
+    """The parts of an action side by side, a row per agent."""
+    nodes: list[Node] = []
+    names = output_names(signature)
+
+    def const(value: Sequence[int] | int, what: str) -> str:
+        nodes.append(Node(scope.fresh(f"action/{what}"), "Const", value=np.array(value, np.int32)))
+        return nodes[-1].name
+
+    for action, keys in _actions(signature).items():
+        if len(keys) == 1:
+            continue  # it is pinned under that name
+        columns = []
+        for key in keys:
+            dims = signature.outputs[key].shape.dims
+            columns.append(names[key])
+            if dims is not None and len(dims) == 1:
+                fed = (columns[-1], const([-1, 1], "column_shape"))
+                nodes.append(Node(scope.fresh("action/column"), "Reshape", fed, {}))
+                columns[-1] = nodes[-1].name
+        nodes.append(Node(action, "ConcatV2", (*columns, const(1, "axis")), {}))
+    return nodes
+
+
 def declared(signature: ModelSignature) -> dict[str, Role | None]:
     """The outputs that a signature declares, as they are called once exposed, with the roles that their names say."""
-    return {name: OUTPUT_NAMES.get(name.rpartition("/")[2]) for name in output_names(signature).values()}
+    names, joined = output_names(signature), _actions(signature)
+    parts = {names[key] for keys in joined.values() if len(keys) > 1 for key in keys}
+    exposed = [*(name for name in names.values() if name not in parts), *joined]
+    return {name: OUTPUT_NAMES.get(name.rpartition("/")[2]) for name in exposed}
 
 
 def exposed(graph: Graph, signature: ModelSignature, notes: Sequence[str] = ()) -> tuple[Graph, SourceFacts]:
     """The graph with its outputs under telling names, and what its signature says of it. Raises DamagedFileError."""
     graph, roles = expose(graph, signature)
     memories = memories_of(signature, roles)
-    return graph, SourceFacts(roles=roles, outputs=declared(signature), memories=memories, notes=tuple(notes))
+    said = (f"{action} is {', '.join(keys)}, in this order" for action, keys in _actions(signature).items())
+    return graph, SourceFacts(roles=roles, outputs=declared(signature), memories=memories, notes=(*notes, *said))
 
 
 def memories_of(signature: ModelSignature, roles: Mapping[str, Role]) -> tuple[SeparateMemory, ...]:
@@ -205,9 +255,11 @@ def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:
 
 def output_names(signature: ModelSignature) -> dict[str, str]:
     """Output's key → the node that stands for it, once it is exposed."""
-    names: dict[str, str] = {}
+    names = {keys[0]: action for action, keys in _actions(signature).items() if len(keys) == 1}
     left: list[str] = []
     for key, tensor in signature.outputs.items():
+        if key in names:
+            continue
         node, index = split_ref(normal_ref(tensor.name))
         if key in OUTPUT_NAMES:
             names[key] = key

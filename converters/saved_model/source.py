@@ -18,6 +18,7 @@ from converters.frozen_graph.reader import from_graph_def
 from converters.frozen_graph.source import read as read_frozen
 from converters.graph.nodes import Graph, node_of
 from converters.saved_model.inlining import flat
+from converters.saved_model.lengths import without_counted
 from converters.saved_model.reader import Saved, read_saved_model
 from converters.saved_model.signature import ModelSignature, exposed, fed_by_signature
 from converters.source import OriginalRun, ReadOptions, SourceModel
@@ -106,12 +107,13 @@ def _inlined(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
         {key: replace(t, name=flattened.tensor(t.name)) for key, t in side.items()}
         for side in (signature.inputs, signature.outputs)
     )
+    flat_signature = without_counted(flattened.definition, ModelSignature(inputs, outputs, signature.key))
     restored = {}
     if saved.restore:
         restoring = flat(saved.graph_def, [saved.restore], restoring=True)
         restored = saved_places(restoring.definition)
     training = replace(training_graph(flattened.definition, saved.detached), saved=restored)
-    return training, ModelSignature(inputs, outputs, signature.key)
+    return training, flat_signature
 
 
 def _notes(saved: Saved) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -102,23 +102,32 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
     return leaves
 
 
-def _clips_nothing(graph: Graph, node: Node) -> bool:
-    """Whether a node holds classes within bounds that they cannot leave (TF-Agents clips to the action's space)."""
+def clips_nothing(graph: Graph, node: Node, width: Callable[[Graph, str], int | None]) -> bool:
+    """Whether a node holds classes within bounds that they cannot leave (TF-Agents clips to the action's space).
+
+    ``width`` says how many classes a tensor has.
+    """
     bound = graph.constant(node.inputs[1]) if node.op == "Minimum" or node.op == "Maximum" else None
     if bound is None or bound.dtype.kind not in "iu":
         return False
     if node.op == "Maximum":
         return bool((bound <= 0).all())
-    chosen = [graph.producer(leaf) for leaf in _leaves(graph, node.inputs[0])]
-    types = infer_types(graph)
-    widths = [(types[p.inputs[0]].shape or (None,))[-1] for p in chosen if p.inputs]
-    picked = all(traits(p).sampler == "categorical" or p.op == "ArgMax" for p in chosen)
-    return picked and all(isinstance(w, int) and (bound >= w - 1).all() for w in widths)
+    widths = [width(graph, leaf) for leaf in _leaves(graph, node.inputs[0])]
+    return all(w is not None and bool((bound >= w - 1).all()) for w in widths)
+
+
+def _width(graph: Graph, reference: str) -> int | None:
+    """The number of classes of a draw or an ArgMax."""
+    node = graph.producer(reference)
+    if not node.inputs or not (traits(node).sampler == "categorical" or node.op == "ArgMax"):
+        return None
+    width = (infer_types(graph)[node.inputs[0]].shape or (None,))[-1]
+    return width if isinstance(width, int) else None
 
 
 def _parts(graph: Graph, node: Node) -> Sequence[str]:
     """What a node passes on or joins along the last axis; empty where it computes."""
-    if passes_on(node) or node.op == "Cast" or _clips_nothing(graph, node):
+    if passes_on(node) or node.op == "Cast" or clips_nothing(graph, node, _width):
         return node.inputs[:1]
     if node.op == "ConcatV2":
         axis = graph.constant(node.inputs[-1])

@@ -166,10 +166,12 @@ def _has_rows(node: Node) -> bool:
 
 def _undecided(nodes: Sequence[Node]) -> SignatureError:
     name = nodes[0].name
+    roles = [f"--input {name}={r}" for r in ("masks", "vector_observation", "parameter")]
+    known = ", ".join(roles[placeholder_rank(nodes[0]) != 2 :])
     return SignatureError(
         f"it is not clear what the input {name!r} is for",
         why=f"each agent has its own, beside an observation: {', '.join(f'{n.name} {_shape_text(n)}' for n in nodes)}",
-        fix=f"say what it is: --input {name}=vector_observation, --input {name}=parameter, or --set {name}=VALUE",
+        fix=f"say what it is: {known}, or --set {name}=VALUE",
     )
 
 

@@ -121,3 +121,54 @@ def test_a_class_held_within_bounds_that_it_cannot_leave_is_a_draw(most: int, me
     policy = compiled(made)
     assert policy.signature.output("action").role is meaning
     np.testing.assert_array_equal(run(policy, "deterministic_action")[0][:, 0], STATE.argmax(1))
+
+
+def epsilon_greedy(exploring: str, threshold: float) -> list[Node]:
+    """``action`` [B]: where a uniform number is less than the threshold ``exploring``, else the largest of three."""
+    exploration = {
+        "equal": [
+            node("any", "RandomUniformInt", "rows", "zero", "three", Tout=np.dtype("i4")),
+        ],
+        "odds": [
+            node("drawn", "Multinomial", OBSERVATION.name, "one", output_dtype=np.dtype("i4")),
+            node("any", "Reshape", "drawn", "flat"),
+        ],
+    }[exploring]
+    return [
+        OBSERVATION,
+        *(const(k, v) for k, v in {"zero": 0, "one": 1, "three": 3, "flat": [-1]}.items()),
+        *(const(k, [v]) for k, v in {"begin": 0, "end": 1}.items()),
+        const("epsilon", threshold, np.float32),
+        node("whole", "Shape", OBSERVATION.name),
+        node("rows", "StridedSlice", "whole", "begin", "end", "end"),
+        *exploration,
+        node("best", "ArgMax", OBSERVATION.name, "one", output_type=np.dtype("i4")),
+        node("u", "RandomUniform", "rows", dtype=np.dtype("f4")),
+        node("exploits", "GreaterEqual", "u", "epsilon"),
+        node("action", "Select", "exploits", "best", "any"),
+    ]
+
+
+@pytest.mark.parametrize("exploring", ["equal", "odds"])
+def test_an_epsilon_greedy_action_is_one_draw_of_the_same_odds(exploring: str) -> None:
+    policy = compiled(graph(*epsilon_greedy(exploring, 0.3)))
+    assert {s.role for s in policy.signature.outputs} == {Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS}
+    odds = np.exp(STATE) / np.exp(STATE).sum(axis=1, keepdims=True) if exploring == "odds" else np.full((2, 3), 1 / 3)
+    wanted = 0.3 * odds + 0.7 * np.eye(3)[STATE.argmax(axis=1)]
+    log_probs, likeliest = run(policy, "action_log_probs", "deterministic_action")
+    np.testing.assert_allclose(np.exp(log_probs), wanted, rtol=1e-5)
+    np.testing.assert_array_equal(likeliest[:, 0], STATE.argmax(axis=1))
+    many = run_graph(policy.graph, {"state": np.repeat(STATE[:1], 6000, axis=0)}, ["action"])["action"]
+    np.testing.assert_allclose(np.bincount(many.reshape(-1), minlength=3) / 6000, wanted[0], atol=0.05)
+
+
+def test_two_choices_that_share_what_decides_are_not_drawn_apart() -> None:
+    """Drawn at once each would have its own draw, where the source explores with both or with none."""
+    made = [
+        *(n for n in epsilon_greedy("equal", 0.3) if n.name != "action"),
+        node("first", "Select", "exploits", "best", "any"),
+        node("second", "Select", "exploits", "any", "best"),
+        node("action", "Pack", "first", "second", axis=1),
+    ]
+    with pytest.raises(SignatureError, match=r"deterministic_action would be another one in every run"):
+        compiled(graph(*made))

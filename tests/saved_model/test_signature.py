@@ -8,17 +8,22 @@ import numpy as np
 import pytest
 
 from converters import schema
-from converters.frozen_graph.reader import read_graph
+from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
+from converters.saved_model.lengths import without_counted
 from converters.saved_model.reader import read_saved_model
 from converters.saved_model.signature import ModelSignature, Tensor, expose
+from converters.saved_model.signature import exposed as with_facts
+from converters.understand.facts import SourceFacts
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from signatures.roles import Role
+from tests.handmade import constant, continuous_policy, graph_def
+from tests.handmade import node as tf_node
 
 F32 = np.dtype(np.float32)
 X = np.array([[1, -2]], np.float32)
@@ -164,3 +169,61 @@ def test_a_frozen_graph_and_its_saved_model_are_one() -> None:
     base = read_graph(fixture("recurrent.bytes").read_bytes())
     made, _ = exposed(base, {}, {"action": "action:0", "recurrent_out": "recurrent_out:0"})
     assert {n.name for n in made.nodes} <= {n.name for n in base.nodes}
+
+
+def test_parts_of_an_action_stand_side_by_side() -> None:
+    """TF-Agents' PolicySaver calls them ``action/0`` or ``action/jump``: numbers are one action, classes another."""
+    base = Graph(
+        (
+            *graph("a", "b").nodes,
+            *(
+                Node(f"c{i}", "ArgMax", (name, "one_axis"), {"output_type": np.dtype("i4")}, origin=f"c{i}:0")
+                for i, name in enumerate("ab")
+            ),
+        )
+    )
+    base = Graph((*base.nodes[:-2], Node("one_axis", "Const", value=np.array(1, np.int32)), *base.nodes[-2:]))
+    rows = TensorShape((None,))
+
+    def made(outputs: dict[str, Tensor]) -> tuple[Graph, SourceFacts]:
+        return with_facts(base, ModelSignature({"x": Tensor("x:0", F32, TensorShape((None, 2)))}, outputs))
+
+    class_of = {f"action/{n}": Tensor(f"c{i}:0", np.dtype("i4"), rows) for i, n in ((0, "10"), (1, "9"))}
+    joined, facts = made(class_of)
+    found = run_graph(joined, {"x": np.array([[1, -2], [0, 3]], np.float32)}, ["discrete_actions"])["discrete_actions"]
+    np.testing.assert_array_equal(found, [[0, 0], [1, 1]])
+    assert [facts.outputs, facts.notes] == [
+        {"discrete_actions": Role.ACTION},
+        ("discrete_actions is action/9, action/10, in this order",),
+    ]
+    numbers = {"action/move": Tensor("b:0", F32, TensorShape((None, 2)))}
+    hybrid, facts = made({**numbers, "action/jump": class_of["action/9"]})
+    assert facts.outputs == {"discrete_actions": Role.ACTION, "continuous_actions": Role.ACTION}
+    assert (hybrid["continuous_actions"].origin, hybrid["discrete_actions"].origin) == ("b:0", "c1:0")
+
+
+def test_an_input_of_which_only_the_length_is_read_is_none() -> None:
+    """TF-Agents' collect policies count ``step_type``; what a recurrent one looks at stays."""
+    message = graph_def(
+        [
+            *continuous_policy(),
+            *(tf_node(name, "Placeholder", dtype=np.int32) for name in ("step", "looked_at")),
+            tf_node("same", "Identity", "step"),
+            tf_node("count", "Shape", "same", T=np.int32, out_type=np.int32),
+            constant("zero", 0.0),
+            tf_node("zeros", "Fill", "count", "zero"),
+            tf_node("length", "Shape", "looked_at", T=np.int32, out_type=np.int32),
+        ]
+    )
+    row = TensorShape((None,))
+    inputs = {
+        "0/observation": Tensor("vector_observation:0", F32, TensorShape((None, 3))),
+        "0/step_type": Tensor("step:0", np.dtype("i4"), row),
+        "0/other": Tensor("looked_at:0", np.dtype("i4"), row),
+    }
+    outputs = {"action": Tensor("action:0"), "zeros": Tensor("zeros:0"), "other": Tensor("looked_at:0")}
+    left = without_counted(message, ModelSignature(inputs, outputs))
+    assert sorted(left.inputs) == ["0/observation", "0/other"]
+    made = normalise(from_graph_def(message).pruned(["zeros"]))
+    zeros = run_graph(made, {"vector_observation": np.ones((5, 3), np.float32)}, ["zeros"])["zeros"]
+    assert zeros.shape == (5,)

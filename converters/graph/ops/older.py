@@ -234,6 +234,19 @@ def _broadcast_args(builder: GraphBuilder, node: Node) -> str:
     return builder.add("Maximum", wide, f"{node.name}/shape", node.origin)
 
 
+def _uniform_int(builder: GraphBuilder, node: Node) -> str:
+    """RandomUniformInt of low to high - 1, as the floor of a uniform number; up to high - low = 2^24 none is missed."""
+    shape, low, high = node.inputs
+    dtype = node.attrs.get("Tout", INT32)
+    count = builder.add("Sub", [high, low], f"{node.name}/count")
+    drawn = builder.add("RandomUniform", [shape], f"{node.name}/RandomUniform", seed=0, seed2=0, dtype=FLOAT32)
+    scale = builder.add("Cast", [count], f"{node.name}/scale", DstT=FLOAT32)
+    whole = builder.add("Floor", [builder.add("Mul", [drawn, scale], f"{node.name}/scaled")], f"{node.name}/floor")
+    return builder.add(
+        "Add", [builder.add("Cast", [whole], f"{node.name}/number", DstT=dtype), low], f"{node.name}/drawn", node.origin
+    )
+
+
 def _spelt(name: str, older: Older, *spellings: str) -> OpDef:
     return OpDef(name, written_as_older, older=older, spellings=spellings)
 
@@ -247,6 +260,7 @@ OPS = (
     _spelt("Erfc", _erfc),
     _spelt("ReverseV2", _reversed),
     _spelt("BroadcastArgs", _broadcast_args),
+    _spelt("RandomUniformInt", _uniform_int),
     OpDef(
         "PlaceholderWithDefault",
         written_as_older,
