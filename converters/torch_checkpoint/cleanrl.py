@@ -103,12 +103,12 @@ def _observed(making: _Making, first: str) -> str:
     """The input that the layer ``first`` reads: numbers, or an image, whose size the user says; divided by 255."""
     net = making.net
     shape = net.state.shape(f"{first}.weight")
-    if len(shape) == 2:
-        if making.told and tuple(making.told) != ((shape[1],),):
+    if len(shape) in (1, 2):
+        if making.told and tuple(making.told) != ((shape[-1],),):
             raise UsageError(
-                "--sensors does not fit the checkpoint", why=f"it observes {shape[1]} numbers", fix="leave it out"
+                "--sensors does not fit the checkpoint", why=f"it observes {shape[-1]} numbers", fix="leave it out"
             )
-        return net.input("obs", shape[1])
+        return net.input("obs", shape[-1])
     if len(making.told) != 1 or len(making.told[0]) != 3:
         raise SourceError(
             "the checkpoint does not tell the size of the image that it sees",
@@ -127,14 +127,16 @@ def _observed(making: _Making, first: str) -> str:
 
 
 def _layers(making: _Making, x: str, module: str, *, ends: bool) -> str:
-    """``nn.Sequential`` of convolutions, linear layers and layer norms, an activation after each but the last."""
+    """``nn.Sequential`` of convolutions, linear layers and layer norms, an activation after each but the last.
+
+    What has no weights is told by its place: one module between two layers is the activation (before images become
+    rows: Flatten alone; two are both), none is none, and more could be anything.
+    """
     net, state = making.net, making.net.state
     found = state.indices(f"{module}.")
     ranks = {index: len(state.shape(f"{module}.{index}.weight")) for index in found}
-    if any(b == a + 1 and 1 not in (ranks[a], ranks[b]) for a, b in itertools.pairwise(found)):
-        raise state.unknown(module, "nothing stands between two of its layers")
     images = [index for index in found if ranks[index] == 4]
-    for index in found:
+    for index, after in itertools.zip_longest(found, found[1:]):
         name = f"{module}.{index}"
         if ranks[index] == 4:
             kernel = state.length(f"{name}.weight", 2)
@@ -144,16 +146,38 @@ def _layers(making: _Making, x: str, module: str, *, ends: bool) -> str:
                     name, "its strides are not in the file, and its kernels are not those of CleanRL's scripts"
                 )
             x = net.convolution(x, name, _WINDOWS[place][1])
-        elif ranks[index] == 1:
-            width = net.width(x)
-            scale, bias = (state.array(f"{name}.{part}", width) for part in ("weight", "bias"))
-            net.at(name)
-            x = layer(net, x, 1, net.const(scale, "scale"), net.const(bias, "bias"))[0]
+        elif ranks[index] in (1, 3):
+            x = _normalised(net, x, name)
         else:
             x = net.linear(net.flat(x) if net.rank(x) == 4 else x, name)
-        if (index != found[-1] or not ends) and ranks.get(index + 1) != 1:
+        if after is None:
+            return x if ends else making.activation(net, x)
+        between, norms = after - index - 1, (ranks[index], ranks[after])
+        flattened = net.rank(x) == 4 and ranks[after] == 2
+        if between == 0 and not flattened and (1 in norms or 3 in norms):
+            continue
+        if between == flattened + 1:
             x = making.activation(net, x)
-    return x
+        elif between != 1:
+            what = "nothing stands" if between == 0 else f"{between} modules without weights stand"
+            raise state.unknown(
+                module, f"{what} between its layers {index} and {after}, and one activation is expected"
+            )
+    raise state.unknown(module, "it has no layers")
+
+
+def _normalised(net: Network, x: str, name: str) -> str:
+    """``nn.LayerNorm``, of a row or of a whole image [C, H, W]."""
+    rank, shape = net.rank(x), net.type_of(x).shape
+    assert shape is not None
+    sizes = [shape[i] for i in ((3, 1, 2) if rank == 4 else (1,))]
+    if len(net.state.shape(f"{name}.weight")) != len(sizes):
+        raise net.state.unknown(name, "it is no LayerNorm: what it takes together (groups, a batch) is not in the file")
+    scale, bias = (net.state.array(f"{name}.{part}", *map(int, sizes)) for part in ("weight", "bias"))
+    if rank == 4:
+        scale, bias = scale.transpose(1, 2, 0), bias.transpose(1, 2, 0)
+    net.at(name)
+    return layer(net, x, 1, net.const(scale, "scale"), net.const(bias, "bias"))[0]
 
 
 def _trunk(making: _Making) -> str:
@@ -170,8 +194,9 @@ def _scaled(net: Network, value: str) -> str:
     net.at("action")
     value = net.add("Tanh", [value])
     scale, bias = (
-        net.state.array(name, *(1,) * (len(net.state.shape(name)) - 1), net.width(value)).reshape(-1)
+        net.state.array(name, *(*(1,) * (len(shape) - 1), net.width(value))[: len(shape)]).reshape(-1)
         for name in ("action_scale", "action_bias")
+        for shape in (net.state.shape(name),)
     )
     return net.add("Add", [net.add("Mul", [value, net.const(scale, "scale")]), net.const(bias, "bias")])
 
@@ -191,7 +216,7 @@ def _ppo_continuous(making: _Making) -> str:
 def _ppo_discrete(making: _Making) -> str:
     """Logits of an actor, after a trunk that it shares with the critic or alone; a memory between them."""
     net = making.net
-    shared = "network.0.weight" in net.state
+    shared = bool(net.state.under("network."))
     alone = "actor.weight" in net.state
     if shared:
         x = _layers(making, _observed(making, "network.0"), "network", ends=False)

@@ -133,3 +133,57 @@ def test_what_the_weights_do_not_tell_is_refused_and_named(tmp_path: Path) -> No
     (tmp_path / "dqn.pt").write_bytes(writer.zip(writer.state(between)))
     with pytest.raises(SourceError, match="nothing stands between"):
         read_source(tmp_path / "dqn.pt", ReadOptions(activation="relu"))
+
+
+def _sequence(*layers: tuple[int, tuple[int, ...]], module: str = "actor_mean") -> dict[str, np.ndarray]:
+    """Weights and biases of an ``nn.Sequential`` of 3 numbers to 4 and 2, at the indices that are given."""
+    made = {"actor_logstd": np.zeros((1, 2), np.float32)} if module == "actor_mean" else {}
+    for index, shape in layers:
+        bias = shape if len(shape) in (1, 3) else shape[:1]
+        made |= {f"{module}.{index}.weight": waves(f"w{index}", shape), f"{module}.{index}.bias": waves("b", bias)}
+    return made
+
+
+def _exported(folder: Path, state: dict[str, np.ndarray], **told: Any) -> Any:
+    writer = Writer()
+    path = folder / "policy.pt"
+    path.write_bytes(writer.zip(writer.state(state)))
+    (policy,) = read_source(path, ReadOptions(activation="tanh", **told)).policies()
+    return policy
+
+
+def _norm(x: np.ndarray, state: dict[str, np.ndarray], name: str) -> np.ndarray:
+    axes = tuple(range(1, x.ndim))
+    value = (x - x.mean(axes, keepdims=True)) / np.sqrt(x.var(axes, keepdims=True) + 1e-5)
+    return np.asarray(value * state[f"{name}.weight"] + state[f"{name}.bias"])
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_layer_norm_stands_where_its_number_says(place: int, tmp_path: Path) -> None:
+    """Before the first layer, before the activation, after it: none of them adds an activation of its own."""
+    indices = {0: (1, 3, 0), 1: (0, 3, 1), 2: (0, 3, 2)}[place]
+    state = _sequence((indices[0], (4, 3)), (indices[1], (2, 4)), (indices[2], (3,) if place == 0 else (4,)))
+    x = np.array([[0.5, -1, 2], [3, 0.1, -0.2]], np.float32)
+
+    def linear(value: np.ndarray, index: int) -> np.ndarray:
+        return value @ state[f"actor_mean.{index}.weight"].T + state[f"actor_mean.{index}.bias"]
+
+    norm = f"actor_mean.{indices[2]}"
+    hidden = linear(_norm(x, state, norm) if place == 0 else x, indices[0])
+    hidden = np.tanh(_norm(hidden, state, norm)) if place == 1 else np.tanh(hidden)
+    wanted = linear(_norm(hidden, state, norm) if place == 2 else hidden, indices[1])
+    found = run_graph(_exported(tmp_path, state).graph, {"state": x}, ["action"])["action"]
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+
+
+def test_what_stands_between_layers_and_has_no_weights_is_not_guessed(tmp_path: Path) -> None:
+    windows = ((0, (32, 2, 8, 8)), (3, (4, 32, 4, 4)), (6, (4, 4, 3, 3)))
+    norms = ((1, (32,)), (4, (4,)), (7, (4,)))
+    image = _sequence(*windows, *norms, (10, (2, 4)), module="network")
+    for state, words, told in (
+        (_sequence((0, (4, 3)), (3, (2, 4))), "2 modules without weights stand between its layers 0 and 3", {}),
+        (_sequence((0, (4, 3)), (1, (2, 4))), "nothing stands between its layers 0 and 1", {}),
+        (image, "network.1.*it is no LayerNorm", {"sensors": EYE}),
+    ):
+        with pytest.raises(SourceError, match=rf"(?s){words}"):
+            _exported(tmp_path, state, **told)
