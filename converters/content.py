@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import io
 import json
+import re
 import struct
 import zipfile
 from functools import cached_property
@@ -13,6 +14,9 @@ from typing import Any
 from converters.varints import read_varint
 
 _HEAD = 4096
+#: Objects and lists in a JSON file: an empty one has two bytes, and takes sixty in memory.
+_MAX_JSON = 1 << 22
+_SURROGATE = re.compile(r"[\ud800-\udfff]|\\u[dD][89a-fA-F]")
 
 
 class Content:
@@ -41,7 +45,7 @@ class Content:
         if self.text is None or not self.text.startswith("{"):
             return None
         try:
-            found: dict[str, Any] = json.loads(self.data)
+            found: dict[str, Any] = _parsed(self.data.decode("utf-8-sig"))
         except (ValueError, RecursionError):
             return None
         return found
@@ -73,6 +77,23 @@ class Content:
             return False
         first = _fields(self.fields[0][2], 3)
         return [field[:2] for field in first[:2]] == [(1, 2), (2, 2)] and _is_op_name(bytes(first[1][2][:100]))
+
+
+def json_in(data: bytes | str) -> Any:
+    """What JSON text of a stranger says. Raises ValueError, too where a text in it is none or there are too many
+    values, and RecursionError.
+    """
+    text = data if isinstance(data, str) else data.decode("utf-8-sig")
+    found = _parsed(text)
+    if _SURROGATE.search(text):  # halves of a character: nothing can be written under such a name
+        json.dumps(found, ensure_ascii=False).encode()
+    return found
+
+
+def _parsed(text: str) -> Any:
+    if text.count("[") + text.count("{") > _MAX_JSON:
+        raise ValueError(f"it has more than {_MAX_JSON} objects and lists")
+    return json.loads(text)
 
 
 def _is_op_name(data: bytes) -> bool:

@@ -22,6 +22,9 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 #: Nodes of a file, training part and functions included.
 MAX_NODES = 1 << 17
 
+#: Graphs of a SavedModel, one for each set of tags.
+_MAX_GRAPHS = 1 << 6
+
 #: message → fields, as converters/messages.py reads them
 _MESSAGES = {
     "Dim": "1 size int64, 2 name string",
@@ -114,9 +117,15 @@ def parse(message_class: Any, data: bytes, what: str, detached: Detached | None 
 
 
 def _graphs(message: Any) -> list[Any]:
-    """The GraphDefs in a message."""
+    """The GraphDefs in a message. Raises NotAPolicyError where there are too many."""
     kind = message.DESCRIPTOR.name
     if kind == "SavedModel":
+        if len(message.meta_graphs) > _MAX_GRAPHS:
+            raise NotAPolicyError(
+                f"the SavedModel has {len(message.meta_graphs)} graphs",
+                why=f"no more than {_MAX_GRAPHS} are looked at; a policy has one",
+                fix="save the policy alone",
+            )
         return [meta.graph_def for meta in message.meta_graphs]
     return [message] if kind == "GraphDef" else [message.graph_def] if kind == "MetaGraphDef" else []
 

@@ -20,6 +20,8 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).
 SCALAR_SHAPE_PRODUCER = 24
+#: Axes of a shape, attributes of a node, values of a list: TensorFlow allows 254 axes, and no policy has the others.
+_MAX_AXES, _MAX_ATTRIBUTES, _MAX_LISTED = 254, 1 << 10, 1 << 16
 
 
 def read_graph(data: bytes) -> Graph:
@@ -63,6 +65,7 @@ def _node(proto: Any, producer: int, allowance: Allowance, detached: Detached | 
             why="that is how the output of a node is called: a node's own name has no colon",
             fix="freeze the graph again; this file is damaged",
         )
+    _few(len(proto.attr), _MAX_ATTRIBUTES, f"the node {proto.name!r} has", "attributes")
     attrs: dict[str, Any] = {}
     value: np.ndarray | None = None
     for key in sorted(proto.attr):
@@ -104,6 +107,7 @@ def _check_placeholder(name: str, attrs: dict[str, Any]) -> None:
 def _shape(proto: Any) -> TensorShape:
     if proto.unknown_rank:
         return TensorShape(None)
+    _few(len(proto.dim), _MAX_AXES, "a shape has", "axes")
     return TensorShape(tuple(None if d.size < 0 else int(d.size) for d in proto.dim))
 
 
@@ -132,9 +136,17 @@ def _attribute(proto: Any, allowance: Allowance, detached: Detached | None) -> A
             ("shape", _shape),
         ):
             if values := getattr(items, field):
+                _few(len(values), _MAX_LISTED, "a list has", "values")
                 return tuple(convert(v) for v in values)
         return ()
     return None
+
+
+def _few(count: int, most: int, whose: str, what: str) -> None:
+    if count > most:
+        raise DamagedFileError(
+            f"{whose} {count} {what}", why=f"no graph has more than {most}", fix="freeze the policy's own outputs"
+        )
 
 
 def _text(data: bytes) -> str:

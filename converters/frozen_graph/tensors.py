@@ -34,7 +34,7 @@ _VALUE_FIELDS = {
 def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached | None = None) -> np.ndarray:
     """The array of a TensorProto, a view of what is ``detached``; raises DamagedFileError."""
     dtype = dtype_of(proto.dtype)
-    shape = tuple(int(d.size) for d in proto.tensor_shape.dim)
+    shape = tuple(int(d.size) for d in proto.tensor_shape.dim[: _MAX_AXES + 1])
     if proto.tensor_shape.unknown_rank or any(n < 0 for n in shape):
         raise _damaged("its shape is not fully known")
     if len(shape) > _MAX_AXES or math.prod(n or 1 for n in shape) > _MAX_ELEMENTS:

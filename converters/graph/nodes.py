@@ -244,8 +244,12 @@ def _is_ordered(nodes: Sequence[Node]) -> bool:
     return True
 
 
+#: Characters of a name that is made here. A stranger's layer of a megabyte's name would hand it to all of its nodes.
+MAX_NAME = 1 << 10
+
+
 class NameScope:
-    """Hands out node names that are not taken yet, the same ones in every run."""
+    """Hands out node names that are not taken yet, the same ones in every run; long ones are cut."""
 
     def __init__(self, taken: Iterable[str]) -> None:
         self._taken = set(taken)
@@ -253,6 +257,7 @@ class NameScope:
 
     def fresh(self, wish: str) -> str:
         """``wish``, or ``wish_1``, ``wish_2``… if it is taken."""
+        wish = wish[:MAX_NAME]
         name, number = wish, self._numbers.get(wish, 0)
         while name in self._taken:
             number += 1

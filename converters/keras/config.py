@@ -7,12 +7,12 @@ layer, an initialiser or the like of Keras itself is refused, whatever the versi
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from converters.content import json_in
 from converters.fetch import read_bytes
 from converters.zips import ZIP_ERRORS, entry_of, opened
 from signatures.errors import DamagedFileError, NotAPolicyError
@@ -31,6 +31,8 @@ _ROOMS = frozenset(
         *("ops", "engine", "mixed_precision"),
     )
 )
+#: What training alone uses, which Keras builds too for a model inside of another.
+_TRAINING = frozenset(("optimizers", "losses", "metrics"))
 #: Classes that run what the file gives them, load what it names, or read files.
 _CODE = frozenset(
     (
@@ -49,7 +51,7 @@ def config_of(path: Path, name: str = "config.json") -> Any:
     """The configuration in a ``.keras`` file (a zip), or another part of it in JSON. Raises DamagedFileError."""
     try:
         with opened(read_bytes(path)) as archive:
-            return json.loads(entry_of(archive, name, MAX_CONFIG))
+            return json_in(entry_of(archive, name, MAX_CONFIG))
     except (*ZIP_ERRORS, RecursionError) as error:
         raise DamagedFileError(
             "its configuration cannot be read",
@@ -65,7 +67,10 @@ def config_inside(path: str) -> Any:
     Weights that are links to other files are refused.
     """
     if path.endswith(".keras") and zipfile.is_zipfile(path):
-        return config_of(Path(path))
+        config = config_of(Path(path))
+        if isinstance(config, dict):
+            config.pop("compile_config", None)  # so does Keras, of the model itself, where it is not to be compiled
+        return config
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -77,7 +82,7 @@ def config_inside(path: str) -> Any:
             why="it holds weights alone, or something else",
             fix="save the whole model: model.save('policy.keras')",
         )
-    return json.loads(text)
+    return json_in(text)
 
 
 def _refuse_links(group: Any, h5py: Any, depth: int = 0) -> None:
@@ -102,9 +107,13 @@ def stateful_layer(config: Any) -> str | None:
     return next(named, None)
 
 
-def refuse_code(config: Any) -> None:
-    """Raise NotAPolicyError where a configuration names anything but layers and settings of Keras itself."""
-    for named in _objects(config):
+def refuse_code(config: Any, *, built: bool = False) -> None:
+    """Raise NotAPolicyError where a configuration names anything but layers and settings of Keras itself.
+
+    Where Keras itself is to build it (``built``), what training uses is looked at, too.
+    """
+    rooms = _ROOMS | _TRAINING if built else _ROOMS
+    for named in _objects(config, built=built):
         name = named.get("class_name")
         module, registered = named.get("module"), named.get("registered_name")
         if isinstance(name, str) and name in _VALUES:
@@ -112,31 +121,31 @@ def refuse_code(config: Any) -> None:
         whole = ".".join(str(part) for part in (module, name) if part)
         if not isinstance(name, str) or name in _CODE or "lambda" in name.lower() or not name[:1].isupper():
             raise _code(whole)
-        if not (module is None or isinstance(module, str)) or (module is not None and not _of_keras(module)):
+        if not (module is None or isinstance(module, str)) or (module is not None and not _of_keras(module, rooms)):
             raise _code(whole)
         if ">" in name or (registered is not None and (not isinstance(registered, str) or ">" in registered)):
             raise _code(str(registered or whole))
 
 
-def _of_keras(module: str) -> bool:
+def _of_keras(module: str, rooms: frozenset[str]) -> bool:
     """Whether a module is one of Keras' that hold layers and their settings."""
     for package in _PACKAGES:
         if module == package:
             return True
-        if module.startswith(f"{package}.") and module.removeprefix(f"{package}.").partition(".")[0] in _ROOMS:
+        if module.startswith(f"{package}.") and module.removeprefix(f"{package}.").partition(".")[0] in rooms:
             return True
     return False
 
 
-def _objects(config: Any) -> Iterator[dict[str, Any]]:
-    """Every object of a configuration that names a class, or should; what training alone uses is left out."""
+def _objects(config: Any, *, built: bool = False) -> Iterator[dict[str, Any]]:
+    """Every object of a configuration that names a class, or should; what training alone uses only if it is built."""
     stack = [config]
     while stack:
         value = stack.pop()
         if isinstance(value, dict):
             if "class_name" in value or "registered_name" in value or "__lambda__" in value:
                 yield value
-            stack.extend(v for k, v in value.items() if k != "compile_config")
+            stack.extend(v for k, v in value.items() if built or k != "compile_config")
         elif isinstance(value, list):
             stack.extend(value)
 

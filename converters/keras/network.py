@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
 from converters.graph.passes.unroll import MAX_NODES
 from converters.graph.types import FLOAT32
 from converters.keras.layers.step import Step
@@ -130,7 +130,7 @@ class Network(Builder):
     ) -> list[str]:
         call = layer.calls[number]
         args, kwargs = _resolved(list(call.args), results), _resolved(dict(call.kwargs), results)
-        path = f"{prefix}{layer.name}"
+        path = f"{prefix}{layer.name}"[:MAX_NAME]
         weights = arrays.get(layer.name)
         if layer.model is not None:
             assert weights is not None

@@ -6,13 +6,13 @@ They are read as data. What is more than the layers of ``layers/table.py`` is le
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from converters import schema
+from converters.content import json_in
 from converters.fetch import Fetched
 from converters.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph
@@ -84,7 +84,7 @@ def _stored(given: Fetched) -> tuple[Any, Weights, str]:
             fix="save the whole model: model.save('policy.keras')",
         )
     try:
-        config = json.loads(stored.config)
+        config = json_in(stored.config)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
     refuse_code(config)
@@ -120,7 +120,7 @@ def of_web_model(files: tuple[Path, ...], topology: Mapping[str, Any], weights: 
     config = topology.get("model_config") or topology
     version = str(topology.get("keras_version") or "tfjs-layers")
     try:
-        config = json.loads(config) if isinstance(config, str) else config
+        config = json_in(config) if isinstance(config, str) else config
     except (ValueError, RecursionError) as error:
         raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
     return layered(files, config, weights, version)

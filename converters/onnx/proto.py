@@ -19,9 +19,11 @@ from converters.fetch import MAX_WEIGHTS, read_bytes
 from converters.graph.types import FLOAT32
 from converters.onnx.messages import ModelProto
 from converters.schema import check_nodes
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 
-_MAX_AXES = 32
+_MAX_AXES, _MAX_ELEMENTS = 32, 1 << 31
+#: Messages of a file: nodes, attributes, types, axes. An empty one has two bytes, and takes a hundred in memory.
+_MAX_MESSAGES = 1 << 19
 #: Where the bytes of weights lie: ModelProto.graph.initializer.raw_data.
 _CONTENTS: Fields = {7: {5: {9: None}}}
 _EXTERNAL = 1  # TensorProto.DataLocation
@@ -68,9 +70,9 @@ def decoded(data: bytes, detached: Detached | None = None) -> Any:
 def _check_texts(model: Any) -> None:
     """Raise DamagedFileError where a text is none: protobuf gives its bytes then, as ONNX is written in proto2.
 
-    NotAPolicyError where there are more nodes than any file is read with.
+    NotAPolicyError where there are more nodes, or messages, than any file is read with.
     """
-    stack, nodes = [model], 0
+    stack, nodes, messages = [model], 0, 0
     while stack:
         message = stack.pop()
         if message.DESCRIPTOR.name == "GraphProto":
@@ -83,6 +85,13 @@ def _check_texts(model: Any) -> None:
             if not items:
                 continue
             if hasattr(items[0], "ListFields"):
+                messages += len(items)
+                if messages > _MAX_MESSAGES:
+                    raise NotAPolicyError(
+                        f"the model is made of more than {_MAX_MESSAGES} parts",
+                        why=f"of {field} alone it has {len(items)}; a policy has some thousands of all",
+                        fix="export the policy alone",
+                    )
                 stack.extend(items)
             elif isinstance(items[0], str | bytes) and message.DESCRIPTOR.fields_by_name[field].type == _TEXT:
                 broken = next((i for i in items if isinstance(i, bytes)), None)
@@ -110,7 +119,7 @@ def array_of(tensor: Any, detached: Detached | None) -> np.ndarray:
     dtype, field = _STORED[tensor.data_type]
     shape = tuple(int(d) for d in tensor.dims)
     count = math.prod(shape)
-    if len(shape) > _MAX_AXES or any(d < 0 for d in shape):
+    if len(shape) > _MAX_AXES or any(d < 0 for d in shape) or math.prod(d or 1 for d in shape) > _MAX_ELEMENTS:
         raise _damaged(name, f"its shape is {list(shape[:8])}")
     array: np.ndarray
     if tensor.HasField("raw_data"):

@@ -14,6 +14,7 @@ from converters import schema
 from converters.detached import Detached
 from converters.graph.nodes import TensorShape, node_of
 from converters.graph.ops.table import CALLING
+from converters.graph.options import MAX_PORTS
 from converters.saved_model.signature import ModelSignature, Tensor
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass
@@ -50,6 +51,12 @@ def read_saved_model(data: bytes, key: str | None = None, detached: Detached | N
     if not message.meta_graphs:
         raise NotAPolicyError("the SavedModel has no graph", fix="save the model again")
     meta = next((m for m in message.meta_graphs if "serve" in m.meta_info_def.tags), message.meta_graphs[0])
+    if len(meta.signature_def) > MAX_PORTS:
+        raise NotAPolicyError(
+            f"the SavedModel has {len(meta.signature_def)} signatures",
+            why=f"no more than {MAX_PORTS} are looked at; a policy has one or two",
+            fix="save the policy alone",
+        )
     keys = tuple(sorted(k for k, s in meta.signature_def.items() if s.outputs and not k.startswith(_INIT)))
     if key not in keys:
         key = SERVING if SERVING in keys else next(iter(keys), None)

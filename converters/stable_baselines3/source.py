@@ -7,9 +7,9 @@ disk; what its two entries may unfold to is bounded by the file.
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
+from converters.content import json_in
 from converters.fetch import Fetched
 from converters.source import ReadOptions, SourceModel
 from converters.stable_baselines3.policy import to_graph
@@ -35,7 +35,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         files = (given.path,)
         data, policy = _entries(given.data)
     try:
-        content: Any = json.loads(data)
+        content: Any = json_in(data)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError("its data is not JSON", why=str(error)[:200], fix=_COPY_AGAIN) from error
     if not isinstance(content, dict):

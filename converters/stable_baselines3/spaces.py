@@ -52,7 +52,8 @@ class Space:
         """A Box's bounds, float32, flat. Raises SourceError where the text leaves some out."""
         found = []
         for text in (self.low, self.high):
-            numbers = np.array([float(n) for n in _NUMBER.findall(text)], np.float32)
+            with np.errstate(over="ignore"):
+                numbers = np.array([float(n) for n in _NUMBER.findall(text)], np.float32)
             if len(numbers) not in (1, self.size) or "..." in text:
                 raise SourceError(
                     f"the bounds of its {self.size} actions are not told",

@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from converters.content import json_in
 from converters.fetch import MAX_BYTES, read_bytes
 from converters.format import Port, Ports
 from converters.frozen_graph.subgraph import COMPUTING
@@ -36,7 +37,7 @@ def ports(path: Path) -> Ports:
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     """Those of a folder with a model.json; what was fused with its bias or activation is not there."""
-    model = json.loads((loaded.path / "model.json").read_bytes())
+    model = json_in((loaded.path / "model.json").read_bytes())
     return contextlib.nullcontext(
         InnerTensors(own_names(n["name"] for n in model["modelTopology"]["node"]), loaded.run)
     )
@@ -51,6 +52,9 @@ _OWN = frozenset(
         *("TensorListSplit", "StatelessRandomNormal", "StatelessRandomUniform", "LinSpace"),
     )
 )
+#: What a loader reads of a model, and of its graph: not the graph of an initialiser, which it would run.
+_PARTS = ("format", "generatedBy", "convertedBy", "signature", "userDefinedMetadata")
+_GRAPH = ("node", "versions", "library")
 _FIX = "convert the model again with the official converter, the policy's outputs only"
 
 
@@ -61,7 +65,7 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     DamagedFileError.
     """
     try:
-        model = json.loads(read_bytes(path / MODEL))
+        model = json_in(read_bytes(path / MODEL))
         functions = (model["modelTopology"].get("library") or {}).get("function") or ()
         nodes = [*model["modelTopology"]["node"], *(n for f in functions for n in f.get("nodeDef") or ())]
         names = {str(f["signature"]["name"]) for f in functions}
@@ -77,8 +81,10 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
         raise unsupported(refused)
     copy = folder / (path.resolve().name or "model")
     copy.mkdir()
-    model["weightsManifest"] = manifest
-    (copy / MODEL).write_text(json.dumps(model), encoding="utf-8")
+    graph = {key: model["modelTopology"][key] for key in _GRAPH if key in model["modelTopology"]}
+    kept = {key: model[key] for key in _PARTS if key in model}
+    content = {**kept, "modelTopology": graph, "weightsManifest": manifest}
+    (copy / MODEL).write_text(json.dumps(content), encoding="utf-8")
     for name, source in files.items():
         (copy / name).write_bytes(read_bytes(source, empty=True))
     return copy

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from converters import schema
+from converters.content import json_in
 from converters.fetch import Fetched, read_bytes
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.graph.ops.table import IFS, WHILES, is_fed
@@ -75,7 +75,7 @@ def _head(path: Path) -> bytes:
 def content_of(given: Fetched) -> dict[str, Any]:
     """The object in a model.json, which has a topology. Raises DamagedFileError."""
     try:
-        model = json.loads(given.bytes_of(model_file(given.path)))
+        model = json_in(given.bytes_of(model_file(given.path)))
     except (ValueError, RecursionError) as error:
         raise _damaged("model.json is not JSON", str(error)[:200]) from error
     if not isinstance(model, dict) or not isinstance(model.get("modelTopology"), dict):
@@ -110,7 +110,7 @@ def read_model(given: Fetched) -> WebModel:
 def held(path: Path) -> Any:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     try:
-        return (json.loads(read_bytes(path / MODEL if path.is_dir() else path)).get("userDefinedMetadata") or {}).get(
+        return (json_in(read_bytes(path / MODEL if path.is_dir() else path)).get("userDefinedMetadata") or {}).get(
             "contract"
         )
     except (AttributeError, ArithmeticError, ValueError, RecursionError) as error:
@@ -120,7 +120,7 @@ def held(path: Path) -> Any:
 def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
     """(the signature, node → op) of a model.json, without its weights. Raises SourceError, DamagedFileError."""
     try:
-        model = json.loads(read_bytes(path))
+        model = json_in(read_bytes(path))
         signature = model.get("signature") or (model.get("userDefinedMetadata") or {}).get("signature") or {}
         nodes = {str(n["name"]): str(n["op"]) for n in model["modelTopology"]["node"]}
         return _signature(signature), nodes

@@ -81,7 +81,8 @@ def told(name: str) -> Activation:
 
 _FILES = ("params/agent.yaml", "agent.yaml", "config.yaml", "params.yaml")
 _LARGEST = 1 << 20
-_LINE = re.compile(r"( *)(?:- )?([\w.]+) *: *(?:['\"]?([\w.]+)['\"]?)? *(?:#.*)?$")
+#: Nothing is tried twice (``*+``): a file of spaces would take seconds.
+_LINE = re.compile(r"( *+)(?:- )?([\w.]++) *+: *+(?:['\"]?([\w.]++)['\"]?)? *+(?:#.*)?$")
 #: Sections that describe the policy; a critic may have another activation.
 _OF_POLICY = frozenset(("policy", "actor", "student", "model"))
 

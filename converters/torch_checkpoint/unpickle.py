@@ -24,6 +24,8 @@ MAX_OPCODES = 1 << 21
 MAX_COPIED = 1 << 20
 #: Of a tensor: kernels of images have four, and no axis is longer than a file can be.
 MAX_AXES, MAX_LENGTH = 8, 1 << 31
+#: PyTorch's magic number has 77.
+_MAX_BITS = 1 << 10
 _FIX = "give a checkpoint as its trainer wrote it"
 _MARK = object()
 _KEYS = (str, int, float, bool, type(None))
@@ -106,6 +108,8 @@ class _Machine:
         if name in _PUSHED:
             self.stack.append(_PUSHED[name])
         elif name in _ARGUMENT:
+            if isinstance(argument, int) and argument.bit_length() > _MAX_BITS:  # Python would not write it as text
+                raise _damaged(f"its pickle holds a number of {argument.bit_length()} bits")
             self.stack.append(argument)
         elif name in _NEW:
             self.stack.append(_NEW[name]())

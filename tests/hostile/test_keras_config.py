@@ -82,6 +82,15 @@ def test_code_is_refused_wherever_it_is_nested(name: str) -> None:
         refuse_code(model(DENSE, wrapped))
 
 
+def test_what_trains_a_model_inside_another_is_built_with_it() -> None:
+    inner = layer("Sequential", "keras", compile_config={"optimizer": layer("Adam", "keras.optimizers"), "loss": "mse"})
+    evil = layer("Sequential", "keras", compile_config={"loss": CODE["a class of another module"]})
+    refuse_code(model(DENSE, inner) | {"compile_config": None}, built=True)
+    refuse_code(model(DENSE, evil))  # read as data, no part of it matters
+    with pytest.raises(NotAPolicyError, match=r"subprocess\.Popen"):
+        refuse_code(model(DENSE, evil) | {"compile_config": None}, built=True)
+
+
 def archive(path: Path, config: bytes) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as made:
         made.writestr("metadata.json", "{}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from converters.detached import Detached
 from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
 from converters.graph.ops.base import MISFIT
 from converters.graph.ops.table import op_of
 from converters.graph.types import FLOAT32, TensorType
@@ -102,7 +102,7 @@ class Importer(Builder):
             self._break(op, joined_errors([*self._causes(op, missing), *errors]))
             return
         target = next((o for o in op.outputs if o), op.name)
-        self.prefix = self._scope + (self._reserved.get(target) or node_name(target))
+        self.prefix = (self._scope + (self._reserved.get(target) or node_name(target)))[:MAX_NAME]
         try:
             results = function(op, self)
         except UnsupportedOpError as error:

@@ -100,7 +100,7 @@ def main() -> None:
         if kind == "keras":
             from converters.keras.config import config_inside, refuse_code
 
-            refuse_code(config_inside(path))
+            refuse_code(config_inside(path), built=True)
             return _Frozen(frozen_function(path, "keras"))
         if kind == "function":
             return InSession(imported(frozen_function(path, header["form"], header.get("signature")).graph_def))
