@@ -79,6 +79,9 @@ def _run(args: list[str]) -> None:
     import io
     import warnings
 
+    from signatures.cycles import look_seldom
+
+    look_seldom()  # before the imports, which are a good part of an export
     import click
 
     from exporter.cli.app import app

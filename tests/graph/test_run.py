@@ -104,3 +104,18 @@ def test_a_large_product_is_computed_a_piece_at_a_time(monkeypatch: pytest.Monke
     monkeypatch.setattr("converters.graph.ops.linear._AT_ONCE", 100)
     for each, other in ((Node("y", "MatMul"), b), (Node("y", "MatMul", attrs={"transpose_b": True}), b.T.copy())):
         np.testing.assert_allclose(product(each, a, other), whole, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize(("ulps", "absolute"), [(1.0, 0.0), (2.37, 1e-6)])
+def test_what_rounding_moves_it_moves_by_units_in_the_last_place(dtype: str, ulps: float, absolute: float) -> None:
+    random = np.random.default_rng(0)
+    bits = {"float16": np.uint16, "float32": np.uint32, "float64": np.uint64}[dtype]
+    given = random.integers(0, np.iinfo(bits).max, (64, 64), dtype=bits, endpoint=True).view(dtype)  # NaN, denormals
+    for array in (given, given[:1, 0].reshape(()), random.standard_normal(99).astype(dtype), np.zeros(4, dtype)):
+        with np.errstate(all="ignore"):
+            step = np.maximum(np.spacing(np.abs(array)) * ulps, absolute).astype(dtype)
+            up = np.random.default_rng(3).random(array.shape) >= 0.5
+            moved = np.where(up, array + step, array - step)
+        expected = np.where((array == 0) | ~np.isfinite(array), array, moved)
+        np.testing.assert_array_equal(Jitter(3)._moved(array, ulps, absolute), expected)
