@@ -2,73 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import MappingProxyType
+from collections.abc import Callable, Mapping
 
 from converters.barracuda.layer_builder import LayerBuilder, Value
-from converters.barracuda.vocabulary import Activation, activation_label
+from converters.barracuda.vocabulary import ONE_OP, Activation, activation_label
 from converters.graph.builder import Builder
 from converters.graph.nn import activations as nn
 from converters.graph.nn import reduction, trigonometry
 
-#: Activations that are one op.
-_OPS = MappingProxyType(
-    {
-        Activation.RELU: "Relu",
-        Activation.TANH: "Tanh",
-        Activation.SIGMOID: "Sigmoid",
-        Activation.RELU6: "Relu6",
-        Activation.SOFTPLUS: "Softplus",
-        Activation.ABS: "Abs",
-        Activation.NEG: "Neg",
-        Activation.CEIL: "Ceil",
-        Activation.FLOOR: "Floor",
-        Activation.ROUND: "Round",
-        Activation.RECIPROCAL: "Reciprocal",
-        Activation.SQRT: "Sqrt",
-        Activation.EXP: "Exp",
-        Activation.LOG: "Log",
-        Activation.COS: "Cos",
-        Activation.SIN: "Sin",
-        Activation.TAN: "Tan",
-        Activation.ERF: "Erf",
-        Activation.SOFTSIGN: "Softsign",
-    }
-)
-_FUNCTIONS: MappingProxyType[int, Callable[[Builder, str], str]] = MappingProxyType(
-    {
-        Activation.SWISH: nn.swish,
-        Activation.ACOS: trigonometry.acos,
-        Activation.ACOSH: trigonometry.acosh,
-        Activation.ASIN: trigonometry.asin,
-        Activation.ASINH: trigonometry.asinh,
-        Activation.ATAN: trigonometry.atan,
-        Activation.ATANH: trigonometry.atanh,
-        Activation.COSH: trigonometry.cosh,
-        Activation.SINH: trigonometry.sinh,
-    }
-)
+_FUNCTIONS: Mapping[int, Callable[[Builder, str], str]] = {
+    Activation.SWISH: nn.swish,
+    Activation.ACOS: trigonometry.acos,
+    Activation.ACOSH: trigonometry.acosh,
+    Activation.ASIN: trigonometry.asin,
+    Activation.ASINH: trigonometry.asinh,
+    Activation.ATAN: trigonometry.atan,
+    Activation.ATANH: trigonometry.atanh,
+    Activation.COSH: trigonometry.cosh,
+    Activation.SINH: trigonometry.sinh,
+}
 #: Activations that read ``alpha`` and ``beta``, in that order; Unity drops them where the activation is fused into
 #: another layer.
-_PARAMETRIC: MappingProxyType[int, Callable[[Builder, str, float, float], str]] = MappingProxyType(
-    {
-        Activation.LEAKY_RELU: lambda b, x, alpha, beta: nn.leaky_relu(b, x, alpha),
-        Activation.SELU: nn.selu,
-        Activation.HARD_SIGMOID: nn.hard_sigmoid,
-        Activation.CLIP: nn.clip,
-        Activation.POW: lambda b, x, alpha, beta: b.add("Pow", [x, b.number(x, alpha)]),
-    }
-)
-_ROWS: MappingProxyType[int, Callable[[Builder, str], str]] = MappingProxyType(
-    {
-        Activation.SOFTMAX: lambda b, x: reduction.over_last_axis(b, "Softmax", x),
-        Activation.LOG_SOFTMAX: lambda b, x: reduction.over_last_axis(b, "LogSoftmax", x),
-        Activation.HARDMAX: reduction.hardmax,
-    }
-)
+_PARAMETRIC: Mapping[int, Callable[[Builder, str, float, float], str]] = {
+    Activation.LEAKY_RELU: lambda b, x, alpha, beta: nn.leaky_relu(b, x, alpha),
+    Activation.SELU: nn.selu,
+    Activation.HARD_SIGMOID: nn.hard_sigmoid,
+    Activation.CLIP: nn.clip,
+    Activation.POW: lambda b, x, alpha, beta: b.add("Pow", [x, b.number(x, alpha)]),
+}
+_ROWS: Mapping[int, Callable[[Builder, str], str]] = {
+    Activation.SOFTMAX: lambda b, x: reduction.over_last_axis(b, "Softmax", x),
+    Activation.LOG_SOFTMAX: lambda b, x: reduction.over_last_axis(b, "LogSoftmax", x),
+    Activation.HARDMAX: reduction.hardmax,
+}
 
 
-def activate(b: LayerBuilder, number: int, x: Value, version: int, *, axis: int = -1, fused: bool = False) -> Value:
+def activate(b: LayerBuilder, number: int, x: Value, *, axis: int = -1, fused: bool = False) -> Value:
     """``number`` applied to ``x``; the parameters are the current layer's, or the defaults where it is fused."""
     if number == Activation.NONE:
         return x
@@ -78,9 +47,9 @@ def activate(b: LayerBuilder, number: int, x: Value, version: int, *, axis: int 
             "Unity drops the parameters of a fused activation, so what it computed is not known",
         )
     if number in _ROWS:
-        return _over_rows(b, Activation(number), x, version, axis)
-    if number in _OPS:
-        return Value(b.add(_OPS[Activation(number)], [x.reference]), x.shape)
+        return _over_rows(b, Activation(number), x, axis)
+    if number in ONE_OP:
+        return Value(b.add(ONE_OP[number], [x.reference]), x.shape)
     if number == Activation.ELU:
         return Value(nn.elu(b, x.reference, 1.0 if fused else b.layer.alpha), x.shape)
     if number in _FUNCTIONS:
@@ -103,16 +72,16 @@ def prelu(b: LayerBuilder, x: Value, slope: Value) -> Value:
 # ------------------------------------------------------------------ over rows
 
 
-def _over_rows(b: LayerBuilder, kind: Activation, x: Value, version: int, axis: int) -> Value:
+def _over_rows(b: LayerBuilder, kind: Activation, x: Value, axis: int) -> Value:
     """Softmax and its kin, over the flattened row up to version 16, along an axis (8-D order) from 18 on."""
     along_channels = axis in (-1, 7)
-    if x.rank == 4 and version > 16:
-        if not along_channels or version == 17:
+    if x.rank == 4 and b.version > 16:
+        if not along_channels or b.version == 17:
             raise b.unsupported(
                 f"{activation_label(kind)} of a tensor of shape {list(x.shape)}, axis {axis}",
                 "Barracuda 1.x took the whole row, later versions an axis; only an axis of channels is known for sure",
             )
         return Value(_ROWS[kind](b, x.reference), x.shape)
-    if version > 16 and not along_channels:
+    if b.version > 16 and not along_channels:
         raise b.unsupported(f"{activation_label(kind)} along axis {axis}", "that axis is not the channels'")
     return b.rows(_ROWS[kind](b, b.as_matrix(x)), x.shape[0], x.size)

@@ -2,50 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from types import MappingProxyType
+from collections.abc import Mapping, Sequence
 
 from converters.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
 from converters.barracuda.shaping import axis_of
-from converters.barracuda.vocabulary import C, LayerType, N
+from converters.barracuda.vocabulary import COMPARISONS, C, LayerType, N
 from converters.graph.nn import reduction
 from converters.graph.types import FLOAT32
 
-_FOLDED = MappingProxyType(
-    {
-        LayerType.ADD: "Add",
-        LayerType.SUB: "Sub",
-        LayerType.MUL: "Mul",
-        LayerType.DIV: "RealDiv",
-        LayerType.POW: "Pow",
-        LayerType.MIN: "Minimum",
-        LayerType.MAX: "Maximum",
-        LayerType.MEAN: "Add",
-    }
-)
-_COMPARED = MappingProxyType(
-    {
-        LayerType.GREATER: "Greater",
-        LayerType.GREATER_EQUAL: "GreaterEqual",
-        LayerType.LESS: "Less",
-        LayerType.LESS_EQUAL: "LessEqual",
-        LayerType.EQUAL: "Equal",
-    }
-)
-_REDUCED: MappingProxyType[int, reduction.Reduction] = MappingProxyType(
-    {
-        LayerType.REDUCE_MAX: reduction.of_kind("Max"),
-        LayerType.REDUCE_MEAN: reduction.of_kind("Mean"),
-        LayerType.REDUCE_MIN: reduction.of_kind("Min"),
-        LayerType.REDUCE_PROD: reduction.of_kind("Prod"),
-        LayerType.REDUCE_SUM: reduction.of_kind("Sum"),
-        LayerType.REDUCE_L1: reduction.l1,
-        LayerType.REDUCE_L2: reduction.l2,
-        LayerType.REDUCE_SUM_SQUARE: reduction.sum_square,
-        LayerType.REDUCE_LOG_SUM: reduction.log_sum,
-        LayerType.REDUCE_LOG_SUM_EXP: reduction.log_sum_exp,
-    }
-)
+_FOLDED: Mapping[LayerType, str] = {
+    LayerType.ADD: "Add",
+    LayerType.SUB: "Sub",
+    LayerType.MUL: "Mul",
+    LayerType.DIV: "RealDiv",
+    LayerType.POW: "Pow",
+    LayerType.MIN: "Minimum",
+    LayerType.MAX: "Maximum",
+    LayerType.MEAN: "Add",
+}
+_REDUCED: Mapping[int, reduction.Reduction] = {
+    LayerType.REDUCE_MAX: reduction.of_kind("Max"),
+    LayerType.REDUCE_MEAN: reduction.of_kind("Mean"),
+    LayerType.REDUCE_MIN: reduction.of_kind("Min"),
+    LayerType.REDUCE_PROD: reduction.of_kind("Prod"),
+    LayerType.REDUCE_SUM: reduction.of_kind("Sum"),
+    LayerType.REDUCE_L1: reduction.l1,
+    LayerType.REDUCE_L2: reduction.l2,
+    LayerType.REDUCE_SUM_SQUARE: reduction.sum_square,
+    LayerType.REDUCE_LOG_SUM: reduction.log_sum,
+    LayerType.REDUCE_LOG_SUM_EXP: reduction.log_sum_exp,
+}
 
 
 def folded(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -62,7 +48,7 @@ def folded(b: LayerBuilder, args: Sequence[Value]) -> Value:
 def compared(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """1 where the comparison holds, else 0."""
     operands, shape = b.operands(args)
-    return _as_float(b, b.add(_COMPARED[LayerType(b.layer.type)], operands), shape)
+    return _as_float(b, b.add(COMPARISONS[b.layer.type], operands), shape)
 
 
 def logical(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -98,10 +84,10 @@ def _as_float(b: LayerBuilder, truth: str, shape: Shape) -> Value:
     return Value(b.add("Cast", [truth], DstT=FLOAT32), shape)
 
 
-def reduced(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
+def reduced(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """One number per row along an axis, which stays with length 1. A second input names the axis and is ignored."""
     x = args[0]
-    axis = axis_of(b, b.layer.axis, version)
+    axis = axis_of(b, b.layer.axis)
     if axis == N:
         raise b.unsupported("it reduces over the batch", "an agent's action would depend on the other agents")
     small = x.shape[1:3] == (1, 1)

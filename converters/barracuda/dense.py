@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.barracuda.layer_builder import LayerBuilder, Shape, Value
+from converters.barracuda.vocabulary import LayerType
 from converters.graph.nn import linear
 from converters.graph.nn.activations import scaled
 from converters.graph.types import FLOAT32, INT32, INT64
@@ -105,17 +106,8 @@ def scale_bias(b: LayerBuilder, args: Sequence[Value]) -> Value:
 # ------------------------------------------------------------------ chance
 
 
-def random_normal(b: LayerBuilder, args: Sequence[Value]) -> Value:
-    """alpha·N(0, 1) + beta of the shape of the input, or of ``pool``."""
-    return _random(b, args, "RandomStandardNormal", origin=True)
-
-
-def random_uniform(b: LayerBuilder, args: Sequence[Value]) -> Value:
-    """alpha·U(0, 1) + beta of the shape of the input, or of ``pool``."""
-    return _random(b, args, "RandomUniform", origin=False)
-
-
-def _random(b: LayerBuilder, args: Sequence[Value], op: str, *, origin: bool) -> Value:
+def random(b: LayerBuilder, args: Sequence[Value]) -> Value:
+    """alpha·N(0, 1) + beta, or alpha·U(0, 1) + beta, of the shape of the input, or of ``pool``."""
     if b.layer.pool:
         shape: Shape = b.four(b.layer.pool)
         n, h, w, c = shape
@@ -131,7 +123,10 @@ def _random(b: LayerBuilder, args: Sequence[Value], op: str, *, origin: bool) ->
         size = b.add("Shape", [args[0].reference], out_type=INT32)
     else:
         raise b.damaged("it has neither a shape nor an input", "the shape of what it draws is not known")
-    drawn = b.add(op, [size], origin=b.layer.name, dtype=FLOAT32) if origin else b.add(op, [size], dtype=FLOAT32)
+    if b.layer.type == LayerType.RANDOM_NORMAL:
+        drawn = b.add("RandomStandardNormal", [size], origin=b.layer.name, dtype=FLOAT32)
+    else:
+        drawn = b.add("RandomUniform", [size], dtype=FLOAT32)
     return Value(scaled(b, drawn, b.layer.alpha, b.layer.beta), shape)
 
 
@@ -145,7 +140,7 @@ def multinomial(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.rows(b.add("Cast", [drawn], DstT=FLOAT32), x.n, count, drawn)
 
 
-def one_hot(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
+def one_hot(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """A row of ``pool[0]`` numbers per index: alpha at the index, beta elsewhere.
 
     Up to version 16 [N, 1, 1, n] becomes [N, 1, n, depth]; later, ``axis`` is the rank of the indices in ONNX, and the
@@ -164,9 +159,9 @@ def one_hot(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
         [index, b.ints(depth, "depth"), b.floats(b.layer.alpha, "on"), b.floats(b.layer.beta, "off")],
         axis=-1,
     )
-    if count == 1 and (version <= 16 or b.layer.axis < 2):
+    if count == 1 and (b.version <= 16 or b.layer.axis < 2):
         return b.shaped(hot, (n, 1, 1, depth))
-    if version <= 16:
+    if b.version <= 16:
         return b.shaped(hot, (n, 1, count, depth))
     if b.layer.axis == 2 and x.rank != 4:
         turned = b.add("Transpose", [hot, b.ints([0, 2, 1], "before")])

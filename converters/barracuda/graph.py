@@ -16,6 +16,7 @@ from functools import partial
 from converters.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
 from converters.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
 from converters.barracuda.layers import check_bypassed, translate
+from converters.barracuda.slices import above
 from converters.barracuda.vocabulary import LayerType
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32, INT64
@@ -58,7 +59,7 @@ class _Reader:
         for name in _names(model):
             self.nodes[name] = names.fresh(node_name(name))
         reserved = [*self.nodes.values(), MEMORY_IN, MEMORY_OUT]
-        self.builder = LayerBuilder(reserved)
+        self.builder = LayerBuilder(reserved, model.version)
         self.values: dict[str, Value] = {}
         #: what could not be translated, and is read by nothing that is needed so far
         self.failed: dict[str, ExportModelError] = {}
@@ -219,7 +220,7 @@ class _Reader:
         args = [self._value(i, b.location) for i in layer.inputs]
         args += [b.dataset(d.name, self.model.array(d)) for d in layer.datasets]
         begun = b.start(layer, name)
-        result = translate(b, layer, args, self.model.version)
+        result = translate(b, layer, args)
         if self.draws and layer.name in _CLASSES and result.integer is None:
             result = replace(result, integer=b.add("Cast", [b.as_matrix(result)], name="classes", DstT=INT64))
         if self.draws and layer.name == MEMORY_OUT:
@@ -269,11 +270,4 @@ def _upstream(model: NnModel, layers: Mapping[str, Layer]) -> set[str]:
         roots = list(model.outputs)
     if model.memories:
         roots = [name for name in roots if name != MEMORY_OUT]
-    stack = [*roots, *(m.output for m in model.memories)]
-    seen: set[str] = set()
-    while stack:
-        name = stack.pop()
-        if name not in seen:
-            seen.add(name)
-            stack.extend(layers[name].inputs if name in layers else ())
-    return seen
+    return above([*roots, *(m.output for m in model.memories)], layers)

@@ -87,11 +87,12 @@ class Value:
 class LayerBuilder(Builder):
     """The builder of a ``.nn``'s graph, at a layer of it; ``notes`` are what the user should know of how it was read.
 
-    ``reserved`` are the names of the nodes that stand for layers, inputs and outputs.
+    ``reserved`` are the names of the nodes that stand for layers, inputs and outputs, ``version`` is the file's.
     """
 
-    def __init__(self, reserved: Iterable[str]) -> None:
+    def __init__(self, reserved: Iterable[str], version: int) -> None:
         super().__init__(NameScope(reserved))
+        self.version = version
         self.notes: list[str] = []
         self.layer = Layer("", 0)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from types import MappingProxyType
+from collections.abc import Callable, Mapping, Sequence
 
 from converters.barracuda import activations, arithmetic, convolution, dense, shaping
 from converters.barracuda.format import Layer
@@ -11,92 +10,79 @@ from converters.barracuda.layer_builder import LayerBuilder, Value
 from converters.barracuda.vocabulary import Activation, LayerType, layer_label
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
-#: Takes (builder, the layer's inputs and then its datasets, the file's version).
-Translate = Callable[[LayerBuilder, Sequence[Value], int], Value]
+#: Takes (builder, the layer's inputs and then its datasets).
+Translate = Callable[[LayerBuilder, Sequence[Value]], Value]
 _ANY = 1 << 16
 
 
-def _plain(function: Callable[[LayerBuilder, Sequence[Value]], Value]) -> Translate:
-    return lambda b, args, version: function(b, args)
-
-
-def _same(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
+def _same(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return args[0]
 
 
-def _activation(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
+def _activation(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if b.layer.activation == Activation.PRELU:
         if len(args) != 2:
             raise b.damaged(f"it has {len(args)} inputs", "a PRelu takes a tensor and its slopes")
         return activations.prelu(b, args[0], args[1])
     if len(args) != 1:
         raise b.damaged(f"it has {len(args)} inputs", "an activation takes one")
-    return activations.activate(b, b.layer.activation, args[0], version, axis=b.layer.axis)
+    return activations.activate(b, b.layer.activation, args[0], axis=b.layer.axis)
 
 
 #: Type → (fewest tensors, most, translation). A reduction may have a second input that is ignored.
-_LAYERS: MappingProxyType[int, tuple[int, int, Translate]] = MappingProxyType(
-    {
-        LayerType.NOP: (1, 1, _same),
-        LayerType.DROPOUT: (1, 1, _same),
-        LayerType.DENSE: (3, 3, _plain(dense.dense)),
-        LayerType.MATMUL: (2, 2, _plain(dense.matmul)),
-        LayerType.DENSE3: (3, 3, _plain(dense.dense3)),
-        LayerType.SCALE_BIAS: (3, 3, _plain(dense.scale_bias)),
-        LayerType.RANDOM_NORMAL: (0, 1, _plain(dense.random_normal)),
-        LayerType.RANDOM_UNIFORM: (0, 1, _plain(dense.random_uniform)),
-        LayerType.MULTINOMIAL: (1, 1, _plain(dense.multinomial)),
-        LayerType.ONE_HOT: (1, 1, dense.one_hot),
-        LayerType.CONV2D: (3, 3, _plain(convolution.conv2d)),
-        LayerType.DEPTHWISE_CONV2D: (3, 3, _plain(convolution.depthwise)),
-        LayerType.CONV2D_TRANS: (3, 3, _plain(convolution.conv2d_trans)),
-        LayerType.UPSAMPLE2D: (1, 2, _plain(convolution.upsample)),
-        LayerType.NORMALIZATION: (3, 3, _plain(convolution.normalization)),
-        LayerType.ACTIVATION: (1, 2, _activation),
-        LayerType.WHERE: (3, 3, _plain(arithmetic.where)),
-        LayerType.SIGN: (1, 1, _plain(arithmetic.sign)),
-        LayerType.LOGICAL_NOT: (1, 1, _plain(arithmetic.logical)),
-        LayerType.FLATTEN: (1, 1, _plain(shaping.flatten)),
-        LayerType.RESHAPE: (1, 2, _plain(shaping.reshape)),
-        LayerType.TRANSPOSE: (1, 1, _plain(shaping.transpose)),
-        LayerType.SQUEEZE: (1, 1, _plain(shaping.squeeze)),
-        LayerType.UNSQUEEZE: (1, 1, _plain(shaping.squeeze)),
-        LayerType.GATHER: (2, 2, shaping.gather),
-        LayerType.CONCAT: (1, _ANY, shaping.concat),
-        LayerType.STRIDED_SLICE: (1, 1, _plain(shaping.strided_slice)),
-        LayerType.TILE: (1, 1, _plain(shaping.tile)),
-        LayerType.EXPAND: (1, 1, _plain(shaping.expand)),
-        LayerType.DEPTH_TO_SPACE: (1, 1, _plain(shaping.depth_to_space)),
-        LayerType.SPACE_TO_DEPTH: (1, 1, _plain(shaping.space_to_depth)),
-        **dict.fromkeys((LayerType.MAX_POOL2D, LayerType.AVG_POOL2D), (1, 1, _plain(convolution.pool))),
-        **dict.fromkeys(
-            (LayerType.GLOBAL_MAX_POOL2D, LayerType.GLOBAL_AVG_POOL2D), (1, 1, _plain(convolution.global_pool))
-        ),
-        **dict.fromkeys(
-            (LayerType.BORDER2D, LayerType.PAD2D_REFLECT, LayerType.PAD2D_SYMMETRIC, LayerType.PAD2D_EDGE),
-            (1, 1, _plain(convolution.border)),
-        ),
-        **dict.fromkeys((*range(LayerType.ADD, LayerType.POW + 1),), (1, _ANY, _plain(arithmetic.folded))),
-        **dict.fromkeys((*range(LayerType.MIN, LayerType.MEAN + 1),), (1, _ANY, _plain(arithmetic.folded))),
-        **dict.fromkeys((*range(LayerType.GREATER, LayerType.EQUAL + 1),), (2, 2, _plain(arithmetic.compared))),
-        **dict.fromkeys(
-            (LayerType.LOGICAL_OR, LayerType.LOGICAL_AND, LayerType.LOGICAL_XOR), (2, 2, _plain(arithmetic.logical))
-        ),
-        **dict.fromkeys((*range(LayerType.REDUCE_L1, LayerType.REDUCE_SUM_SQUARE + 1),), (1, 2, arithmetic.reduced)),
-        **dict.fromkeys((LayerType.ARG_MAX, LayerType.ARG_MIN), (1, 2, arithmetic.reduced)),
-    }
-)
+_LAYERS: Mapping[int, tuple[int, int, Translate]] = {
+    LayerType.NOP: (1, 1, _same),
+    LayerType.DROPOUT: (1, 1, _same),
+    LayerType.DENSE: (3, 3, dense.dense),
+    LayerType.MATMUL: (2, 2, dense.matmul),
+    LayerType.DENSE3: (3, 3, dense.dense3),
+    LayerType.SCALE_BIAS: (3, 3, dense.scale_bias),
+    **dict.fromkeys((LayerType.RANDOM_NORMAL, LayerType.RANDOM_UNIFORM), (0, 1, dense.random)),
+    LayerType.MULTINOMIAL: (1, 1, dense.multinomial),
+    LayerType.ONE_HOT: (1, 1, dense.one_hot),
+    LayerType.CONV2D: (3, 3, convolution.conv2d),
+    LayerType.DEPTHWISE_CONV2D: (3, 3, convolution.depthwise),
+    LayerType.CONV2D_TRANS: (3, 3, convolution.conv2d_trans),
+    LayerType.UPSAMPLE2D: (1, 2, convolution.upsample),
+    LayerType.NORMALIZATION: (3, 3, convolution.normalization),
+    LayerType.ACTIVATION: (1, 2, _activation),
+    LayerType.WHERE: (3, 3, arithmetic.where),
+    LayerType.SIGN: (1, 1, arithmetic.sign),
+    LayerType.LOGICAL_NOT: (1, 1, arithmetic.logical),
+    LayerType.FLATTEN: (1, 1, shaping.flatten),
+    LayerType.RESHAPE: (1, 2, shaping.reshape),
+    LayerType.TRANSPOSE: (1, 1, shaping.transpose),
+    LayerType.SQUEEZE: (1, 1, shaping.squeeze),
+    LayerType.UNSQUEEZE: (1, 1, shaping.squeeze),
+    LayerType.GATHER: (2, 2, shaping.gather),
+    LayerType.CONCAT: (1, _ANY, shaping.concat),
+    LayerType.STRIDED_SLICE: (1, 1, shaping.strided_slice),
+    LayerType.TILE: (1, 1, shaping.tile),
+    LayerType.EXPAND: (1, 1, shaping.expand),
+    LayerType.DEPTH_TO_SPACE: (1, 1, shaping.depth_to_space),
+    LayerType.SPACE_TO_DEPTH: (1, 1, shaping.space_to_depth),
+    **dict.fromkeys((LayerType.MAX_POOL2D, LayerType.AVG_POOL2D), (1, 1, convolution.pool)),
+    **dict.fromkeys((LayerType.GLOBAL_MAX_POOL2D, LayerType.GLOBAL_AVG_POOL2D), (1, 1, convolution.global_pool)),
+    **dict.fromkeys(
+        (LayerType.BORDER2D, LayerType.PAD2D_REFLECT, LayerType.PAD2D_SYMMETRIC, LayerType.PAD2D_EDGE),
+        (1, 1, convolution.border),
+    ),
+    **dict.fromkeys(range(LayerType.ADD, LayerType.POW + 1), (1, _ANY, arithmetic.folded)),
+    **dict.fromkeys(range(LayerType.MIN, LayerType.MEAN + 1), (1, _ANY, arithmetic.folded)),
+    **dict.fromkeys(range(LayerType.GREATER, LayerType.EQUAL + 1), (2, 2, arithmetic.compared)),
+    **dict.fromkeys((LayerType.LOGICAL_OR, LayerType.LOGICAL_AND, LayerType.LOGICAL_XOR), (2, 2, arithmetic.logical)),
+    **dict.fromkeys(range(LayerType.REDUCE_L1, LayerType.REDUCE_SUM_SQUARE + 1), (1, 2, arithmetic.reduced)),
+    **dict.fromkeys((LayerType.ARG_MAX, LayerType.ARG_MIN), (1, 2, arithmetic.reduced)),
+}
 
-_WHY = MappingProxyType(
-    {
-        LayerType.LRN: "local response normalisation is not in the op table, and no model of ML-Agents has it",
-        LayerType.LSTM: "it takes and gives its state beside the graph; the converters of ML-Agents never wrote it",
-        LayerType.RESAMPLE2D: "which pixel is nearest is rounded differently by Unity's backends",
-    }
-)
+_WHY: Mapping[LayerType, str] = {
+    LayerType.LRN: "local response normalisation is not in the op table, and no model of ML-Agents has it",
+    LayerType.LSTM: "it takes and gives its state beside the graph; the converters of ML-Agents never wrote it",
+    LayerType.RESAMPLE2D: "which pixel is nearest is rounded differently by Unity's backends",
+}
 
 
-def translate(b: LayerBuilder, layer: Layer, args: Sequence[Value], version: int) -> Value:
+def translate(b: LayerBuilder, layer: Layer, args: Sequence[Value]) -> Value:
     """What a layer computes, activation included; ``args`` are its inputs and then its datasets.
 
     Raises UnsupportedOpError that names the layer, GraphError where it contradicts itself.
@@ -112,14 +98,14 @@ def translate(b: LayerBuilder, layer: Layer, args: Sequence[Value], version: int
         wanted = fewest if fewest == most else f"{fewest} to {most}" if most < _ANY else f"{fewest} or more"
         raise b.damaged(f"it has {len(args)} inputs and datasets", f"it takes {wanted}")
     try:
-        result = function(b, args, version)
+        result = function(b, args)
     except UnsupportedOpError as error:
         if error.issues:
             raise
         raise b.unsupported(error.what, error.why or "a policy's tensors have another form") from error
     b.sized(*result.shape[1:])
     if layer.type != LayerType.ACTIVATION and layer.activation != Activation.NONE:
-        result = activations.activate(b, layer.activation, result, version, fused=True)
+        result = activations.activate(b, layer.activation, result, fused=True)
     return result
 
 

@@ -8,67 +8,39 @@ old worker copies what it does not know).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 
 from converters.barracuda.lower_base import Axes, NnBuilder, Value, usual_axes
-from converters.barracuda.vocabulary import Activation, C, H, LayerType, W
+from converters.barracuda.vocabulary import COMPARISONS, ONE_OP, Activation, C, H, LayerType, W
 from converters.graph.types import Dim
 
 #: Times this, every difference that float32 tells apart from 0 near 1 is beyond ±1.
 _STEEP = 1e30
 _LARGEST = float(np.finfo(np.float32).max)
 
-_ACTIVATIONS = MappingProxyType(
-    {
-        "Relu": Activation.RELU,
-        "Relu6": Activation.RELU6,
-        "Tanh": Activation.TANH,
-        "Sigmoid": Activation.SIGMOID,
-        "Elu": Activation.ELU,
-        "Abs": Activation.ABS,
-        "Neg": Activation.NEG,
-        "Floor": Activation.FLOOR,
-        "Ceil": Activation.CEIL,
-        "Reciprocal": Activation.RECIPROCAL,
-        "Sqrt": Activation.SQRT,
-        "Exp": Activation.EXP,
-        "Log": Activation.LOG,
-    }
-)
-_TWO = MappingProxyType(
-    {
-        "Add": LayerType.ADD,
-        "BiasAdd": LayerType.ADD,
-        "Mul": LayerType.MUL,
-        "LogicalAnd": LayerType.MUL,
-        "Minimum": LayerType.MIN,
-        "Maximum": LayerType.MAX,
-        "LogicalOr": LayerType.MAX,
-    }
-)
-_COMPARED = MappingProxyType(
-    {
-        "Greater": LayerType.GREATER,
-        "GreaterEqual": LayerType.GREATER_EQUAL,
-        "Less": LayerType.LESS,
-        "LessEqual": LayerType.LESS_EQUAL,
-        "Equal": LayerType.EQUAL,
-        "NotEqual": LayerType.EQUAL,
-    }
-)
-_MIRRORED = MappingProxyType(
-    {
-        LayerType.GREATER: LayerType.LESS,
-        LayerType.GREATER_EQUAL: LayerType.LESS_EQUAL,
-        LayerType.LESS: LayerType.GREATER,
-        LayerType.LESS_EQUAL: LayerType.GREATER_EQUAL,
-        LayerType.EQUAL: LayerType.EQUAL,
-    }
-)
+#: Those that a Barracuda of 1.0 has not, or rounds another way, are spelled out.
+_YOUNG = ("Softplus", "Softsign", "Round", "Cos", "Sin", "Tan", "Erf")
+_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if op not in _YOUNG} | {"Elu": Activation.ELU}
+_TWO: Mapping[str, LayerType] = {
+    "Add": LayerType.ADD,
+    "BiasAdd": LayerType.ADD,
+    "Mul": LayerType.MUL,
+    "LogicalAnd": LayerType.MUL,
+    "Minimum": LayerType.MIN,
+    "Maximum": LayerType.MAX,
+    "LogicalOr": LayerType.MAX,
+}
+_COMPARED = {op: LayerType(kind) for kind, op in COMPARISONS.items()} | {"NotEqual": LayerType.EQUAL}
+_MIRRORED: Mapping[LayerType, LayerType] = {
+    LayerType.GREATER: LayerType.LESS,
+    LayerType.GREATER_EQUAL: LayerType.LESS_EQUAL,
+    LayerType.LESS: LayerType.GREATER,
+    LayerType.LESS_EQUAL: LayerType.GREATER_EQUAL,
+    LayerType.EQUAL: LayerType.EQUAL,
+}
 
 
 # ------------------------------------------------------------------ one operand
@@ -147,22 +119,20 @@ def _leaky_relu(b: NnBuilder, x: str) -> str:
     return b.two(LayerType.ADD, b.at_least(x, 0), b.scaled(b.at_most(x, 0), alpha))
 
 
-_FORMULAS: MappingProxyType[str, Callable[[NnBuilder, str], str]] = MappingProxyType(
-    {
-        "Square": lambda b, x: b.two(LayerType.MUL, x, x),
-        "Rsqrt": lambda b, x: b.activation(Activation.RECIPROCAL, b.activation(Activation.SQRT, x, label="sqrt")),
-        "Expm1": lambda b, x: b.shifted(b.activation(Activation.EXP, x, label="exp"), -1),
-        "Log1p": lambda b, x: b.activation(Activation.LOG, b.shifted(x, 1)),
-        "Softplus": _softplus,
-        "Softsign": _softsign,
-        "Sign": _sign,
-        "Round": _round,
-        "Erf": _erf,
-        "LogicalNot": lambda b, x: b.shifted(b.scaled(x, -1), 1),
-        "LeakyRelu": _leaky_relu,
-        "Selu": lambda b, x: b.activation(Activation.SELU, x, alpha=1.6732632423543772, beta=1.0507009873554805),
-    }
-)
+_FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
+    "Square": lambda b, x: b.two(LayerType.MUL, x, x),
+    "Rsqrt": lambda b, x: b.activation(Activation.RECIPROCAL, b.activation(Activation.SQRT, x, label="sqrt")),
+    "Expm1": lambda b, x: b.shifted(b.activation(Activation.EXP, x, label="exp"), -1),
+    "Log1p": lambda b, x: b.activation(Activation.LOG, b.shifted(x, 1)),
+    "Softplus": _softplus,
+    "Softsign": _softsign,
+    "Sign": _sign,
+    "Round": _round,
+    "Erf": _erf,
+    "LogicalNot": lambda b, x: b.shifted(b.scaled(x, -1), 1),
+    "LeakyRelu": _leaky_relu,
+    "Selu": lambda b, x: b.activation(Activation.SELU, x, alpha=1.6732632423543772, beta=1.0507009873554805),
+}
 
 
 def formula(b: NnBuilder, args: Sequence[Value]) -> Value:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
-from types import MappingProxyType
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -29,60 +28,56 @@ _FIRST = slice(0, 1)
 _ALL = slice(None)
 
 #: Op → (function, the inputs that are data: the others are read as constants).
-_OPS: MappingProxyType[str, tuple[Lower, slice]] = MappingProxyType(
-    {
-        **dict.fromkeys(elementwise.ACTIVATIONS, (elementwise.activation, _ALL)),
-        **dict.fromkeys(elementwise.FORMULAS, (elementwise.formula, _ALL)),
-        **dict.fromkeys(elementwise.TWO, (elementwise.both, _ALL)),
-        **dict.fromkeys(elementwise.COMPARED, (elementwise.compare, _ALL)),
-        "Sub": (elementwise.subtract, _ALL),
-        "RealDiv": (elementwise.divide, _ALL),
-        "Pow": (elementwise.power, _ALL),
-        "FloorDiv": (elementwise.floor_divide, _ALL),
-        "FloorMod": (elementwise.floor_divide, _ALL),
-        "SquaredDifference": (elementwise.squared_difference, _ALL),
-        "ClipByValue": (elementwise.clip, _ALL),
-        "AddN": (elementwise.add_n, _ALL),
-        "Cast": (elementwise.cast, _ALL),
-        "Select": (elementwise.select, _ALL),
-        "SelectV2": (elementwise.select, _ALL),
-        **dict.fromkeys(
-            ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"), (arrays.same, _FIRST)
-        ),
-        **dict.fromkeys(("Reshape", "Squeeze", "ExpandDims"), (arrays.reshape, _FIRST)),
-        "Transpose": (arrays.transpose, _FIRST),
-        "ConcatV2": (arrays.concat, slice(0, -1)),
-        "Pack": (arrays.pack, _ALL),
-        "Unpack": (arrays.unpack, _ALL),
-        "Split": (arrays.split, slice(1, 2)),
-        "SplitV": (arrays.split, _FIRST),
-        "Slice": (arrays.slice_, _FIRST),
-        "StridedSlice": (arrays.strided_slice, _FIRST),
-        "Gather": (arrays.gather, slice(0, 2)),
-        "GatherV2": (arrays.gather, slice(0, 2)),
-        "OneHot": (arrays.one_hot, _FIRST),
-        "Tile": (arrays.tile, _FIRST),
-        "BroadcastTo": (arrays.broadcast_to, _FIRST),
-        **dict.fromkeys(("Fill", "ZerosLike", "OnesLike"), (arrays.filled, slice(0, 0))),
-        **dict.fromkeys(("Pad", "PadV2"), (arrays.pad, _FIRST)),
-        **dict.fromkeys(("MatMul", "BatchMatMul"), (linear.matmul, _ALL)),
-        "Conv2D": (linear.conv2d, _ALL),
-        **dict.fromkeys(("_FusedMatMul", "_FusedConv2D"), (linear.fused, _ALL)),
-        "DepthwiseConv2dNative": (linear.depthwise, _ALL),
-        **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
-        **dict.fromkeys(linear.REDUCTIONS, (linear.reduce, _FIRST)),
-        **dict.fromkeys(("Softmax", "LogSoftmax"), (linear.softmax, _ALL)),
-        **dict.fromkeys(("ArgMax", "ArgMin"), (linear.arg_best, _FIRST)),
-        "Multinomial": (linear.drawn_class, _FIRST),
-        **dict.fromkeys(("RandomStandardNormal", "RandomUniform"), (linear.random, slice(0, 0))),
-    }
-)
+_OPS: Mapping[str, tuple[Lower, slice]] = {
+    **dict.fromkeys(elementwise.ACTIVATIONS, (elementwise.activation, _ALL)),
+    **dict.fromkeys(elementwise.FORMULAS, (elementwise.formula, _ALL)),
+    **dict.fromkeys(elementwise.TWO, (elementwise.both, _ALL)),
+    **dict.fromkeys(elementwise.COMPARED, (elementwise.compare, _ALL)),
+    "Sub": (elementwise.subtract, _ALL),
+    "RealDiv": (elementwise.divide, _ALL),
+    "Pow": (elementwise.power, _ALL),
+    "FloorDiv": (elementwise.floor_divide, _ALL),
+    "FloorMod": (elementwise.floor_divide, _ALL),
+    "SquaredDifference": (elementwise.squared_difference, _ALL),
+    "ClipByValue": (elementwise.clip, _ALL),
+    "AddN": (elementwise.add_n, _ALL),
+    "Cast": (elementwise.cast, _ALL),
+    "Select": (elementwise.select, _ALL),
+    "SelectV2": (elementwise.select, _ALL),
+    **dict.fromkeys(
+        ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"), (arrays.same, _FIRST)
+    ),
+    **dict.fromkeys(("Reshape", "Squeeze", "ExpandDims"), (arrays.reshape, _FIRST)),
+    "Transpose": (arrays.transpose, _FIRST),
+    "ConcatV2": (arrays.concat, slice(0, -1)),
+    "Pack": (arrays.pack, _ALL),
+    "Unpack": (arrays.unpack, _ALL),
+    "Split": (arrays.split, slice(1, 2)),
+    "SplitV": (arrays.split, _FIRST),
+    "Slice": (arrays.slice_, _FIRST),
+    "StridedSlice": (arrays.strided_slice, _FIRST),
+    "Gather": (arrays.gather, slice(0, 2)),
+    "GatherV2": (arrays.gather, slice(0, 2)),
+    "OneHot": (arrays.one_hot, _FIRST),
+    "Tile": (arrays.tile, _FIRST),
+    "BroadcastTo": (arrays.broadcast_to, _FIRST),
+    **dict.fromkeys(("Fill", "ZerosLike", "OnesLike"), (arrays.filled, slice(0, 0))),
+    **dict.fromkeys(("Pad", "PadV2"), (arrays.pad, _FIRST)),
+    **dict.fromkeys(("MatMul", "BatchMatMul"), (linear.matmul, _ALL)),
+    "Conv2D": (linear.conv2d, _ALL),
+    **dict.fromkeys(("_FusedMatMul", "_FusedConv2D"), (linear.fused, _ALL)),
+    "DepthwiseConv2dNative": (linear.depthwise, _ALL),
+    **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
+    **dict.fromkeys(linear.REDUCTIONS, (linear.reduce, _FIRST)),
+    **dict.fromkeys(("Softmax", "LogSoftmax"), (linear.softmax, _ALL)),
+    **dict.fromkeys(("ArgMax", "ArgMin"), (linear.arg_best, _FIRST)),
+    "Multinomial": (linear.drawn_class, _FIRST),
+    **dict.fromkeys(("RandomStandardNormal", "RandomUniform"), (linear.random, slice(0, 0))),
+}
 
-_WHY = MappingProxyType(
-    {
-        "Multinomial": "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
-    }
-)
+_WHY: Mapping[str, str] = {
+    "Multinomial": "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
+}
 
 
 def lower_graph(b: NnBuilder, graph: Graph, given: dict[str, Value], wanted: Iterable[str]) -> dict[str, Value]:

@@ -21,13 +21,13 @@ _NAMES = "NHWC"
 _FAR = (1 << 31) - 1
 
 
-def axis_of(b: LayerBuilder, axis: int, version: int) -> int:
+def axis_of(b: LayerBuilder, axis: int) -> int:
     """An axis of the file as a position in N, H, W, C; −1 is C."""
     if -4 <= axis < 0:
         return axis + 4
-    if version < EIGHT_AXES and 0 <= axis < 4:
+    if b.version < EIGHT_AXES and 0 <= axis < 4:
         return axis
-    if version >= EIGHT_AXES and axis in EIGHT:
+    if b.version >= EIGHT_AXES and axis in EIGHT:
         return EIGHT.index(axis)
     raise b.unsupported(f"the axis is {axis}", "the tensors of a policy have the axes N, H, W and C")
 
@@ -109,9 +109,9 @@ def transpose(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.shaped(turned, (n, int(h or 0), int(w or 0), int(c or 0)))
 
 
-def concat(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
+def concat(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The inputs one after the other along an axis; the other lengths are equal."""
-    axis = axis_of(b, b.layer.axis, version)
+    axis = axis_of(b, b.layer.axis)
     if len(args) == 1:
         return args[0]
     if axis == N:
@@ -194,10 +194,10 @@ def _cut(b: LayerBuilder, start: int, end: int, step: int, length: int, name: st
     return first, last, step
 
 
-def gather(b: LayerBuilder, args: Sequence[Value], version: int) -> Value:
+def gather(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Elements along an axis: chosen by constants, or by a number per agent out of the rows of a constant table."""
     x, index = args
-    axis = axis_of(b, b.layer.axis, version)
+    axis = axis_of(b, b.layer.axis)
     if tuple(b.layer.pool)[1:] not in ((), (0,), (1,)):
         raise b.unsupported(f"indices of rank {b.layer.pool[1]}", "only a list of indices is translated")
     if index.constant is not None and axis != N:

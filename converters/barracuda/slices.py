@@ -9,11 +9,12 @@ branches' widths are those of the dense layers that were joined; the file has th
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from converters.barracuda.format import Layer, NnModel
 from converters.barracuda.vocabulary import Activation, LayerType
+from converters.graph.nodes import reached
 
 _MASKS = "action_masks"
 
@@ -26,7 +27,7 @@ def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
     total, parts = model.number("action_output_shape"), _parts(layers)
     if not model.from_python or total is None or len(parts) < 2:
         return model, ()
-    above = [_above(part, layers) for part in parts]
+    above = [above([part], layers) for part in parts]
     shared = set.intersection(*above)
     own = [names - shared for names in above]
     logits = {name for name in shared if name in layers and len(layers[name].inputs) == len(parts)}
@@ -66,16 +67,9 @@ def _parts(layers: Mapping[str, Layer]) -> Sequence[str]:
     return layer.inputs if layer is not None and layer.type == LayerType.CONCAT else ()
 
 
-def _above(name: str, layers: Mapping[str, Layer]) -> set[str]:
-    """A tensor and all that it is computed from."""
-    found: set[str] = set()
-    stack = [name]
-    while stack:
-        name = stack.pop()
-        if name not in found:
-            found.add(name)
-            stack.extend(layers[name].inputs if name in layers else ())
-    return found
+def above(names: Iterable[str], layers: Mapping[str, Layer]) -> set[str]:
+    """Tensors and all that they are computed from."""
+    return reached(names, lambda name: layers[name].inputs if name in layers else ())
 
 
 def _widths(layers: Mapping[str, Layer], joined: Sequence[str], total: int) -> tuple[int, ...]:

@@ -5,6 +5,7 @@ Source: Barracuda's ``Layer.Type`` and ``Layer.Activation`` (Model.cs of 0.1.x t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 
 
@@ -145,6 +146,37 @@ class Activation(IntEnum):
     TAN = 210
     ERF = 211
 
+
+#: Activations that are one op.
+ONE_OP: Mapping[int, str] = {
+    Activation.RELU: "Relu",
+    Activation.TANH: "Tanh",
+    Activation.SIGMOID: "Sigmoid",
+    Activation.RELU6: "Relu6",
+    Activation.SOFTPLUS: "Softplus",
+    Activation.ABS: "Abs",
+    Activation.NEG: "Neg",
+    Activation.CEIL: "Ceil",
+    Activation.FLOOR: "Floor",
+    Activation.ROUND: "Round",
+    Activation.RECIPROCAL: "Reciprocal",
+    Activation.SQRT: "Sqrt",
+    Activation.EXP: "Exp",
+    Activation.LOG: "Log",
+    Activation.COS: "Cos",
+    Activation.SIN: "Sin",
+    Activation.TAN: "Tan",
+    Activation.ERF: "Erf",
+    Activation.SOFTSIGN: "Softsign",
+}
+#: Comparisons, whose results are 1 and 0, and their ops.
+COMPARISONS: Mapping[int, str] = {
+    LayerType.GREATER: "Greater",
+    LayerType.GREATER_EQUAL: "GreaterEqual",
+    LayerType.LESS: "Less",
+    LayerType.LESS_EQUAL: "LessEqual",
+    LayerType.EQUAL: "Equal",
+}
 
 #: Positions of the axes in the four-entry shapes of versions up to 16.
 N, H, W, C = range(4)

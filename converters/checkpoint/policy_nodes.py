@@ -15,7 +15,6 @@ from collections.abc import Mapping
 
 from converters.checkpoint.freeze import is_effect
 from converters.graph.nodes import Graph, Node, node_of, topological
-from converters.renaming import renamed
 from converters.understand.brains import find_brains
 from signatures.errors import ExportModelError
 from signatures.roles import OUTPUT_NAMES, Constant, numbers
@@ -37,7 +36,7 @@ def policy_nodes(graph: Graph) -> tuple[Graph, tuple[str, ...]]:
         for base, _, reference in brain.outputs
         if _is_inner(graph, brain.scope, base, brain.constants) and (name := node_of(reference))
     ]
-    return renamed(graph, {name: f"{name}/not_exported" for name in hidden}), notes
+    return graph.renamed({name: f"{name}/not_exported" for name in hidden}), notes
 
 
 def _with_action(graph: Graph) -> tuple[Graph, tuple[str, ...]]:

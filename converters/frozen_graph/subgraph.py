@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from converters import schema
-from converters.graph.nodes import Node, node_of
+from converters.graph.nodes import Node, node_of, reached
 from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, ORDERING, SPELLINGS, TABLE, unsupported
 from signatures.errors import GraphError
 
@@ -43,14 +43,7 @@ def subgraph(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) 
     """
     nodes, roots = _checked(graph_def, fetches, feeds)
     looping = any(n.op in CONTROL_FLOW for n in graph_def.node)
-    kept: set[str] = set()
-    stack = list(roots)
-    while stack:
-        name = stack.pop()
-        if name in kept:
-            continue
-        kept.add(name)
-        stack.extend(node_of(i.removeprefix("^")) for i in _inputs(nodes, nodes[name], looping))
+    kept = reached(roots, lambda n: (node_of(i.removeprefix("^")) for i in _inputs(nodes, nodes[n], looping)))
     part = schema.GraphDef()
     part.versions.CopyFrom(graph_def.versions)
     for node in graph_def.node:

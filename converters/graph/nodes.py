@@ -7,7 +7,7 @@ Graphs are immutable by convention: passes make new ones.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from typing import Any
 
@@ -88,6 +88,24 @@ def normal_ref(reference: str) -> str:
     return ref(*split_ref(reference))
 
 
+def renamed_ref(reference: str, names: Mapping[str, str]) -> str:
+    """``reference`` where the nodes of ``names`` (old → new) are called otherwise."""
+    name, index = split_ref(reference)
+    return ref(names.get(name, name), index)
+
+
+def reached(starts: Iterable[str], ahead: Callable[[str], Iterable[str]]) -> set[str]:
+    """``starts`` and all names that ``ahead`` leads to from them."""
+    seen: set[str] = set()
+    stack = list(starts)
+    while stack:
+        name = stack.pop()
+        if name not in seen:
+            seen.add(name)
+            stack.extend(ahead(name))
+    return seen
+
+
 @dataclass(frozen=True)
 class Graph:
     """Nodes in topological order (the back edges of while loops apart), looked up by name."""
@@ -140,16 +158,8 @@ class Graph:
 
     def ancestors(self, references: Iterable[str], stop: frozenset[str] = frozenset()) -> set[str]:
         """Names of all nodes upstream of ``references``, themselves included; does not look behind ``stop``."""
-        seen: set[str] = set()
-        stack = list(map(node_of, references))
-        while stack:
-            name = stack.pop()
-            if name in seen:
-                continue
-            seen.add(name)
-            if name not in stop:
-                stack.extend(map(node_of, self._index[name].inputs))
-        return seen
+        index = self._index
+        return reached(map(node_of, references), lambda n: () if n in stop else map(node_of, index[n].inputs))
 
     def descendants(self, names: Iterable[str]) -> set[str]:
         """Names of all nodes downstream of those called ``names``, themselves included, in a graph without loops."""
@@ -163,6 +173,14 @@ class Graph:
         """Only what is upstream of ``references``, in the same order."""
         keep = self.ancestors(references)
         return self if len(keep) == len(self.nodes) else Graph(tuple(n for n in self.nodes if n.name in keep))
+
+    def renamed(self, names: Mapping[str, str]) -> Graph:
+        """The graph with the nodes of ``names`` (old → new) renamed; their ``origin`` stays."""
+        if not names:
+            return self
+        return Graph(
+            tuple(n.moved(names.get(n.name, n.name), (renamed_ref(r, names) for r in n.inputs)) for n in self.nodes)
+        )
 
 
 def by_name(nodes: Sequence[Node]) -> dict[str, Node]:

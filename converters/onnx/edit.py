@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nodes import reached
 from converters.graph.types import FLOAT32
 from converters.onnx import messages
 
@@ -71,18 +72,8 @@ def cut(model: Any, fetch: Sequence[str]) -> Any:
     part.CopyFrom(model)
     graph = part.graph
     makers = {output: index for index, node in enumerate(graph.node) for output in node.output if output}
-    needed: set[str] = set()
-    kept: set[int] = set()
-    stack = list(fetch)
-    while stack:
-        name = stack.pop()
-        if name in needed:
-            continue
-        needed.add(name)
-        maker = makers.get(name)
-        if maker is not None:
-            kept.add(maker)
-            stack.extend(_reads(graph.node[maker]))
+    needed = reached(fetch, lambda name: _reads(graph.node[makers[name]]) if name in makers else ())
+    kept = {makers[name] for name in needed if name in makers}
     nodes = [n for i, n in enumerate(graph.node) if i in kept]
     inputs = [v for v in graph.input if v.name in needed]
     constants = [t for t in graph.initializer if t.name in needed]

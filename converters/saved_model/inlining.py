@@ -14,7 +14,7 @@ from typing import Any
 
 from converters import schema
 from converters.frozen_graph.subgraph import COMPUTING, is_pivot
-from converters.graph.nodes import NameScope, Node, ref, split_ref
+from converters.graph.nodes import NameScope, Node, normal_ref, reached, ref, renamed_ref, split_ref
 from converters.graph.ops.table import CALLING, EFFECTS, IFS, ORDERING, READS, RESULTS, WHILES, unsupported
 from signatures.errors import DamagedFileError, NotAPolicyError
 
@@ -87,8 +87,7 @@ class _Flattening:
         placed = {n.name: self.names.get(n.name, f"\0{n.name}" if self._calls(n) else n.name) for n in nodes}
 
         def tensor(reference: str) -> str:
-            name, index = split_ref(reference)
-            return ref(placed.get(name, name), index)
+            return renamed_ref(reference, placed)
 
         self._check(nodes)
         pinned = {n.name for n in nodes if is_pivot(n)}
@@ -101,7 +100,7 @@ class _Flattening:
             for i, reference in enumerate(node.input):
                 if not reference.startswith("^"):
                     node.input[i] = self._resolved(reference)
-        outer = {r: tensor(r) for r in [*self.aliases, *map(_normal, roots), *placed]}
+        outer = {r: tensor(r) for r in [*self.aliases, *map(normal_ref, roots), *placed]}
         return Flat(self.result, {r: self._resolved(t) for r, t in outer.items()})
 
     def _calls(self, node: Any) -> bool:
@@ -308,21 +307,16 @@ def _index(op: str, result: str, position: str) -> int:
 
 def _upstream(nodes: Mapping[str, Any], roots: Iterable[str], given: Collection[str] = ()) -> list[Any]:
     """The nodes that ``roots`` depend on, control inputs counted, in the order of ``nodes``."""
-    seen: set[str] = set()
-    stack = [r.removeprefix("^").partition(":")[0] for r in roots]
-    while stack:
-        name = stack.pop()
-        if name in seen or name in given:
-            continue
+
+    def inputs(name: str) -> Iterable[str]:
+        if name in given:
+            return ()
         if name not in nodes:
             raise _damaged(f"{name!r} is read and is not in the graph")
-        seen.add(name)
-        stack.extend(i.removeprefix("^").partition(":")[0] for i in nodes[name].input)
-    return [n for n in nodes.values() if n.name in seen]
+        return (i.removeprefix("^").partition(":")[0] for i in nodes[name].input)
 
-
-def _normal(reference: str) -> str:
-    return ref(*split_ref(reference))
+    seen = reached((r.removeprefix("^").partition(":")[0] for r in roots), inputs)
+    return [n for n in nodes.values() if n.name in seen and n.name not in given]
 
 
 def _damaged(what: str) -> DamagedFileError:

@@ -12,7 +12,7 @@ from typing import Any
 
 from converters import schema
 from converters.detached import Detached
-from converters.graph.nodes import TensorShape, node_of
+from converters.graph.nodes import TensorShape, node_of, reached
 from converters.graph.ops.table import CALLING
 from converters.graph.options import MAX_PORTS
 from converters.saved_model.signature import ModelSignature, Tensor
@@ -88,13 +88,4 @@ def _calls_functions(graph_def: Any, signature: ModelSignature) -> bool:
     if not calling or not signature.outputs:
         return bool(calling)
     inputs = {n.name: [node_of(i) for i in n.input if not i.startswith("^")] for n in graph_def.node}
-    seen: set[str] = set()
-    stack = [node_of(r) for r in signature.roots]
-    while stack:
-        name = stack.pop()
-        if name in calling:
-            return True
-        if name not in seen:
-            seen.add(name)
-            stack.extend(inputs.get(name, ()))
-    return False
+    return not calling.isdisjoint(reached(map(node_of, signature.roots), lambda name: inputs.get(name, ())))

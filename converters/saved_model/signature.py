@@ -16,11 +16,20 @@ from typing import Any
 import numpy as np
 
 from converters.format import Port
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, normal_ref, ref, split_ref, topological
+from converters.graph.nodes import (
+    Graph,
+    NameScope,
+    Node,
+    TensorShape,
+    node_of,
+    normal_ref,
+    renamed_ref,
+    split_ref,
+    topological,
+)
 from converters.graph.ops.table import is_fed
 from converters.graph.options import MAX_PORTS
 from converters.graph.types import Symbols, TensorType
-from converters.renaming import renamed
 from converters.schema import dtype_number
 from converters.understand.facts import SourceFacts
 from converters.understand.inputs import role_by_name
@@ -126,7 +135,7 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
         pins.append(Node(name, "Identity", (reference,), origin=origin))
     roles = {node_of(t.name): role for k, t in signature.inputs.items() if (role := _role(graph, k, t)) is not None}
     pins += _several_actions(signature, scope)
-    nodes = [*renamed(graph, moved).nodes, *(p.with_inputs(_moved(r, moved) for r in p.inputs) for p in pins)]
+    nodes = [*graph.renamed(moved).nodes, *(p.with_inputs(renamed_ref(r, moved) for r in p.inputs) for p in pins)]
     return Graph(topological(nodes)), {moved.get(n, n): role for n, role in roles.items()}
 
 
@@ -211,11 +220,6 @@ def memories_of(signature: ModelSignature, roles: Mapping[str, Role]) -> tuple[S
         sides = [(n, names[k], float_rows(kinds.get(n)), float_rows(kinds.get(names[k]))) for k, n in given.items()]
         return tuple(SeparateMemory(n, out, a, b) for n, out, a, b in sides if a is not None and b is not None)
     return paired_memories(inputs, outputs, types)
-
-
-def _moved(reference: str, names: Mapping[str, str]) -> str:
-    name, index = split_ref(reference)
-    return ref(names.get(name, name), index)
 
 
 def _with_placeholders(graph: Graph, signature: ModelSignature) -> Graph:

@@ -11,7 +11,6 @@ import numpy as np
 from converters.bundle.embed import contract_of, facts_of, redrawn
 from converters.fetch import Fetched
 from converters.graph.nodes import Graph, NameScope, Node, topological
-from converters.renaming import renamed
 from converters.saved_model.signature import exposed
 from converters.source import ReadOptions, SourceModel
 from converters.tfjs.reader import content_of, model_file, read_model, weights_of
@@ -55,7 +54,7 @@ def _retyped(graph: Graph, contract: Contract) -> Graph:
     scope = NameScope(n.name for n in graph.nodes)
     names = [s.name for s in (*contract.signature.inputs, *contract.signature.outputs) if s.dtype not in _NARROW]
     inner = {name: scope.fresh(f"{name}/narrow") for name in names if name in graph}
-    nodes = {n.name: n for n in renamed(graph, inner).nodes}
+    nodes = {n.name: n for n in graph.renamed(inner).nodes}
     for spec in contract.signature.inputs:
         if spec.name in inner:
             node = nodes[inner[spec.name]]

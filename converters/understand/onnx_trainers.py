@@ -18,7 +18,6 @@ from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
 from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.reader import OnnxModel
-from converters.renaming import renamed
 from converters.understand.brains import depends_on_input
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import torch_generation
@@ -146,7 +145,7 @@ def _with_rows_first(model: OnnxModel) -> tuple[Graph, list[str]]:
         if value != "recurrent_out" and model.batch != 1:
             continue
         inner, target = names.fresh(f"{name}/time_first"), names.fresh(f"{name}/shape")
-        graph = renamed(graph, {name: inner})
+        graph = graph.renamed({name: inner})
         rows = Node(target, "Const", value=np.array([-1, 1, int(shape[2])], np.int32))
         turned = Node(name, "Reshape", (inner, target), origin=graph[inner].origin)
         graph = Graph(topological([*graph.nodes, rows, turned]))
@@ -230,7 +229,7 @@ def _with_spreads(model: OnnxModel, graph: Graph, roles: Mapping[str, Role | Non
         if role not in (Role.STD, Role.LOG_STD) or action is None or (shape and isinstance(shape[0], str)):
             continue
         inner, zero, rows = (names.fresh(f"{node}/{word}") for word in ("constant", "zero", "rows"))
-        graph = renamed(graph, {node: inner})
+        graph = graph.renamed({node: inner})
         made = (
             Node(zero, "Const", value=np.zeros((), np.float32)),
             Node(rows, "Mul", (action, zero)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Protocol
 
 from converters.graph.nodes import Node
@@ -12,35 +11,31 @@ from converters.graph.ops.base import OpDef, written_as_older
 from signatures.errors import UnsupportedOpError
 
 #: While loops, conditionals and tensor arrays, by what they do: the unroll pass removes them, so they have no entry.
-CONTROL_FLOW: Mapping[str, str] = MappingProxyType(
-    {
-        **{f"{ref}{op}": op.lower() for ref in ("", "Ref") for op in ("Enter", "Exit", "Merge", "Switch")},
-        **dict.fromkeys(("NextIteration", "RefNextIteration"), "next_iteration"),
-        "LoopCond": "loop_cond",
-        "TensorArrayV3": "array",
-        **{f"TensorArray{op}V3": op.lower() for op in ("Scatter", "Gather", "Read", "Write", "Size")},
-        **{f"TensorList{op}": f"list_{op.lower()}" for op in ("FromTensor", "Reserve", "GetItem", "SetItem", "Stack")},
-        "TensorListLength": "list_length",
-    }
-)
+CONTROL_FLOW: Mapping[str, str] = {
+    **{f"{ref}{op}": op.lower() for ref in ("", "Ref") for op in ("Enter", "Exit", "Merge", "Switch")},
+    **dict.fromkeys(("NextIteration", "RefNextIteration"), "next_iteration"),
+    "LoopCond": "loop_cond",
+    "TensorArrayV3": "array",
+    **{f"TensorArray{op}V3": op.lower() for op in ("Scatter", "Gather", "Read", "Write", "Size")},
+    **{f"TensorList{op}": f"list_{op.lower()}" for op in ("FromTensor", "Reserve", "GetItem", "SetItem", "Stack")},
+    "TensorListLength": "list_length",
+}
 
 #: Ops that take references to variables, which frozen graphs do not have → those that take values.
-OF_VALUES: Mapping[str, str] = MappingProxyType(
-    {f"Ref{op}": op for op in ("Enter", "Exit", "Merge", "Switch", "NextIteration", "Identity")}
-)
+OF_VALUES: Mapping[str, str] = {
+    f"Ref{op}": op for op in ("Enter", "Exit", "Merge", "Switch", "NextIteration", "Identity")
+}
 
 #: Ops with several results of different names, in their order (the registry of TensorFlow 2.21).
-RESULTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        **dict.fromkeys(
-            ("FusedBatchNorm", "FusedBatchNormV2", "FusedBatchNormV3"),
-            ("y", "batch_mean", "batch_variance", "reserve_space_1", "reserve_space_2", "reserve_space_3"),
-        ),
-        "Switch": ("output_false", "output_true"),
-        "Merge": ("output", "value_index"),
-        "TensorArrayV3": ("handle", "flow"),
-    }
-)
+RESULTS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(
+        ("FusedBatchNorm", "FusedBatchNormV2", "FusedBatchNormV3"),
+        ("y", "batch_mean", "batch_variance", "reserve_space_1", "reserve_space_2", "reserve_space_3"),
+    ),
+    "Switch": ("output_false", "output_true"),
+    "Merge": ("output", "value_index"),
+    "TensorArrayV3": ("handle", "flow"),
+}
 
 #: Ops that reach outside the graph. A model file is untrusted input: these are refused by name.
 FORBIDDEN = frozenset(
@@ -82,12 +77,12 @@ def _table() -> Mapping[str, OpDef]:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")
             table[op.name] = op
-    return MappingProxyType(table)
+    return table
 
 
 TABLE = _table()
 #: Other names of an op → the op's.
-SPELLINGS: Mapping[str, str] = MappingProxyType({name: op.name for op in TABLE.values() for name in op.spellings})
+SPELLINGS: Mapping[str, str] = {name: op.name for op in TABLE.values() for name in op.spellings}
 _UNKNOWN = OpDef("", written_as_older)
 #: Both in one, plain: they are asked for every node in every pass.
 _BY_NAME = dict(TABLE)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from converters.graph.compilation import Compilation
-from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, split_ref, topological
+from converters.graph.nodes import Graph, NameScope, Node, node_of, renamed_ref, split_ref, topological
 from converters.graph.ops.table import traits
 from signatures.contract import EMBEDDED
 from signatures.roles import Constant, Role
@@ -66,12 +66,8 @@ def name_tensors(
         if node.name in wanted and renamed.get(node.name) is None:
             renamed[node.name] = names.fresh(f"{node.name}/inner")
 
-    def moved(reference: str) -> str:
-        name, index = split_ref(reference)
-        return ref(renamed.get(name, name), index)
-
-    nodes = [n.moved(renamed.get(n.name, n.name), map(moved, n.inputs)) for n in graph.nodes]
+    nodes = [*graph.renamed(renamed).nodes]
     for name, reference in identities:
         origin = graph.producer(reference).origin if split_ref(reference)[1] == 0 else None
-        nodes.append(Node(name, "Identity", (moved(reference),), origin=origin))
+        nodes.append(Node(name, "Identity", (renamed_ref(reference, renamed),), origin=origin))
     return Graph(topological(nodes))

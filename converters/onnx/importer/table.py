@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 
 from converters.onnx.importer import (
     arrays,
@@ -33,7 +32,7 @@ def _table() -> Mapping[tuple[str, str], Translate]:
             if ("", kind) in table:
                 raise ValueError(f"{kind} stands twice in the table")
             table["", kind] = function
-    return MappingProxyType(table)
+    return table
 
 
 TABLE = _table()
