@@ -16,7 +16,6 @@ from converters.barracuda.layer_builder import LayerBuilder, Value
 from converters.barracuda.vocabulary import LayerType
 from converters.graph.nn import convolution as nn
 from converters.graph.nn import normalisation, pooling
-from converters.graph.nn.shaping import padded, taken
 
 _SAME, _SAME_LOWER = -1, -2
 #: What Unity's maximum starts from; a border of it never wins.
@@ -172,13 +171,13 @@ def border(b: LayerBuilder, args: Sequence[Value]) -> Value:
         raise b.damaged(f"a border of {list(pad)} around {list(x.shape)}", "nothing is left of the image")
     b.sized(h, w, c)
     if b.layer.type == LayerType.BORDER2D:
-        return b.shaped(padded(b, b.as_image(x), pairs, b.layer.beta), (n, h, w, c))
+        return b.shaped(b.pad(b.as_image(x), pairs, b.layer.beta), (n, h, w, c))
     data = b.as_image(x)
     for axis, (low, high) in enumerate(pairs):
         if (low, high) == (0, 0):
             continue
         index = np.arange(-low, lengths[axis - 1] + high)
-        data = taken(b, data, _mirrored(b.layer.type, index, lengths[axis - 1]).tolist(), axis)
+        data = b.take(data, _mirrored(b.layer.type, index, lengths[axis - 1]).tolist(), axis)
     return b.shaped(data, (n, h, w, c))
 
 
@@ -211,7 +210,7 @@ def upsample(b: LayerBuilder, args: Sequence[Value]) -> Value:
     data = b.as_image(x)
     for axis, (length, factor) in enumerate(((h, factors[1]), (w, factors[0])), start=1):
         if factor > 1:
-            data = taken(b, data, np.arange(length).repeat(factor).tolist(), axis)
+            data = b.take(data, np.arange(length).repeat(factor).tolist(), axis)
     return b.shaped(data, (n, h * factors[1], w * factors[0], c))
 
 

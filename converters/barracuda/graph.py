@@ -16,7 +16,7 @@ from functools import partial
 from converters.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
 from converters.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
 from converters.barracuda.layers import check_bypassed, translate
-from converters.barracuda.slices import above
+from converters.barracuda.slices import upstream
 from converters.barracuda.vocabulary import LayerType
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32, INT32, INT64
@@ -270,4 +270,4 @@ def _upstream(model: NnModel, layers: Mapping[str, Layer]) -> set[str]:
         roots = list(model.outputs)
     if model.memories:
         roots = [name for name in roots if name != MEMORY_OUT]
-    return above([*roots, *(m.output for m in model.memories)], layers)
+    return upstream([*roots, *(m.output for m in model.memories)], layers)

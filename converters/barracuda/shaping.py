@@ -13,7 +13,6 @@ import numpy as np
 from converters.barracuda.format import EIGHT_AXES
 from converters.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
 from converters.barracuda.vocabulary import EIGHT, C, H, N, W
-from converters.graph.nn.shaping import taken
 from converters.graph.types import INT32
 
 _NAMES = "NHWC"
@@ -204,7 +203,7 @@ def gather(b: LayerBuilder, args: Sequence[Value]) -> Value:
         chosen = b.whole(index.constant)
         if not chosen or min(chosen) < 0 or max(chosen) >= int(x.shape[axis] or 0):
             raise b.damaged(f"the indices are {chosen}", f"there are {x.shape[axis]} elements along {_NAMES[axis]}")
-        return b.shaped(taken(b, b.as_image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))
+        return b.shaped(b.take(b.as_image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))
     if axis == N and x.n is not None and index.size == 1:
         numbers = index.integer or b.add("Cast", [index.reference], DstT=INT32)
         flat = b.add("Reshape", [numbers, b.ints([-1], "list")], name="list")
@@ -256,7 +255,7 @@ def depth_to_space(b: LayerBuilder, args: Sequence[Value]) -> Value:
         raise b.damaged(f"blocks of {across}·{down} out of {c} channels, mode {b.layer.axis}", "they do not divide")
     deep, data = c // (across * down), b.as_image(x)
     if b.layer.axis == 1:
-        data = taken(b, data, np.arange(c).reshape(deep, -1).T.reshape(-1).tolist(), C)
+        data = b.take(data, np.arange(c).reshape(deep, -1).T.reshape(-1).tolist(), C)
     rows = -1 if n is None else n
     split = b.add("Reshape", [data, b.ints([rows, h, w, down, across * deep], "blocks")], name="blocks")
     turned = b.add("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])

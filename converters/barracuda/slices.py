@@ -27,7 +27,7 @@ def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
     total, parts = model.number("action_output_shape"), _parts(layers)
     if not model.from_python or total is None or len(parts) < 2:
         return model, ()
-    above = [above([part], layers) for part in parts]
+    above = [upstream([part], layers) for part in parts]
     shared = set.intersection(*above)
     own = [names - shared for names in above]
     logits = {name for name in shared if name in layers and len(layers[name].inputs) == len(parts)}
@@ -67,7 +67,7 @@ def _parts(layers: Mapping[str, Layer]) -> Sequence[str]:
     return layer.inputs if layer is not None and layer.type == LayerType.CONCAT else ()
 
 
-def above(names: Iterable[str], layers: Mapping[str, Layer]) -> set[str]:
+def upstream(names: Iterable[str], layers: Mapping[str, Layer]) -> set[str]:
     """Tensors and all that they are computed from."""
     return reached(names, lambda name: layers[name].inputs if name in layers else ())
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from converters.checkpoint import listing
-from converters.checkpoint.definition import with_values
-from converters.checkpoint.freeze import freeze
+from converters.checkpoint.freeze import freeze, with_values
 from converters.checkpoint.listing import STEPPED, Behavior, behaviors, best, graph_of
 from converters.checkpoint.policy_nodes import policy_nodes
 from converters.checkpoint.table import MAGIC

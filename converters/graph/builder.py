@@ -309,6 +309,23 @@ class Builder:
             end_mask=masks | (1 << axis if stop is None else 0),
         )
 
+    def take(self, reference: str, index: Sequence[int], axis: int) -> str:
+        """The elements ``index`` of an axis, in that order."""
+        return self.add("GatherV2", [reference, self.ints(list(index), "indices"), self.ints(axis, "axis")])
+
+    def pad(self, x: str, pairs: Sequence[tuple[int, int]], fill: str | float | None = None) -> str:
+        """``x`` with a pair of paddings per axis, of zeros or ``fill`` (number or scalar); a negative one cuts off."""
+        if isinstance(fill, float | int):
+            fill = self.number(x, fill) if fill else None
+        for axis, (before, after) in enumerate(pairs):
+            if min(before, after) < 0:
+                x = self.slice(x, axis, -before if before < 0 else None, after if after < 0 else None)
+        wide = [[max(a, 0), max(z, 0)] for a, z in pairs]
+        if not any(map(any, wide)):
+            return x
+        operand = self.ints(wide, "paddings")
+        return self.add("Pad", [x, operand]) if fill is None else self.add("PadV2", [x, operand, fill])
+
     def split(self, reference: str, count: int) -> list[str]:
         """A matrix [rows, count·n] cut into ``count`` matrices [rows, n]."""
         made = self.add("Split", [self.ints(1, "axis"), reference], num_split=count)

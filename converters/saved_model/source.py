@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.bundle.embed import embedded, facts_of, recalled
-from converters.checkpoint.definition import with_values
-from converters.checkpoint.freeze import freeze
+from converters.checkpoint.freeze import freeze, with_values
 from converters.checkpoint.tensor_bundle import Checkpoint
 from converters.checkpoint.training_graph import Saved as Place
 from converters.checkpoint.training_graph import TrainingGraph, saved_places, training_graph

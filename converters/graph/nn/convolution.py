@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.nn.shaping import padded
 from converters.graph.ops.convolution import window_padding
 from signatures.errors import UnsupportedOpError
 from signatures.records import dataclass
@@ -68,7 +67,7 @@ def framed(b: Builder, image: str, window: Window, fill: float = 0.0) -> tuple[s
     known = [n for n in b.shape(image)[1:3] if isinstance(n, int)]
     if len(known) == len(window.pads) and window.pads == window.same_pads(known):
         return image, "SAME"
-    return padded(b, image, [(0, 0), *window.pads, (0, 0)], fill), "VALID"
+    return b.pad(image, [(0, 0), *window.pads, (0, 0)], fill), "VALID"
 
 
 def conv2d(b: Builder, image: str, kernel: str | np.ndarray, window: Window, groups: int = 1) -> str:
@@ -119,7 +118,7 @@ def conv2d_transposed(
         image = _spread(b, image, axis + 1, stride)
         # the spread image ends with stride - 1 zeros that belong to no pixel
         pairs.append((span - 1 - before, span - 1 - after + extra[axis] - (stride - 1)))
-    image = padded(b, image, [(0, 0), *pairs, (0, 0)])
+    image = b.pad(image, [(0, 0), *pairs, (0, 0)])
     turned = kernel[::-1, ::-1].reshape(*size, groups, channels // groups, each)
     turned = np.moveaxis(turned, 2, 3).reshape(*size, channels // groups, groups * each)
     return conv2d(b, image, turned, replace(window, strides=(1, 1), pads=((0, 0), (0, 0)), same=False), groups)
@@ -131,5 +130,5 @@ def _spread(b: Builder, image: str, axis: int, stride: int) -> str:
         return image
     shape = b.shape(image)
     behind = math.prod(b.length(image, i) for i in range(axis + 1, 4))
-    wide = padded(b, b.reshape(image, (-1, 1, behind)), [(0, 0), (0, stride - 1), (0, 0)])
+    wide = b.pad(b.reshape(image, (-1, 1, behind)), [(0, 0), (0, stride - 1), (0, 0)])
     return b.reshape(wide, (*shape[:axis], b.length(image, axis) * stride, *shape[axis + 1 :]))

@@ -9,7 +9,6 @@ import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nn.convolution import Pair, Window, framed
-from converters.graph.nn.shaping import padded
 from converters.graph.types import FLOAT32
 from signatures.errors import UnsupportedOpError
 
@@ -21,7 +20,7 @@ def max_pool(b: Builder, image: str, window: Window, lowest: float = -np.inf) ->
     """The largest element under each window; ``lowest`` stands where the image is not."""
     if set(window.dilations) != {1}:
         window = window.with_pads([b.length(image, axis) for axis in (1, 2)])
-        frame = padded(b, image, [(0, 0), *window.pads, (0, 0)], lowest)
+        frame = b.pad(image, [(0, 0), *window.pads, (0, 0)], lowest)
         value, *rest = _under(b, frame, window)
         for part in rest:
             value = b.add("Maximum", [value, part])
@@ -36,7 +35,7 @@ def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pa
     if set(window.dilations) != {1}:
         lengths = [b.length(image, axis) for axis in (1, 2)]
         window = window.with_pads(lengths)
-        value, *rest = _under(b, padded(b, image, [(0, 0), *window.pads, (0, 0)]), window)
+        value, *rest = _under(b, b.pad(image, [(0, 0), *window.pads, (0, 0)]), window)
         for part in rest:
             value = b.add("Add", [value, part])
         count = _counts(b, lengths, window, counted or ((0, 0), (0, 0))).astype(FLOAT32)
@@ -49,7 +48,7 @@ def average_pool(b: Builder, image: str, window: Window, counted: tuple[Pair, Pa
     if not any(map(any, counted)) and window.pads == window.same_pads(lengths):
         return b.add("AvgPool", [image], **_attrs(window, "SAME"))
     counts = _counts(b, lengths, window, counted)
-    data = padded(b, image, [(0, 0), *window.pads, (0, 0)])
+    data = b.pad(image, [(0, 0), *window.pads, (0, 0)])
     mean = b.add("AvgPool", [data], **_attrs(window, padding))
     factor = (window.size[0] * window.size[1] / counts).astype(FLOAT32)
     return b.add("Mul", [mean, b.const(factor[None, :, :, None], "share")])

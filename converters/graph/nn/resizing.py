@@ -15,7 +15,6 @@ import numpy.typing as npt
 from converters.graph.builder import Builder
 from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import matmul
-from converters.graph.nn.shaping import taken
 from signatures.errors import UnsupportedOpError
 from signatures.records import dataclass
 
@@ -50,7 +49,7 @@ def resampled(b: Builder, x: str, axis: int, length: int, scale: float, how: Res
     if how.mode == "nearest":
         index = _nearest(places, how.nearest, before)
         if not left_out.any():
-            return x if index == list(range(before)) else taken(b, x, index, axis)
+            return x if index == list(range(before)) else b.take(x, index, axis)
         weights = np.eye(before)[index]
     else:
         weights = _weights(places, before, scale, how)

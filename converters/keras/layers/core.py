@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nn.linear import matmul
-from converters.graph.nn.shaping import padded, taken
 from converters.graph.ops.einsum import einsum
 from converters.graph.types import FLOAT32, INT32, Dim
 from converters.keras.layers.activations import activated
@@ -108,7 +107,7 @@ def _framed(step: Step, key: str, sign: int) -> str:
     for axis, (a, z) in enumerate(pairs, 2 if first else 1):
         if sign < 0 and -a - z >= step.net.length(step.x, axis):
             raise DamagedFileError(f"the layer {step.path!r} leaves nothing of an axis", fix="save the model again")
-    return padded(step.net, step.x, [(0, 0), (0, 0), *pairs] if first else [(0, 0), *pairs, (0, 0)])
+    return step.net.pad(step.x, [(0, 0), (0, 0), *pairs] if first else [(0, 0), *pairs, (0, 0)])
 
 
 def _up_sampling(step: Step) -> str:
@@ -124,7 +123,7 @@ def _up_sampling(step: Step) -> str:
             raise UnsupportedOpError(f"it makes {count * length} rows or columns")
         step.net.room(count * length)
         if count != 1:
-            value = taken(step.net, value, np.repeat(np.arange(length), count).tolist(), axis)
+            value = step.net.take(value, np.repeat(np.arange(length), count).tolist(), axis)
     return value
 
 

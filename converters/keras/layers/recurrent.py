@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nn import recurrent as nn
-from converters.graph.nn.shaping import taken
 from converters.graph.types import FLOAT32
 from converters.keras.layers.activations import activation_of
 from converters.keras.layers.step import Step, Translate
@@ -178,7 +177,7 @@ def _bidirectional(step: Step) -> list[str]:
     ahead, behind = results
     if forward.config.get("return_sequences"):
         steps = b.length(behind, 1)
-        behind = behind if steps == 1 else taken(b, behind, range(steps - 1, -1, -1), 1)
+        behind = behind if steps == 1 else b.take(behind, range(steps - 1, -1, -1), 1)
     mode = step.get("merge_mode", "concat")
     if mode == "concat":
         return [b.concat([ahead, behind], b.rank(ahead) - 1)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from converters.graph.nn import reduction
-from converters.graph.nn import shaping as nn
 from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import matmul
 from converters.graph.ops.einsum import einsum
@@ -87,7 +86,7 @@ def _arg(kind: str) -> Translate:
         last = bool(op.integer("select_last_index", 0))
         if last:  # the targets take the first of equal elements
             length = net.length(x, axis)
-            x = nn.taken(net, x, range(length - 1, -1, -1), axis)
+            x = net.take(x, range(length - 1, -1, -1), axis)
         best = net.add(kind, [x, net.ints(axis, "axis")], output_type=INT64)
         best = net.add("Sub", [net.number(best, length - 1), best]) if last else best
         return net.expand_dims(best, axis) if op.integer("keepdims", 1) else best

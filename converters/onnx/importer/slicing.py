@@ -7,7 +7,6 @@ from typing import Literal, cast
 
 import numpy as np
 
-from converters.graph.nn.shaping import padded, taken
 from converters.graph.types import INT32, INT64, Dim
 from converters.onnx.importer.importer import Importer
 from converters.onnx.importer.node import Op, Translate
@@ -170,11 +169,11 @@ def _pad(op: Op, net: Importer) -> str:
     pairs = dict(zip(axes, zip(pads[: len(axes)], pads[len(axes) :], strict=True), strict=True))
     if mode in ("reflect", "edge", "wrap"):
         for axis in (a for a in axes if any(pairs[a])):
-            x = taken(net, x, _mirrored(op, net, net.length(x, axis), pairs[axis], mode), axis)
+            x = net.take(x, _mirrored(op, net, net.length(x, axis), pairs[axis], mode), axis)
         return x
     if mode != "constant":
         raise op.refused(f"mode {mode!r}", "the model is damaged")
-    return padded(net, x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
+    return net.pad(x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
 
 
 def _mirrored(op: Op, net: Importer, length: int, pair: tuple[int, int], mode: str) -> list[int]:

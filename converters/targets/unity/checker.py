@@ -10,16 +10,17 @@ from typing import Any
 from converters.barracuda import format as nn_format
 from converters.fetch import Fetched, read_bytes
 from converters.recognise import recognised
-from converters.targets.unity import barracuda_model, importing, rules, sentis_model, trial_run
+from converters.targets.unity import barracuda_model, importing, rules, sentis_model
 from converters.targets.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
+from converters.targets.unity.constructs import INPUT, OUTPUT, constructs
 from converters.targets.unity.consumers import Consumer, Engine
-from converters.targets.unity.findings import Finding, Thrown, UnityThrows
-from converters.targets.unity.misread import misread
+from converters.targets.unity.findings import Finding, Severity, Thrown, UnityThrows
 from converters.targets.unity.model import CheckedModel
 from converters.targets.unity.onnx_file import OnnxFile, read_onnx_file
 from converters.targets.unity.overlooked import overlooked
+from converters.targets.unity.readings import Misreading, Reading, misreadings
 from converters.targets.unity.settings import Brain
-from signatures.errors import SourceError
+from signatures.errors import ExportModelError, SourceError
 from signatures.records import dataclass
 
 #: Deterministic Inference of Behavior Parameters: off and on.
@@ -114,7 +115,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
             fix=f"export it with --for {consumer.profile}, and check what that writes",
         )
     file = read_onnx_file(path)
-    refused, wrong = importing.refusal(file, consumer), misread(file, consumer)
+    refused, wrong = importing.refusal(file, consumer), _misread(file, consumer)
     if refused is not None:
         return UnityVerdict(path, consumer, brain or Brain(), refused, misread=wrong, assumed=brain is None)
     model: CheckedModel
@@ -161,7 +162,7 @@ def _mode(
     model: CheckedModel, consumer: Consumer, brain: Brain, deterministic: bool, file: OnnxFile | None
 ) -> ModeVerdict:
     if isinstance(model, sentis_model.SentisModel) and file is not None:
-        thrown = trial_run.failure(file, consumer) or _throws(lambda: model.load(deterministic))
+        thrown = sentis_model.failure(file, consumer) or _throws(lambda: model.load(deterministic))
         if thrown is not None:
             return ModeVerdict(thrown, (), thrown, thrown)
     checks: tuple[Finding, ...] = ()
@@ -192,3 +193,45 @@ def _throws(step: Callable[[], None]) -> Thrown | None:
     except UnityThrows as raised:
         return raised.thrown
     return None
+
+
+_SAYS = {
+    Reading.WRONG: "gives other numbers, without an error",
+    Reading.REFUSED: "is refused",
+    Reading.FAILS: "throws when it runs",
+    Reading.LOST: "is left out",
+}
+
+
+def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
+    """The constructs of a file that its importer does not read rightly: one finding per kind, with its places; empty
+    where the shapes of the file contradict each other. Most of them give no error at all.
+    """
+    if file.has_negative_lengths:
+        return ()  # ONNX's shape inference would abort the process
+    try:
+        model = constructs(file.model)
+    except (ExportModelError, ValueError, TypeError, LookupError):
+        return ()
+    found: dict[tuple[Reading, str, str], list[str]] = {}
+    for reading in misreadings(model, [consumer.runtime]):
+        found.setdefault(_kind(reading), []).append(reading.construct.name)
+    return tuple(
+        Finding(
+            Severity.ERROR,
+            f"{op} {_SAYS[kind]}: {says}",
+            _places(names),
+            f"--for {consumer.profile} writes it in a form that {consumer.runtime} reads",
+        )
+        for (kind, op, says), names in found.items()
+    )
+
+
+def _kind(found: Misreading) -> tuple[Reading, str, str]:
+    op = {INPUT: "an input", OUTPUT: "an output"}.get(found.construct.op, found.construct.op)
+    return found.rule.reading, op, found.rule.says
+
+
+def _places(names: list[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

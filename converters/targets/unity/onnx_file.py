@@ -1,4 +1,13 @@
-"""An ONNX file as an importer meets it: its messages untouched (nothing inlined, nothing converted), and its shapes."""
+"""An ONNX file as an importer meets it: its messages untouched (nothing inlined or converted), constants and shapes.
+
+An importer folds constants before it looks at them, so ``version_number`` may be an initializer, a Constant, the cast
+of one, a sum; where a run is looked at, it may hang on the inputs too. They are computed node by node from what is
+stored. Untrusted files: whatever would grow beyond ``_LIMIT`` elements is not computed.
+
+Shapes are those of a run in which every free length of an input is 1, as Sentis' trial run has it, by ONNX's own shape
+inference, asked node by node: asked for a whole graph it aborts the process where a length comes out negative (Slice,
+onnx 1.23). What cannot be told is left out.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +21,8 @@ import numpy as np
 
 from converters.fetch import read_bytes
 from converters.onnx.messages import packaged
-from converters.onnx.proto import decoded, load_external
-from converters.targets.unity.onnx_constants import RANDOM_OPS, value_of
-from converters.targets.unity.onnx_shapes import inferred_shapes
-from signatures.errors import DamagedFileError
+from converters.onnx.proto import array_of, decoded, load_external
+from signatures.errors import DamagedFileError, ExportModelError
 from signatures.records import dataclass
 
 #: TensorProto.DataType that Sentis holds as floats; everything else is held as int.
@@ -152,3 +159,180 @@ def _dims(value: Any) -> Dims | None:
     if not kind.HasField("shape"):
         return None
     return tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.shape.dim)
+
+
+#: Ops that draw: what hangs on them is never a constant.
+RANDOM_OPS = frozenset(
+    {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
+)
+_LIMIT = 1 << 16
+_DEPTH = 200
+#: TensorProto.DataType of float16 and bfloat16.
+_NARROW = (10, 16)
+#: Ops whose result may be of any size whatever goes in, and the input that says which.
+_GROWING = {"Expand": 1, "ConstantOfShape": 0, "Tile": 1}
+_NOT_COMPUTED = frozenset({"Loop", "Scan", "If", "Range", "Resize", "Upsample", "Pad", "EyeLike", "OneHot", "Einsum"})
+
+
+def value_of(file: OnnxFile, name: str, fed: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """A value under what is fed to the inputs, None where it is large, drawn, or cannot be computed here."""
+    wanted, order = [name], []
+    seen: set[str] = set()
+    while wanted:
+        value = wanted.pop()
+        if value in seen or value in file.initializers or value in fed or not value:
+            continue
+        seen.add(value)
+        node = file.producers.get(value)
+        if node is None or node.op_type in RANDOM_OPS or len(seen) > _DEPTH:
+            return None
+        order.append(node)
+        wanted.extend(node.input)
+    needed = {id(node) for node in order}
+    values: dict[str, np.ndarray | None] = dict(fed)
+    for node in file.model.graph.node:
+        if id(node) in needed:
+            inputs = [_stored(file, n) if n in file.initializers else values.get(n) if n else None for n in node.input]
+            made = _computed(node, inputs, file.opset)
+            if made is None:
+                return None
+            values.update(zip(node.output, made, strict=False))
+    return _stored(file, name) if name in file.initializers else values.get(name)
+
+
+def _stored(file: OnnxFile, name: str) -> np.ndarray | None:
+    return _read(file.initializers[name])
+
+
+def _read(tensor: Any) -> np.ndarray | None:
+    if np.prod(tensor.dims, dtype=np.float64) > _LIMIT:
+        return None
+    try:
+        return array_of(tensor, None) if tensor.data_type not in _NARROW else _narrow(tensor)
+    except (ExportModelError, ValueError):
+        return None
+
+
+def _narrow(tensor: Any) -> np.ndarray:
+    """Half precision, which no policy is converted from but a constant may be stored in."""
+    import onnx
+
+    return np.asarray(onnx.numpy_helper.to_array(tensor)).astype(np.float32)
+
+
+def _computed(node: Any, inputs: list[np.ndarray | None], opset: int) -> list[np.ndarray] | None:
+    """A node's results, None where it is not computed."""
+    if any(value is None and name for value, name in zip(inputs, node.input, strict=True)):
+        return None
+    if node.op_type == "Identity" and len(inputs) == 1 and inputs[0] is not None:
+        return [inputs[0]]
+    if node.op_type == "Constant" and len(node.attribute) == 1 and node.attribute[0].name == "value":
+        value = _read(node.attribute[0].t)
+        return None if value is None else [value]
+    return None if _may_grow(node.op_type, inputs) else _run(node, inputs, opset)
+
+
+def _may_grow(kind: str, inputs: list[np.ndarray | None]) -> bool:
+    sizes = [float(value.size) for value in inputs if value is not None]
+    if kind in _NOT_COMPUTED or float(np.prod(sizes)) > _LIMIT:
+        return True
+    if kind in _GROWING:
+        asked = inputs[_GROWING[kind]] if len(inputs) > _GROWING[kind] else None
+        return asked is None or float(np.prod(np.abs(asked.astype(np.float64)))) * float(np.prod(sizes)) > _LIMIT
+    return False
+
+
+def _run(node: Any, inputs: list[np.ndarray | None], opset: int) -> list[np.ndarray] | None:
+    """By ONNX's reference implementation; a node that it does not take has no value here."""
+    import onnx
+    from onnx.reference import ReferenceEvaluator
+
+    graph = onnx.GraphProto(name="constant")
+    graph.node.append(node)
+    for name in dict.fromkeys(n for n in node.input if n):
+        graph.input.append(onnx.ValueInfoProto(name=name))
+    for name in node.output:
+        graph.output.append(onnx.ValueInfoProto(name=name))
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", opset)])
+    try:
+        with np.errstate(all="ignore"):
+            made = ReferenceEvaluator(model).run(None, dict(zip(node.input, inputs, strict=True)))
+    except (RuntimeError, ValueError, TypeError, LookupError, NotImplementedError, AttributeError, ArithmeticError):
+        return None
+    return [np.asarray(value) for value in made]
+
+
+#: Operands that say a shape, axes or bounds, by operator: their values are needed too.
+_SAYING = {
+    "Reshape": (1,),
+    "Expand": (1,),
+    "Tile": (1,),
+    "ConstantOfShape": (0,),
+    "Slice": (1, 2, 3, 4),
+    "Squeeze": (1,),
+    "Unsqueeze": (1,),
+    "Split": (1,),
+    "Pad": (1,),
+    "ReduceSum": (1,),
+    "ReduceMean": (1,),
+    "OneHot": (1,),
+    "TopK": (1,),
+}
+
+
+def inferred_shapes(file: OnnxFile) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
+    """(value → shape, of inputs, initializers and results; whether a length came out negative)."""
+    types, negative = _given(file), False
+    for node in file.model.graph.node:
+        if any(name and name not in types for name in node.input) or any(a.HasField("g") for a in node.attribute):
+            continue
+        for name, kind in _results(file, node, types).items():
+            if any(d.HasField("dim_value") and d.dim_value < 0 for d in kind.tensor_type.shape.dim):
+                negative = True
+            elif name:
+                types[name] = kind
+    shapes = {
+        name: tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.tensor_type.shape.dim)
+        for name, kind in types.items()
+        if kind.tensor_type.HasField("shape")
+    }
+    return shapes, negative
+
+
+def _given(file: OnnxFile) -> dict[str, Any]:
+    import onnx
+
+    types = {}
+    for tensor in file.initializers.values():
+        if min(tensor.dims, default=0) >= 0:
+            types[tensor.name] = onnx.helper.make_tensor_type_proto(tensor.data_type, list(tensor.dims))
+    for value in file.model.graph.input:
+        if value.name not in types and value.type.HasField("tensor_type"):
+            kind = onnx.TypeProto()
+            kind.CopyFrom(value.type)
+            for dim in kind.tensor_type.shape.dim:
+                if not dim.HasField("dim_value") or dim.dim_value < 0:
+                    dim.dim_value = 1
+            types[value.name] = kind
+    return types
+
+
+def _results(file: OnnxFile, node: Any, types: Mapping[str, Any]) -> dict[str, Any]:
+    import onnx
+    import onnx.checker
+    import onnx.shape_inference
+
+    refused = (onnx.defs.SchemaError, onnx.shape_inference.InferenceError, onnx.checker.ValidationError)
+    data = {}
+    for index in _SAYING.get(node.op_type, ()):
+        name = node.input[index] if index < len(node.input) else ""
+        value = file.trial_value(name) if name else None
+        if value is not None:
+            data[name] = onnx.numpy_helper.from_array(value)
+    try:
+        schema = onnx.defs.get_schema(node.op_type, file.opset, "")
+        known = {name: types[name] for name in node.input if name}
+        made: dict[str, Any] = onnx.shape_inference.infer_node_outputs(schema, node, known, data)
+    except (*refused, RuntimeError, ValueError):
+        return {}
+    return made

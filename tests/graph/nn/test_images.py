@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from converters.graph.builder import Builder
 from converters.graph.nn import pooling
 from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
-from converters.graph.nn.shaping import padded, taken
 from converters.graph.nodes import NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32
 from signatures.errors import UnsupportedOpError
@@ -159,11 +158,11 @@ def test_what_is_not_written() -> None:
 def test_borders_are_added_and_cut_off(x: Array, pairs: tuple[tuple[int, int], ...], fill: float | None) -> None:
     cut = x[tuple(slice(max(-a, 0), n - max(-z, 0)) for (a, z), n in zip(pairs, x.shape, strict=True))]
     wanted = np.pad(cut, [(max(a, 0), max(z, 0)) for a, z in pairs], constant_values=np.float32(fill or 0))
-    made = run_one(lambda b, r: b.add("Identity", [padded(b, r, pairs, fill)]), x)
+    made = run_one(lambda b, r: b.add("Identity", [b.pad(r, pairs, fill)]), x)
     np.testing.assert_array_equal(made, wanted)
 
 
 @given(x=arrays(2, 4, 5), index=st.lists(st.integers(0, 3), min_size=1, max_size=6))
 @examples
 def test_elements_of_an_axis(x: Array, index: list[int]) -> None:
-    np.testing.assert_array_equal(run_one(lambda b, r: taken(b, r, index, 1), x), x[:, index])
+    np.testing.assert_array_equal(run_one(lambda b, r: b.take(r, index, 1), x), x[:, index])
