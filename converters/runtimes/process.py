@@ -211,7 +211,7 @@ class RuntimeProcess:
                 process.terminate()  # not kill: one that has started a browser ends that first
             if process.stdout is not None:
                 process.stdout.close()
-            _ended(process, 10)
+            _ended(process, 10 if self.confined else 60)  # what is not confined has a browser to end
         if self._errors is not None:
             self._errors.close()
             self._errors = None

@@ -267,10 +267,10 @@ def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> Non
             stderr=subprocess.DEVNULL,
         )
         try:
-            logged = [answers.get(timeout=120) for _ in range(3)]
+            logged = [answers.get(timeout=600) for _ in range(3)]
         finally:
             browser.kill()
-            browser.wait(30)
+            browser.wait()
             server.shutdown()
     for (values,) in logged:
         assert np.size(values) == 2, logged

@@ -356,7 +356,7 @@ def test_a_signal_that_was_lost_ends_it_all_the_same(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_exports_that_are_killed_at_random_tear_nothing_and_leave_nobody(tmp_path: Path) -> None:
-    assert kill(6, 3, tmp_path).faults == []
+    assert kill(6, 3, tmp_path, patience=60).faults == []
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc which file it is")

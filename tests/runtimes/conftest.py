@@ -33,4 +33,4 @@ def own() -> Iterator[Runner]:
     runner = Runner()
     yield runner
     runner.process.kill()
-    runner.process.communicate(timeout=30)
+    runner.process.communicate()

@@ -92,7 +92,7 @@ class Runner:
 
     def end(self) -> tuple[int, bytes, str]:
         """Closes stdin; the status, what was left on stdout, and stderr."""
-        out, err = self.process.communicate(timeout=60)
+        out, err = self.process.communicate(timeout=300)
         return self.process.returncode, out, err.decode()
 
 

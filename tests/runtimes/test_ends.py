@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -52,8 +53,8 @@ multiply() if sys.argv[3] == "main" else threading.Thread(target=multiply).start
 
 
 def gone(pid: int) -> bool:
-    """Waits up to ten seconds. A child of a process that is gone is nobody's, so it leaves no zombie of ours."""
-    for _ in range(100):
+    """Waits for minutes. A child of a process that is gone is nobody's, so it leaves no zombie of ours."""
+    for _ in range(1200):
         try:
             state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
         except OSError:
@@ -69,16 +70,23 @@ def killed_while_busy(tmp_path: Path, program: str, *arguments: str) -> int:
     place = tmp_path / "pid"
     parent = subprocess.Popen([sys.executable, "-c", program, str(place), *arguments])
     try:
-        for _ in range(300):
-            if place.exists() and place.read_text():
-                break
+        while not (place.exists() and place.read_text()):
             assert parent.poll() is None
-            time.sleep(0.1)
-        time.sleep(1.5)
+            time.sleep(0.02)
+        child = int(place.read_text())
+        since = computed(child)
+        while computed(child) < since + 0.3:
+            time.sleep(0.02)
     finally:
         parent.kill()
-        parent.wait(10)
-    return int(place.read_text())
+        parent.wait()
+    return child
+
+
+def computed(pid: int) -> float:
+    """Seconds of a processor that it has had."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
@@ -144,11 +152,9 @@ def test_an_interrupt_while_a_runtime_starts_is_not_waited_for(tmp_path: Path) -
         stderr=subprocess.DEVNULL,
         preexec_fn=default_signals,
     )
-    for _ in range(300):
-        if (tmp_path / "up").exists():
-            break
+    while not (tmp_path / "up").exists():
         assert command.poll() is None
-        time.sleep(0.1)
-    time.sleep(0.3)
+        time.sleep(0.02)
+    time.sleep(0.3)  # so that it waits, most times: before that, the same must come of it
     command.send_signal(signal.SIGINT)
-    assert command.wait(30) != 0
+    assert command.wait(300) != 0

@@ -293,13 +293,13 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
     command = [sys.executable, "-c", program, str(runtimes.JS_SOURCE), str(user)]
     process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL)
     pid_file = tmp_path / "pid"
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 300
     while not pid_file.exists() or not pid_file.read_text().strip():
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.02)
     process.kill()
-    process.wait(30)
+    process.wait()
     os.kill(int(pid_file.read_text()), signal.SIGKILL)
 
     folder = user / "export-model"

@@ -17,7 +17,7 @@ out = sys.stdout.buffer
 while True:
     header, _ = read_frame(sys.stdin.buffer)
     if header["cmd"] == "hang":
-        time.sleep(60)
+        time.sleep(3600)
     write_frame(out, {"ok": True, "version": "1"})
 """
 
@@ -28,8 +28,8 @@ def test_one_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> No
         slow.start()
         monkeypatch.setattr(process, "TIMEOUT", 0.3)
         time.sleep(0.5)  # nobody asked: that is no hanging
+        monkeypatch.setattr(process, "TIMEOUT", 300.0)  # an answer may take its time on a busy machine
         slow.request({"cmd": "hello"})
-        before = time.monotonic()
+        monkeypatch.setattr(process, "TIMEOUT", 0.3)
         with pytest.raises(RunFailedError, match="ended while it was working"):
             slow.request({"cmd": "hang"})
-        assert time.monotonic() - before < 30

@@ -141,7 +141,7 @@ def test_missing_packages_are_an_answer(tmp_path: Path) -> None:
 )
 def test_a_bad_command_line_is_status_2(arguments: list[str]) -> None:
     assert NODE is not None
-    done = subprocess.run([NODE, str(RUNNER), *arguments], input=b"", capture_output=True, timeout=60)
+    done = subprocess.run([NODE, str(RUNNER), *arguments], input=b"", capture_output=True, timeout=300)
     assert (done.returncode, done.stdout) == (2, b"")
     message = done.stderr.decode()
     assert message.startswith("runner.mjs: ")
