@@ -1,7 +1,8 @@
 """The environment with the peers: made on first use, kept in the user's cache, found again by what it was made from.
 
-``python -m tests.peers.environment`` makes it (half a minute, 1.6 GB) and prints where it is. EXPORT_MODEL_PEERS names
-a folder with an environment that is there already.
+``python -m tests.peers.environment`` makes it and prints where it is. What this Python has in the very version that is
+required, TensorFlow first of all, is not installed a second time (half a minute, 1.6 GB) but found where it is.
+EXPORT_MODEL_PEERS names a folder with an environment that is there already.
 
 Imports the standard library only: the benchmark measures peak memory, and what a process holds before it starts another
 counts as the other's.
@@ -14,6 +15,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +26,8 @@ REQUIREMENTS = Path(__file__).with_name("requirements.txt")
 SHIM = Path(__file__).with_name("shim.py")
 _READY = ".ready"
 _SHIM_MODULE = "export_model_peers_shim"
+#: Of the Python that runs this.
+_PACKAGES = sysconfig.get_paths()["purelib"]
 
 
 class PeersUnavailableError(Exception):
@@ -85,7 +89,8 @@ def ensure_peers() -> Peers:
 def _place() -> Path:
     """A folder of its own for each content of the requirements and the shim, and each version of Python."""
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    digest = hashlib.sha256(REQUIREMENTS.read_bytes() + SHIM.read_bytes() + version.encode()).hexdigest()
+    missing = " ".join([_PACKAGES, *_missing()])
+    digest = hashlib.sha256(REQUIREMENTS.read_bytes() + SHIM.read_bytes() + (version + missing).encode()).hexdigest()
     # Imported here: converters.runtimes.registry is small, but the benchmark's own process should stay smaller still.
     from converters.runtimes.installed import cache_folder
 
@@ -108,16 +113,23 @@ class _locked:  # noqa: N801  used as a function
         self._file.close()
 
 
+def _missing() -> list[str]:
+    """The requirements that this Python has not, or in another version."""
+    lines = [line for line in REQUIREMENTS.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    here = {p.name.lower() for p in Path(_PACKAGES).glob("*.dist-info")}
+    return [line for line in lines if f"{line.lower().replace('-', '_').replace('==', '-')}.dist-info" not in here]
+
+
 def _make(home: Path) -> None:
     # Made without links to another virtual environment: the interpreter that this one stands on.
     base = getattr(sys, "_base_executable", sys.executable)
     _step([base, "-m", "venv", str(home)])
     python = Peers(home).python
-    _step([python, "-m", "pip", "install", "--quiet", "--no-deps", "--requirement", str(REQUIREMENTS)])
+    _step([python, "-m", "pip", "install", "--quiet", "--no-deps", *_missing()])
     find = "import sysconfig; print(sysconfig.get_paths()['purelib'])"
     packages = Path(_step([python, "-c", find]).strip())
     shutil.copyfile(SHIM, packages / f"{_SHIM_MODULE}.py")
-    (packages / f"{_SHIM_MODULE}.pth").write_text(f"import {_SHIM_MODULE}\n", encoding="utf-8")
+    (packages / f"{_SHIM_MODULE}.pth").write_text(f"import {_SHIM_MODULE}\n{_PACKAGES}\n", encoding="utf-8")
     # pip compiles by itself unless it was told not to. Without bytecode the peers would start three times slower, and
     # the comparison would flatter us. Some packages ship files for other versions of Python; those fail, and may.
     subprocess.run([python, "-m", "compileall", "-q", "-j", "0", str(packages)], env=environment(), capture_output=True)

@@ -16,47 +16,34 @@ from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportResult
 from signatures.roles import Role
 from tests.peers.agreement import POLICIES
+from tests.peers.conftest import Theirs
 from tests.peers.environment import Peers
 
 pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peers")]
 RUNTIMES = "tensorflow,onnxruntime,tfjs-cpu"
 
 
-def to_tfjs(peers: Peers, source: Path, out: Path, *options: str) -> Path:
-    peers.run([*peers.tensorflowjs_converter(), "--input_format=tf_saved_model", *options, str(source), str(out)])
-    return out
-
-
-def to_onnx(peers: Peers, graph: Path, inputs: list[str], outputs: list[str], out: Path) -> Path:
-    names = ["--inputs", ",".join(f"{n}:0" for n in inputs), "--outputs", ",".join(f"{n}:0" for n in outputs)]
-    peers.run([*peers.tf2onnx(), "--graphdef", str(graph), *names, "--output", str(out)])
-    return out
-
-
 @pytest.mark.parametrize("name", POLICIES)
 def test_right_conversions_pass(
-    name: str, tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], pool: RuntimePool
+    name: str, official: Theirs, by_tf2onnx: Theirs, bundles: dict[str, ExportResult], pool: RuntimePool
 ) -> None:
-    bundle = bundles[name]
+    bundle, theirs = bundles[name], [official(name), by_tf2onnx(name)]
     signature = bundle.policy.signature
-    theirs = to_tfjs(peers, bundle.folder / "saved_model", tmp_path / "tfjs")
-    inputs, outputs = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
-    onnx = to_onnx(peers, bundle.folder / f"{name}.bytes", inputs, outputs, tmp_path / "theirs.onnx")
-    report = compare_artefacts(bundle.folder / "saved_model", [theirs, onnx], runtimes=RUNTIMES, pool=pool)
+    report = compare_artefacts(bundle.folder / "saved_model", theirs, runtimes=RUNTIMES, pool=pool)
     # tf2onnx gives the seed 0 to every Multinomial: it draws the same after every start.
     drawn = any(s.role is Role.SAMPLED for s in signature.outputs)
     wrong = {(c.kind, c.runtime, c.output) for c in report.failures}
     assert wrong == ({("draws", "onnxruntime", "action")} if drawn else set()), report.failures
     assert {c.runtime for c in report.comparisons} == {"tfjs-cpu", "onnxruntime"}
-    assert {c.output for c in report.comparisons} == set(outputs)
+    assert {c.output for c in report.comparisons} == {s.name for s in signature.outputs}
 
 
 def test_lost_signature_names_are_named(
-    tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], pool: RuntimePool
+    tmp_path: Path, official: Theirs, bundles: dict[str, ExportResult], pool: RuntimePool
 ) -> None:
     """What converters of old did to a SavedModel of TensorFlow 2: its keys gone, Identity nodes in their place."""
     bundle = bundles["discrete"]
-    theirs = to_tfjs(peers, bundle.folder / "saved_model", tmp_path / "tfjs")
+    theirs = shutil.copytree(official("discrete"), tmp_path / "tfjs")
     model = json.loads((theirs / "model.json").read_text())
     for place in (model, model.get("userDefinedMetadata", {})):
         outputs = place.get("signature", {}).get("outputs", {})
@@ -83,7 +70,8 @@ def test_an_op_that_tf2onnx_writes_all_the_same_is_named(tmp_path: Path, peers: 
     ]
     source = tmp_path / "policy.bytes"
     source.write_bytes(encode(Graph(tuple(nodes))).SerializeToString(deterministic=True))
-    theirs = to_onnx(peers, source, ["vector_observation"], ["action"], tmp_path / "theirs.onnx")
+    theirs, names = tmp_path / "theirs.onnx", ["--inputs", "vector_observation:0", "--outputs", "action:0"]
+    peers.run([*peers.tf2onnx(), "--graphdef", str(source), *names, "--output", str(theirs)])
     report = compare_artefacts(source, [theirs], runtimes=RUNTIMES, pool=pool)
     assert report.passed is False
     (failure,) = report.failures
@@ -92,12 +80,11 @@ def test_an_op_that_tf2onnx_writes_all_the_same_is_named(tmp_path: Path, peers: 
 
 
 def test_a_conversion_of_other_weights_differs(
-    tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], pool: RuntimePool
+    tmp_path: Path, official: Theirs, bundles: dict[str, ExportResult], pool: RuntimePool
 ) -> None:
     bundle = bundles["continuous"]
-    theirs = to_tfjs(peers, bundle.folder / "saved_model", tmp_path / "tfjs")
+    theirs = shutil.copytree(official("continuous"), tmp_path / "tfjs")
     shard = next(theirs.glob("*.bin"))
-    shutil.copy(shard, tmp_path / "kept")
     values = np.frombuffer(shard.read_bytes(), np.uint8).copy()
     values[: len(values) // 2] = 0
     shard.write_bytes(values.tobytes())

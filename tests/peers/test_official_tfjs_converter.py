@@ -19,6 +19,7 @@ from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, disagreements
+from tests.peers.conftest import Theirs
 from tests.peers.environment import Peers
 
 pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peers")]
@@ -32,11 +33,8 @@ def tfjs(processes: RuntimePool) -> RuntimeProcess:
     return processes.process("tfjs-cpu")
 
 
-def convert(peers: Peers, bundle: ExportResult, out: Path, *options: str) -> dict[str, Any]:
-    """Convert, and return the model.json."""
-    source = str(bundle.folder / "saved_model")
-    peers.run([*peers.tensorflowjs_converter(), "--input_format=tf_saved_model", *options, source, str(out)])
-    model: dict[str, Any] = json.loads((out / "model.json").read_text(encoding="utf-8"))
+def model_of(folder: Path) -> dict[str, Any]:
+    model: dict[str, Any] = json.loads((folder / "model.json").read_text(encoding="utf-8"))
     return model
 
 
@@ -47,14 +45,14 @@ def nodes(entries: dict[str, dict[str, str]]) -> set[str]:
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_its_model_agrees_with_ours(
-    name: str, tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], tfjs: RuntimeProcess
+    name: str, official: Theirs, bundles: dict[str, ExportResult], tfjs: RuntimeProcess
 ) -> None:
     bundle = bundles[name]
-    model = convert(peers, bundle, tmp_path / "theirs")
+    model = model_of(official(name))
     signature = bundle.policy.signature
     assert nodes(model["signature"]["inputs"]) == {s.name for s in signature.inputs}
     assert nodes(model["signature"]["outputs"]) == {s.name for s in signature.outputs}
-    ours, theirs = tfjs.load(str(bundle.folder / "tfjs")), tfjs.load(str(tmp_path / "theirs"))
+    ours, theirs = tfjs.load(str(bundle.folder / "tfjs")), tfjs.load(str(official(name)))
     assert not disagreements(bundle.policy, ours.run, theirs.run)
     ours.unload()
     theirs.unload()
@@ -63,8 +61,11 @@ def test_its_model_agrees_with_ours(
 def test_the_signature_without_noise_goes_through_too(
     tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], tfjs: RuntimeProcess
 ) -> None:
-    bundle = bundles["continuous"]
-    model = convert(peers, bundle, tmp_path / "theirs", "--signature_name=deterministic")
+    """By the package's own console script."""
+    source, out = str(bundles["continuous"].folder / "saved_model"), str(tmp_path / "theirs")
+    options = ["--input_format=tf_saved_model", "--signature_name=deterministic"]
+    peers.run([*peers.tensorflowjs_converter(), *options, source, out])
+    model = model_of(tmp_path / "theirs")
     assert nodes(model["signature"]["inputs"]) == {"state"}
     assert "deterministic_action" in nodes(model["signature"]["outputs"])
     tfjs.load(str(tmp_path / "theirs")).unload()

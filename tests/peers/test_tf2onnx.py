@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from converters.runtimes.process import LoadedModel, RuntimeProcess
 from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, Run, disagreements
-from tests.peers.environment import Peers
+from tests.peers.conftest import Theirs
 
 pytestmark = [pytest.mark.slow, pytest.mark.peers, pytest.mark.xdist_group("peers")]
 
@@ -38,14 +37,10 @@ def by_tensor(model: LoadedModel) -> Run:
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_its_model_agrees_with_ours(
-    name: str, tmp_path: Path, peers: Peers, bundles: dict[str, ExportResult], onnxruntime: RuntimeProcess
+    name: str, by_tf2onnx: Theirs, bundles: dict[str, ExportResult], onnxruntime: RuntimeProcess
 ) -> None:
-    bundle, made = bundles[name], str(tmp_path / "theirs.onnx")
-    inputs = ",".join(f"{s.name}:0" for s in bundle.policy.signature.inputs)
-    outputs = ",".join(f"{s.name}:0" for s in bundle.policy.signature.outputs)
-    source = str(bundle.folder / f"{name}.bytes")
-    peers.run([*peers.tf2onnx(), "--graphdef", source, "--inputs", inputs, "--outputs", outputs, "--output", made])
-    ours, theirs = onnxruntime.load(str(bundle.folder / f"{name}.onnx")), onnxruntime.load(made)
+    bundle = bundles[name]
+    ours, theirs = onnxruntime.load(str(bundle.folder / f"{name}.onnx")), onnxruntime.load(str(by_tf2onnx(name)))
     assert not disagreements(bundle.policy, ours.run, by_tensor(theirs))
     ours.unload()
     theirs.unload()
