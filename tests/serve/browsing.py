@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
+import functools
 import json
 import subprocess
+import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -40,6 +44,14 @@ def needed() -> str | None:
     return INSTALL_CHROMIUM if chromium_executable() is None else None
 
 
+def with_backends(site: Mapping[str, bytes], *names: str) -> dict[str, bytes]:
+    """A site whose page has these backends alone: WebGL in software takes more than all the rest of a visit."""
+    said = json.loads(site["site.json"])
+    said["backends"] = [each for each in said["backends"] if each["name"] in names]
+    assert len(said["backends"]) == len(names)
+    return {**site, "site.json": json.dumps(said).encode()}
+
+
 @contextmanager
 def served(site: Mapping[str, bytes]) -> Iterator[SiteServer]:
     with listening(site, "127.0.0.1", 0) as server:
@@ -60,11 +72,34 @@ def visit(url: str, steps: Sequence[Sequence[Any]], **context: Any) -> Visit:
     node, chromium = node_executable(), chromium_executable()
     assert node is not None
     assert chromium is not None
-    request = json.dumps({"url": url, "context": context, "steps": steps})
-    done = subprocess.run(
-        [node, str(SCRIPT), str(js_home()), chromium], input=request, capture_output=True, encoding="utf-8", check=False
-    )
-    assert done.returncode == 0, done.stderr
-    seen = json.loads(done.stdout)
+    seen = _browser(node, chromium).ask({"url": url, "context": context, "steps": steps})
     assert "failure" not in seen, seen
     return Visit(seen["results"], seen["console"], seen["requests"])
+
+
+class _Browser:
+    """Chromium, started once: it takes longer than most visits."""
+
+    def __init__(self, node: str, chromium: str) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
+        command = [node, str(SCRIPT), str(js_home()), chromium]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, encoding="utf-8"
+        )
+        atexit.register(self._process.communicate)
+
+    def ask(self, request: Mapping[str, Any]) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            print(json.dumps(request), file=self._process.stdin, flush=True)
+        answer = self._process.stdout.readline()
+        if not answer:
+            _browser.cache_clear()  # the next visit has another
+            self._process.wait()
+            self._errors.seek(0)
+            pytest.fail(f"no Chromium any more: {self._errors.read().decode(errors='replace')}")
+        return json.loads(answer)
+
+
+_browser = functools.cache(_Browser)

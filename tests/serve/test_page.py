@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from exporter.acting.policy import load_policy
 from exporter.serve.site import assemble, assemble_one_file, write_site
 from fixtures.trained import run_folder
 from tests.commands import export_model
-from tests.serve.browsing import CHECKED, Visit, served, visit
+from tests.serve.browsing import CHECKED, Visit, served, visit, with_backends
 from tests.serve.conftest import Bundle
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
@@ -26,12 +27,19 @@ STATES = """[...document.querySelectorAll('[data-backend]')].map((row) => [row.d
 STATUS = "({...document.querySelector('#status').dataset})"
 ACTIONS = "[...document.querySelectorAll('.answering .bars .value')].map((cell) => cell.textContent)"
 DECIDED = "document.querySelector('#timing').textContent.startsWith('Decided')"
+#: Until the answer is another than the one that was noted; how long a decision takes is the machine's matter.
+NOTE = ["eval", f"void (window.noted = {ACTIONS}.join())"]
+ANOTHER = ["wait", f"{ACTIONS}.join() !== window.noted"]
 
 
-def see(bundle: Path, *steps: list[object], scene: str = "auto", **context: object) -> Visit:
-    """A visit once the check is done; nothing may be written to the console, and no other origin be asked."""
-    with served(assemble(bundle, scene)) as server:
-        seen = visit(server.url, [["wait", CHECKED], *steps], **context)
+def see(bundle: Path, *steps: list[object], backends: Sequence[str] = ("js",)) -> Visit:
+    """A visit once the check is done; nothing may be written to the console, and no other origin be asked.
+
+    ``backends``: without any, as it is served.
+    """
+    site = assemble(bundle)
+    with served(with_backends(site, *backends) if backends else site) as server:
+        seen = visit(server.url, [["wait", CHECKED], *steps])
         # Chromium's own words where there is no graphics card; the page says so in its table.
         assert [said for said in seen.console if said != "warning: No available adapters."] == []
         assert [address for address in seen.requests if not address.startswith(server.url)] == []
@@ -39,25 +47,28 @@ def see(bundle: Path, *steps: list[object], scene: str = "auto", **context: obje
 
 
 def test_the_policy_keeps_the_balls_up_for_20_seconds_on_each_backend(bundle: Bundle) -> None:
+    played: list[list[object]] = []
     for backend in ("js", "wasm"):
-        seen = see(
-            bundle("3DBall"),
+        played += [
             ["select", "#backend", backend],
             ["wait", "!document.querySelector('#backend').disabled"],
+            ["click", "#pause"],
             ["click", "#reset"],
+            ["wait", f"{STATUS}.seconds === '0'"],
             ["select", "#speed", "8"],
+            ["click", "#pause"],
             ["wait", f"{STATUS}.seconds > 20.5"],
             ["eval", STATUS],
             ["eval", "document.querySelector('#canvas').getAttribute('aria-label')"],
-            ["eval", VERDICT],
-            ["eval", STATES],
-        )
-        status, described, verdict, states = seen.results[-4:]
+        ]
+    seen = see(bundle("3DBall"), *played, ["eval", VERDICT], ["eval", STATES], backends=())
+    *each, verdict, states = seen.results[1:]
+    for status, described in (each[8:10], each[18:20]):
         assert (status["good"], status["bad"]) == ("12", "0")
         assert described.startswith("12 tilting platforms")
-        names = ["js", "cpu", "wasm", "webgl"]
-        assert verdict.startswith("Yes. In your browser, js, cpu, wasm, webgl give the reference's")
-        assert states == [[name, "agrees"] for name in names]
+    names = ["js", "cpu", "wasm", "webgl"]
+    assert verdict.startswith("Yes. In your browser, js, cpu, wasm, webgl give the reference's")
+    assert states == [[name, "agrees"] for name in names]
 
 
 def test_without_its_memory_the_hallway_is_a_guess(bundle: Bundle) -> None:
@@ -88,15 +99,14 @@ def test_a_slider_changes_the_action_to_what_python_answers(bundle: Bundle) -> N
     seen = see(
         folder,
         ["wait", DECIDED],
-        ["eval", ACTIONS],
+        NOTE,
         ["focus", ".slider input[type=range]"],
-        *[["press", "ArrowRight"]] * 9,
-        ["eval", "new Promise((resolve) => setTimeout(resolve, 300))"],
+        ["press", "End"],
+        ANOTHER,
         ["eval", "[...document.querySelectorAll('.slider input[type=number]')].map((box) => box.valueAsNumber)"],
         ["eval", ACTIONS],
     )
-    before, values, after = seen.results[2], seen.results[-2], seen.results[-1]
-    assert before != after
+    values, after = seen.results[-2:]
     policy = load_policy(folder, runtime="numpy")
     expected = policy.decide(np.array([values], np.float32), deterministic=True).action[0]
     shown = [float(text.replace("−", "-")) for text in after]
@@ -123,14 +133,15 @@ def test_images_can_be_painted_and_filled(bundle: Bundle) -> None:
         bundle("visual"),
         ["wait", DECIDED],
         ["eval", ACTIONS],
+        NOTE,
         ["click", ".picture"],
-        ["eval", "new Promise((resolve) => setTimeout(resolve, 500))"],
-        ["eval", ACTIONS],
+        ANOTHER,
+        NOTE,
         ["click", ".painting button"],
-        ["eval", "new Promise((resolve) => setTimeout(resolve, 500))"],
+        ANOTHER,
         ["eval", ACTIONS],
     )
-    assert len({json.dumps(seen.results[i]) for i in (2, 5, 8)}) == 3
+    assert seen.results[2] != seen.results[-1]
 
 
 def test_a_wrong_answer_is_not_called_right(bundle: Bundle) -> None:
@@ -139,7 +150,7 @@ def test_a_wrong_answer_is_not_called_right(bundle: Bundle) -> None:
     data = bytearray(site["golden.bin"])
     at = slice(entry["offset"], entry["offset"] + 4)
     data[at] = (np.frombuffer(bytes(data[at]), "<f4") + np.float32(0.25)).tobytes()
-    with served({**site, "golden.bin": bytes(data)}) as server:
+    with served(with_backends({**site, "golden.bin": bytes(data)}, "js", "cpu", "wasm")) as server:
         seen = visit(server.url, [["wait", CHECKED], ["eval", VERDICT], ["eval", STATES]])
     assert seen.results[1].startswith("No: js is off by 0.250 at value_estimate")
     assert {state for _, state in seen.results[2]} == {"differs"}
@@ -257,7 +268,7 @@ def test_a_crawler_walks_ahead_and_lands_on_its_feet(bundle: Bundle, tmp_path: P
     walked, pace, before, lifted, flicked, later = (seen.results[k] for k in (2, 3, 4, 6, 7, 10))
     assert 1.5 < pace < 2.5
     assert before < 0.6 < lifted  # of the third, which is the one that is shown since
-    assert flicked > 0.05
+    assert flicked > 0  # how fast is a matter of how long the hand was down
     assert later > walked + 10
     assert (seen.console, seen.requests) == ([], [page.as_uri()])
 
@@ -268,7 +279,8 @@ def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
     words = "document.querySelector('#apart')?.textContent ?? ''"
     onnx = tmp_path / "3DBall" / "3DBall.onnx"
     played = "document.querySelector('#status-2')?.dataset.seconds > 2"
-    with served(assemble(tmp_path / "3DBall")) as server:
+    site = with_backends(assemble(tmp_path / "3DBall"), "js", "wasm", "onnxruntime-web")
+    with served(site) as server:
         seen = visit(
             f"{server.url}#beside=wasm",
             [

@@ -12,7 +12,7 @@ from exporter.acting.policy import load_policy
 from exporter.serve.site import assemble
 from fixtures import path as fixture
 from tests.acting.test_load_policy import observed
-from tests.serve.browsing import CHECKED, served, visit
+from tests.serve.browsing import CHECKED, served, visit, with_backends
 from tests.serve.conftest import Bundle
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
@@ -40,7 +40,7 @@ Answers = dict[str, list[dict[str, list[float]]]]
 
 def in_the_page(bundle: Path, requests: list[object]) -> Answers:
     """What each backend decides; one visit for all, as starting Chromium takes longer than all of them."""
-    with served(assemble(bundle, "none")) as server:
+    with served(with_backends(assemble(bundle, "none"), "cpu", "wasm")) as server:  # what the script finds loaded
         script = DECIDE % (json.dumps(BACKENDS), json.dumps(requests))
         found: Answers = visit(server.url, [["wait", CHECKED], ["eval", script]]).results[1]
     assert list(found) == BACKENDS

@@ -13,7 +13,7 @@ from exporter.serve.onefile import modules_of
 from exporter.serve.site import assemble, assemble_one_file
 from fixtures import path as fixture
 from tests.commands import export_model
-from tests.serve.browsing import CHECKED, served, visit
+from tests.serve.browsing import CHECKED, served, visit, with_backends
 from tests.serve.conftest import Bundle
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
@@ -59,7 +59,8 @@ def looked_at(url: str, axe: Path, ready: str) -> None:
 
 @pytest.mark.parametrize("name", ["3DBall", "recurrent", "visual"])
 def test_the_page_is_accessible_and_fits(bundle: Bundle, axe: Path, name: str) -> None:
-    with served(assemble(bundle(name))) as server:
+    site = assemble(bundle(name))
+    with served(site if name == "3DBall" else with_backends(site, "js", "cpu")) as server:
         looked_at(server.url, axe, CHECKED)
 
 
