@@ -1,8 +1,14 @@
-"""Every policy of ../shared by path, for the tests that go over all of them; each is read and compiled once."""
+"""Every policy of ../shared by path, for the tests that go over all of them; each is read and compiled once.
+
+What is known of a file is the same worker's, whichever test asks.
+"""
 
 from __future__ import annotations
 
 import functools
+import zlib
+from collections.abc import Iterable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +31,18 @@ def sources() -> list[Path]:
 
 def params(found: list[Path]) -> list[Any]:
     """Pytest parameters with the files' names; one that stands for their absence."""
-    named = [pytest.param(p, id="/".join(p.relative_to(SHARED).parts)[-90:]) for p in found]
+    named = [pytest.param(p, id="/".join(p.relative_to(SHARED).parts)[-90:], marks=_group(p)) for p in found]
     return named or [pytest.param(Path("absent"), id="shared-is-absent")]
+
+
+def in_turns(found: list[Path], choices: Iterable[Any]) -> list[Any]:
+    """As ``params``, each with the next of ``choices``."""
+    turns = zip(params(found), cycle(choices), strict=False)
+    return [pytest.param(*f.values, choice, id=f"{f.id}-{choice.name}", marks=f.marks) for f, choice in turns]
+
+
+def _group(path: Path) -> pytest.MarkDecorator:
+    return pytest.mark.xdist_group(f"known-{zlib.crc32(str(path.relative_to(SHARED)).encode()):08x}")
 
 
 @functools.cache

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -79,14 +77,11 @@ def test_a_fixture_acts_the_same(name: str, wanted: Profile, pool: RuntimePool, 
     )
 
 
-def _in_turns() -> list[Any]:
-    files = known.params([p for p in known.sources() if p.suffix != ".keras"])
-    turns = zip(files, itertools.cycle(TFSHARP), strict=False)
-    return [pytest.param(file.values[0], wanted, id=f"{file.id}-{wanted.name}") for file, wanted in turns]
+FILES = [p for p in known.sources() if p.suffix != ".keras"]
 
 
 @pytest.mark.corpus
-@pytest.mark.parametrize(("path", "wanted"), _in_turns())
+@pytest.mark.parametrize(("path", "wanted"), known.in_turns(FILES, TFSHARP))
 def test_a_known_policy_acts_the_same(
     path: Path,
     wanted: Profile,
