@@ -27,7 +27,8 @@ install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json $(TESTS_JS)/package-lock.json
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev,docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable '.[all,dev,docs]'
+	$(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true # as pip does, on all processors; a template is no program
 	cd $(JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	cd $(TESTS_JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	@touch $(STAMP)
@@ -64,7 +65,8 @@ types: install
 check: lint types
 	EXPORT_MODEL_TEST_DAILY=1 $(PYTEST) -n 2 --dist worksteal -q -m "not (runtimes or slow or corpus or legacy or browser or peers)"
 
-test: install browser lint types
+test: install
+	$(MAKE) --jobs 2 browser lint types # one fetches, the others compute
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90 --durations=25
 
 docs: install

@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import os
+import pkgutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
+import converters
+import exporter
+import signatures
 from converters.formats import DEFAULTS, WRITTEN
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
@@ -34,8 +39,10 @@ FULL = "EXPORT_MODEL_TEST_FULL"
 #: Set (by make check), properties are tried on a fifth of their examples.
 DAILY = "EXPORT_MODEL_TEST_DAILY"
 
-#: No time limit per example: on a busy machine it says nothing of the code. Each test has pytest's own.
-settings.register_profile("busy", deadline=None)
+#: No time limit per example, nor for making one: on a busy machine it says nothing of the code. Each test has pytest's
+#: own. The same examples in every run: what is drawn anew is ``make fuzz``'s.
+SLOW = (HealthCheck.too_slow,)
+settings.register_profile("busy", deadline=None, derandomize=True, suppress_health_check=SLOW)
 settings.load_profile("busy")
 
 #: Rooms whose tests start runtimes, browsers, servers or the program; and what tests of other rooms then ask for.
@@ -50,10 +57,34 @@ _FIXTURE = "processes"
 #: Where one file after the other runs the same lines, coverage traces one in so many: Python takes nearly twice as long
 #: under it (3.11 has no other way), and the lines are the same.
 _TRACED = {"corpus": 8, "legacy": 8, "slow": 4}
+#: Of a test with more than so many cases, one in four.
+_MANY = 64
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session: pytest.Session) -> Iterator[Any]:
+    """All modules of the product are imported under coverage; then it rests until the first test.
+
+    pytest rewrites and imports the tests meanwhile, which took most of a minute in each worker.
+    """
+    plugins = session.config.pluginmanager
+    controller = plugins.getplugin("_cov").cov_controller if plugins.hasplugin("_cov") else None
+    if controller is None or not controller.started or plugins.hasplugin("dsession"):  # whose workers collect
+        return (yield)
+    for package in (signatures, converters, exporter):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith("__main__"):
+                importlib.import_module(module.name)
+    controller.pause()
+    try:
+        return (yield)
+    finally:
+        controller.resume()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what ``make check`` leaves out, and of sweeps what coverage does; tell pytest-xdist the groups."""
+    families = Counter(item.nodeid.partition("[")[0] for item in items)
     swept: Counter[str] = Counter()
     for item in items:
         rooms = set(item.path.relative_to(Path(__file__).parent).parts)
@@ -62,6 +93,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         of = max((count for name, count in _TRACED.items() if item.get_closest_marker(name)), default=1)
         if config.pluginmanager.hasplugin("_cov"):
             family = item.nodeid.partition("[")[0]
+            of = max(of, 4 if families[family] > _MANY else 1)
             if swept[family] % of:
                 item.add_marker(pytest.mark.no_cover)
             swept[family] += 1
