@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from signatures.fields import Field, FieldError
+from signatures.fields import Field, FieldError, known
 from signatures.labels import parsed
 from signatures.memories import SourcePart
 from signatures.records import dataclass
@@ -73,18 +73,15 @@ class Origin:
 
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json."""
-        content: dict[str, Any] = {"path": self.path, "sha256": self.sha256}
-        if self.model is not None:
-            content["model"] = self.model
-        if self.step is not None:
-            content["step"] = self.step
-        if self.sensors:
-            content["sensors"] = [list(shape) for shape in self.sensors]
-        if self.goals:
-            content["goals"] = list(self.goals)
-        if self.activation is not None:
-            content["activation"] = self.activation
-        return content
+        return known(
+            path=self.path,
+            sha256=self.sha256,
+            model=self.model,
+            step=self.step,
+            sensors=[list(shape) for shape in self.sensors] or None,
+            goals=list(self.goals) or None,
+            activation=self.activation,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +160,12 @@ def parse(content: Any) -> Contract:
         None if source["activation"].missing else source["activation"].text(),
     )
     files = {_key(path, entry): _file(entry) for path, entry in whole["files"].members().items()}
-    made = {key: tool[key].text() for key in ("name", "version")}
-    if not tool["profile"].missing:  # the consumer that it was made for
-        made["profile"] = tool["profile"].text()
-    if not tool["weights"].missing:  # what they were rounded to
-        made["weights"] = tool["weights"].one_of(("float16", "int8"))
+    made = known(
+        name=tool["name"].text(),
+        version=tool["version"].text(),
+        profile=None if tool["profile"].missing else tool["profile"].text(),
+        weights=None if tool["weights"].missing else tool["weights"].one_of(("float16", "int8")),
+    )
     return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
 
 
@@ -210,9 +208,9 @@ def parse_signature(whole: Field) -> PolicySignature:
 def parse_source_map(source: Field, signature: PolicySignature) -> SourceMap:
     """How the source is run, with the feeds and fetches of ``signature``. Raises FieldError."""
     parts = {name: tuple(_part(p) for p in given.items()) for name, given in source["parts"].members().items()}
-    known = {s.name for s in (*signature.inputs, *signature.outputs)}
-    if not parts.keys() <= known:
-        raise source["parts"].error(f"names {min(parts.keys() - known)!r}, which is no input or output")
+    names = {s.name for s in (*signature.inputs, *signature.outputs)}
+    if not parts.keys() <= names:
+        raise source["parts"].error(f"names {min(parts.keys() - names)!r}, which is no input or output")
     return SourceMap(
         feeds=sources(signature.inputs, parts),
         fetches=sources(signature.outputs, parts),

@@ -154,6 +154,14 @@ class PolicySignature:
         return next((head.plain for head in self.heads if head.name == output), None)
 
     @property
+    def recurrence(self) -> tuple[str, str] | None:
+        """(the memory's input, the output that is fed back into it); None where there is no such pair."""
+        memory = self.memory
+        if memory is None or memory.input is None or memory.output is None:
+            return None
+        return memory.input, memory.output
+
+    @property
     def log_probs(self) -> TensorSpec | None:
         """The log-probabilities of the discrete actions, None where there are none."""
         return next((s for s in self.outputs if s.role is Role.LOG_PROBS), None)

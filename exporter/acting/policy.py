@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
-RUNTIMES = ("onnxruntime", "numpy")
+#: Runtime → the format that it runs.
+_TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}
+RUNTIMES = tuple(_TAKES)
 #: What ``decide`` may be given besides observations, and the inputs that take it.
 _TAKEN = {"masks": Role.MASKS, "memory": Role.MEMORY_IN, "previous": Role.PREV_ACTION}
 
@@ -120,7 +122,9 @@ class LoadedPolicy:
             self.seed(seed)
         given = self._named(observations)
         special = {Role.MASKS: masks, Role.MEMORY_IN: memory, Role.PREV_ACTION: previous}
-        self._check_taken({"masks": masks, "memory": memory, "previous": previous})
+        for word, role in _TAKEN.items():
+            if special[role] is not None and not self.takes(role):
+                raise UsageError(f"the policy takes no {word}", why="it has no such input", fix=f"leave {word}= out")
         self._check_parameters(parameters or {})
         feeds: dict[str, Array] = {}
         rows: int | None = None
@@ -160,22 +164,18 @@ class LoadedPolicy:
 
     def _named(self, observations: npt.ArrayLike | Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         names = [s.name for s in self.signature.observations]
+        known = ", ".join(names)
         if not isinstance(observations, Mapping):
             if len(names) != 1:
-                raise UsageError(f"the policy has {len(names)} observations", fix=f"give a dict of {', '.join(names)}")
+                raise UsageError(f"the policy has {len(names)} observations", fix=f"give a dict of {known}")
             return {names[0]: observations}
         for name in names:
             if name not in observations:
-                raise UsageError(f"the observation {name!r} is missing", fix=f"there are {', '.join(names)}")
+                raise UsageError(f"the observation {name!r} is missing", fix=f"there are {known}")
         for name in observations:
             if name not in names:
-                raise UsageError(f"there is no observation {name!r}", fix=f"there are {', '.join(names)}")
+                raise UsageError(f"there is no observation {name!r}", fix=f"there are {known}")
         return dict(observations)
-
-    def _check_taken(self, given: Mapping[str, npt.ArrayLike | None]) -> None:
-        for word, value in given.items():
-            if value is not None and not self.takes(_TAKEN[word]):
-                raise UsageError(f"the policy takes no {word}", why="it has no such input", fix=f"leave {word}= out")
 
     def _check_parameters(self, given: Mapping[str, npt.ArrayLike]) -> None:
         wanted = {s.name: s.shape for s in self.signature.inputs if s.role is Role.PARAMETER}
@@ -451,5 +451,3 @@ def _in_numpy(model: bytes) -> tuple[Run, Declared]:
 
 
 _RUNS: Mapping[str, Callable[[bytes], tuple[Run, Declared]]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}
-#: Runtime → the format that it runs.
-_TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}

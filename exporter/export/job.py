@@ -19,7 +19,7 @@ from exporter.export.options import ExportOptions
 from exporter.export.sources import Source
 from signatures.contract import Contract, Origin, parse
 from signatures.errors import SignatureError, TooLargeError, UsageError, naming
-from signatures.fields import FieldError, printable
+from signatures.fields import FieldError, known, printable
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
@@ -97,8 +97,7 @@ def contract_of(
         read.goals,
         read.activation,
     )
-    made = {"name": "export-model", "version": __version__, "profile": profile, "weights": weights}
-    tool = {key: value for key, value in made.items() if value is not None}
+    tool = known(name="export-model", version=__version__, profile=profile, weights=weights)
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
         parse(contract.to_dict())

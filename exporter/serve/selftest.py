@@ -49,11 +49,11 @@ def golden(signature: PolicySignature, graph: Graph) -> tuple[dict[str, Any], by
         if number >= 3 and book.size + sum(a.nbytes for a in case.feeds.values()) > _MOST_BYTES:
             continue
         book.add(case, run_graph(graph, case.feeds, names))
-    memory = signature.memory
-    if memory is not None and memory.input is not None and memory.output is not None:
+    if signature.recurrence is not None:
+        fed, fed_back = signature.recurrence
         last: Mapping[str, np.ndarray] | None = None
         for step, feeds in enumerate(draw_rollout(signature, seed=SEED, steps=_STEPS), 1):
-            given = feeds if last is None else {**feeds, memory.input: last[memory.output]}
+            given = feeds if last is None else {**feeds, fed: last[fed_back]}
             answers = run_graph(graph, given, names)
             book.add(Case(f"memory fed back, step {step}", given, 2), answers, continues=last is not None)
             last = answers

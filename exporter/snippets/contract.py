@@ -66,10 +66,8 @@ class Bundle:
     @property
     def memory(self) -> tuple[TensorSpec, str] | None:
         """(the input, the output that is fed back into it), None where there is no such pair."""
-        memory = self.signature.memory
-        if memory is None or memory.input is None or memory.output is None:
-            return None
-        return self.signature.input(memory.input), memory.output
+        pair = self.signature.recurrence
+        return None if pair is None else (self.signature.input(pair[0]), pair[1])
 
     @property
     def previous(self) -> TensorSpec | None:

@@ -9,6 +9,7 @@ from converters.runtimes.process import RunFailedError
 from exporter.verify.difference import by_decade
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
+from signatures.fields import known
 from signatures.records import dataclass
 
 
@@ -39,20 +40,14 @@ class Bisection:
         if self.tensor is None:
             return {"tensor": None, "reason": self.reason}
         numbers = {k: getattr(self, k) for k in ("expected", "got", "max_abs_diff", "smallest_tolerance")}
-        entry: dict[str, Any] = {
+        return {
             "tensor": self.tensor,
             "op": self.op,
             "source": list(self.source) if isinstance(self.source, tuple) else self.source,
             "index": None if self.index is None else list(self.index),
             **{k: None if v is None else _number(v) for k, v in numbers.items()},
+            **known(hidden=list(self.hidden) or None, input=self.input, reason=self.reason or None),
         }
-        if self.hidden:
-            entry["hidden"] = list(self.hidden)
-        if self.input is not None:
-            entry["input"] = self.input
-        if self.reason:
-            entry["reason"] = self.reason
-        return entry
 
     def sentence(self) -> str:
         """Where it begins, in a line."""
@@ -84,6 +79,10 @@ class Finding:
     kind: ClassVar[str]
     #: ``max_abs_diff`` is a difference of numbers, which a tolerance bounds.
     measured: ClassVar[bool] = False
+    #: What a cell says of one that passed, and that did not, where it is no number.
+    words: ClassVar[tuple[str, str] | None] = None
+    #: What went wrong, where it is told otherwise than of a number.
+    wrong: ClassVar[str] = ""
 
     format: str
     runtime: str
@@ -118,6 +117,8 @@ class Finding:
 
     def cell(self) -> str:
         """What is said of the output in a table."""
+        if self.words is not None:
+            return self.words[not self.passed]
         return f"{self.max_abs_diff:.1e}" if self.max_abs_diff else "0"
 
     def short(self) -> str:
@@ -134,6 +135,8 @@ class Finding:
 
     def sentence(self) -> str:
         """What went wrong, where this one did not pass."""
+        if self.wrong:
+            return self.wrong.format(self)
         text = f"{self.where}: {self.output} differs"
         if self.reason:
             text += f": {self.reason}"
@@ -153,7 +156,7 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """As in parity.json."""
-        entry: dict[str, Any] = {
+        return {
             "format": self.format,
             "runtime": self.runtime,
             "output": self.output,
@@ -164,30 +167,24 @@ class Finding:
             "rtol": self.tolerance.rtol,
             "passed": self.passed,
             "worst_input": self.worst_input,
+            **known(
+                tolerance_reason=self.tolerance.reason or None,
+                rounding=self.rounding or None,
+                reason=self.reason or None,
+                drift=[_number(d) for d in self.drift] or None,
+                histogram=by_decade(self.histogram) if any(self.histogram) else None,
+                smallest_tolerance=None if self.passed else self.smallest_tolerance,
+                bisection=None if self.bisection is None else self.bisection.to_dict(),
+            ),
         }
-        if self.tolerance.reason:
-            entry["tolerance_reason"] = self.tolerance.reason
-        if self.rounding:
-            entry["rounding"] = self.rounding
-        if self.reason:
-            entry["reason"] = self.reason
-        if self.drift:
-            entry["drift"] = [_number(d) for d in self.drift]
-        if any(self.histogram):
-            entry["histogram"] = by_decade(self.histogram)
-        if self.smallest_tolerance is not None and not self.passed:
-            entry["smallest_tolerance"] = self.smallest_tolerance
-        if self.bisection is not None:
-            entry["bisection"] = self.bisection.to_dict()
-        return entry
 
 
 class Numbers(Finding):
     """An output's numbers, inputs given one at a time."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "numbers"
-    measured: ClassVar[bool] = True
+    kind = "numbers"
+    measured = True
 
     def columns(self) -> tuple[str, str, str]:
         """As they are."""
@@ -199,25 +196,22 @@ class Rollout(Numbers):
     """An output's numbers with the memory fed back; ``drift`` has the worst difference of each step."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "rollout"
+    kind = "rollout"
 
 
 class Shape(Finding):
     """A drawn output's shape, dtype and range."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "shape"
-
-    def cell(self) -> str:
-        """There is no number to tell."""
-        return "drawn"
+    kind = "shape"
+    words = ("drawn", "drawn")
 
 
 class Draws(Shape):
     """How a drawn output is distributed; ``max_abs_diff`` is the p-value's complement."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "draws"
+    kind = "draws"
 
     def columns(self) -> tuple[str, str, str]:
         """The p-value, and what it must reach."""
@@ -230,7 +224,8 @@ class Decisions(Finding):
     """
 
     __slots__ = ()
-    kind: ClassVar[str] = "decisions"
+    kind = "decisions"
+    wrong = "with weights rounded to {0.runtime}, {0.output} is another one: {0.reason}"
 
     def cell(self) -> str:
         """The share."""
@@ -240,50 +235,31 @@ class Decisions(Finding):
         """The share, and what it may be."""
         return f"{self.max_abs_diff:.2%}", "", f"{self.tolerance.atol:.0%}"
 
-    def sentence(self) -> str:
-        """What it does otherwise."""
-        return f"with weights rounded to {self.runtime}, {self.output} is another one: {self.reason}"
-
 
 class Failure(Finding):
     """A runtime that gave no answer; ``output`` is "*" where that is so for all."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "failure"
-
-    def sentence(self) -> str:
-        """What the runtime said."""
-        return f"{self.where}: {self.reason}"
+    kind = "failure"
+    wrong = "{0.where}: {0.reason}"
 
 
 class Accepted(Finding):
     """What a consumer's own checker says to a file; ``runtime`` is the release."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "accepted"
-
-    def cell(self) -> str:
-        """Whether it is accepted."""
-        return "accepted" if self.passed else "refused"
-
-    def sentence(self) -> str:
-        """What the consumer says."""
-        return f"{self.format} is not accepted by {self.runtime}: {self.reason}"
+    kind = "accepted"
+    words = ("accepted", "refused")
+    wrong = "{0.format} is not accepted by {0.runtime}: {0.reason}"
 
 
 class Size(Finding):
     """The bytes of a format beside its budget; ``max_abs_diff`` is what there is too many."""
 
     __slots__ = ()
-    kind: ClassVar[str] = "size"
-
-    def cell(self) -> str:
-        """Whether the budget is kept."""
-        return "kept" if self.passed else "exceeded"
-
-    def sentence(self) -> str:
-        """How large it is."""
-        return f"{self.format} is too large: {self.reason}"
+    kind = "size"
+    words = ("kept", "exceeded")
+    wrong = "{0.format} is too large: {0.reason}"
 
 
 def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -> Failure:

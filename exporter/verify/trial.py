@@ -38,7 +38,8 @@ class Trial:
         self.golden = Golden() if options.golden is None else read_golden(Path(options.golden), self.signature)
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
-        self.steps = self._rollout_feeds()
+        recurrent = self.signature.recurrence is not None
+        self.steps = draw_rollout(self.signature, seed=options.seed, steps=options.steps) if recurrent else []
         self._scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
         self._cost = 0
         self._allowances: dict[tuple[str, str], Allowance] = {}
@@ -129,9 +130,9 @@ class Trial:
         """Per output, what rounding explains of it."""
         if isinstance(at, Case):
             return self.rounding.outputs(self.reference.model, at, participant.runtime, sure=sure)
-        memory = self.signature.memory
-        assert memory is not None and memory.output is not None
-        return self.rounding.steps(self.reference.model, self.rolled, memory.output, at, participant.runtime, sure=sure)
+        assert self.signature.recurrence is not None
+        kept, runtime = self.signature.recurrence[1], participant.runtime
+        return self.rounding.steps(self.reference.model, self.rolled, kept, at, runtime, sure=sure)
 
     def _compared(
         self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: Feeds | None = None
@@ -210,12 +211,11 @@ class Trial:
 
     def rolled(self, run: Callable[[Feeds], Arrays]) -> list[Arrays]:
         """Outputs of each step, the memory fed back."""
-        memory = self.signature.memory
         answers: list[Arrays] = []
         for feeds in self.steps:
-            assert memory is not None and memory.input is not None and memory.output is not None
-            if answers:
-                feeds = {**feeds, memory.input: answers[-1][memory.output]}
+            if answers and self.signature.recurrence is not None:
+                fed, kept = self.signature.recurrence
+                feeds = {**feeds, fed: answers[-1][kept]}
             answers.append(run(feeds))
         return answers
 
@@ -257,9 +257,3 @@ class Trial:
             expected[scores], self.signature.branches, self.tolerance(scores, participant), rounding.get(scores)
         )
         return found if found.shape == expected[name].shape else None
-
-    def _rollout_feeds(self) -> list[Arrays]:
-        memory = self.signature.memory
-        if memory is None or memory.input is None or memory.output is None:
-            return []
-        return draw_rollout(self.signature, seed=self.options.seed, steps=self.options.steps)
