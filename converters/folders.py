@@ -176,3 +176,9 @@ def _forget(path: Path) -> None:
     descriptor = _LIVE.pop(path, None)
     if descriptor is not None:
         os.close(descriptor)
+
+
+def size_of(path: Path) -> int:
+    """The bytes of a file, or of all in a folder; 0 where nothing is."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(f.stat().st_size for f in files if f.is_file())

@@ -45,6 +45,17 @@ class TensorSpec:
     def __repr__(self) -> str:
         return f"<{self.name!r}: {self.role.value}, {self.dtype} {self.shape_text}>"
 
+    def fits(self, array: np.ndarray) -> bool:
+        """Whether an array has its shape, with any number of rows."""
+        return array.ndim == len(self.shape) and all(
+            n in (None, m) for n, m in zip(self.shape[1:], array.shape[1:], strict=True)
+        )
+
+    @property
+    def batched(self) -> bool:
+        """Whether its first axis is the agents'."""
+        return bool(self.shape) and self.shape[0] is None
+
     @property
     def shape_text(self) -> str:
         """The shape for people: ``[B, 8]``, B for the batch, ? for another axis that is free."""
@@ -136,7 +147,7 @@ class PolicySignature:
 
     def rows(self, feeds: Mapping[str, np.ndarray]) -> int:
         """The batch that ``feeds`` have: a parameter's first axis may be longer, it is not free."""
-        free = (s.name for s in self.inputs if s.shape and s.shape[0] is None)
+        free = (s.name for s in self.inputs if s.batched)
         return next((int(feeds[name].shape[0]) for name in free), 1)
 
     @property

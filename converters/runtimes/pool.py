@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import MappingProxyType
 
 from converters.format import Format
 from converters.runtimes.process import RuntimeProcess
@@ -18,7 +17,7 @@ _ORIGINALS = tuple(r.name for r in RUNTIMES if r.originals)
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
 #: Runtimes that have a sandbox of their own: browsers.
 _FREE = frozenset(r.name for r in RUNTIMES if not r.confined)
-_COMMANDS = MappingProxyType({r.name: r.command for r in RUNTIMES})
+_COMMANDS: Mapping[str, Callable[[], list[str]]] = {r.name: r.command for r in RUNTIMES}
 
 
 def chosen_runtimes(

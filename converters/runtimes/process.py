@@ -14,7 +14,7 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
-from converters.folders import OwnFolder, scratch_folder
+from converters.folders import OwnFolder, scratch_folder, size_of
 from converters.runtimes.memory import Memory
 from converters.runtimes.python import confined
 from converters.runtimes.wire import FramingError, Tensors, read_frame, write_frame
@@ -118,7 +118,7 @@ class RuntimeProcess:
         self.start()
         self._loaded += 1
         identity = f"m{self._loaded}"
-        size, memory = _size(path), self._memory
+        size, memory = size_of(Path(path)), self._memory
         if memory is not None:
             memory.allow(size)
         try:
@@ -237,14 +237,6 @@ def _requests(inputs: Sequence[Mapping[str, np.ndarray]]) -> Iterator[tuple[int,
             first, size = number, sum(array.nbytes for array in feeds.values())
     if inputs:
         yield first, len(inputs)
-
-
-def _size(path: str) -> int:
-    """The bytes of a model: a file, or a folder of files."""
-    place = Path(path)
-    if place.is_dir():
-        return sum(f.stat().st_size for f in place.rglob("*") if f.is_file())
-    return place.stat().st_size if place.is_file() else 0
 
 
 def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:

@@ -26,8 +26,6 @@ Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
 #: Runtime → the format that it runs.
 _TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}
 RUNTIMES = tuple(_TAKES)
-#: What ``decide`` may be given besides observations, and the inputs that take it.
-_TAKEN = {"masks": Role.MASKS, "memory": Role.MEMORY_IN, "previous": Role.PREV_ACTION}
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ class LoadedPolicy:
             self.seed(seed)
         given = self._named(observations)
         special = {Role.MASKS: masks, Role.MEMORY_IN: memory, Role.PREV_ACTION: previous}
-        for word, role in _TAKEN.items():
+        for word, role in (("masks", Role.MASKS), ("memory", Role.MEMORY_IN), ("previous", Role.PREV_ACTION)):
             if special[role] is not None and not self.takes(role):
                 raise UsageError(f"the policy takes no {word}", why="it has no such input", fix=f"leave {word}= out")
         self._check_parameters(parameters or {})
@@ -226,10 +224,7 @@ class LoadedPolicy:
             array = array[None]
         if spec.role is Role.PREV_ACTION and len(spec.shape) == 1 and array.ndim == 2 and array.shape[1] == 1:
             array = array[:, 0]  # ML-Agents 0.3 and 0.4 feed it without an axis for the one branch
-        same = array.ndim == len(spec.shape) and all(
-            n in (None, m) for n, m in zip(spec.shape[1:], array.shape[1:], strict=True)
-        )
-        if not same or len(array) != (len(array) if rows is None else rows):
+        if not spec.fits(array) or len(array) != (len(array) if rows is None else rows):
             wanted = ", ".join(["agents", *("any" if n is None else str(n) for n in spec.shape[1:])])
             raise UsageError(
                 f"{spec.name!r} has the shape {list(np.shape(value))}",

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.bundle.bundle import Bundle
-from converters.folders import scratch_folder
+from converters.folders import scratch_folder, size_of
 from converters.format import Format, Port, Ports
 from converters.frozen_graph.writer import frozen
 from converters.graph.options import CompileOptions
@@ -152,7 +152,7 @@ def compare_artefacts(
             policy.signature,
             policy.graph,
             {},
-            {m.label: _size(m.ports.path) for m in matched},
+            {m.label: size_of(m.ports.path) for m in matched},
             reference_file,
             source,
             policy.source,
@@ -201,10 +201,6 @@ def _labels(found: Sequence[tuple[Path, Format, Ports]]) -> list[str]:
             break
     turns = [labels[:i].count(label) for i, label in enumerate(labels)]  # one file may be given twice
     return [f"{label} ({n + 1})" if n else label for label, n in zip(labels, turns, strict=True)]
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.is_file() else sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
 
 
 # ---- names
@@ -332,7 +328,7 @@ def _misfit(spec: TensorSpec, port: Port) -> str:
     )
     if not same:
         return f"the input {port.name!r} has the shape {_dims(port.shape)}, the reference's {_dims(spec.shape)}"
-    if port.shape and spec.shape and spec.shape[0] is None and port.shape[0] is not None:
+    if port.shape and spec.batched and port.shape[0] is not None:
         return f"the input {port.name!r} takes {port.shape[0]} rows only, the reference any number"
     return ""
 

@@ -28,7 +28,7 @@ def docker(bundle: Bundle) -> str:
 def rest(bundle: Bundle) -> str:
     """A call with curl."""
     inputs = bundle.signature.inputs
-    rows = all(s.shape and s.shape[0] is None for s in inputs)
+    rows = all(s.batched for s in inputs)
     texts = [line for spec in inputs for line in meaning(bundle, spec)]
     texts += [line for head in bundle.heads for line in action_meaning(bundle, head)]
     comments = "\n".join(f"# {line}" for line in texts)

@@ -71,7 +71,7 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
     cases, answers = [], []
     for first in range(0, rows, _ROWS):
         last = min(first + _ROWS, rows)
-        feeds = {s.name: _part(s, given[s.name], first, last) for s in signature.inputs}
+        feeds = {s.name: given[s.name][first:last] if s.batched else given[s.name] for s in signature.inputs}
         cases.append(Case(f"golden, rows {first}-{last - 1}", feeds, last - first))
         answers.append({name: given[name][first:last] for name in outputs})
     return Golden(tuple(cases), tuple(answers), frozenset(noiseless))
@@ -110,10 +110,7 @@ def _by_name(specs: tuple[TensorSpec, ...]) -> dict[str, TensorSpec]:
 
 
 def _fitting(path: Path, spec: TensorSpec, array: np.ndarray) -> np.ndarray:
-    same = array.ndim == len(spec.shape) and all(
-        n in (None, m) for n, m in zip(spec.shape[1:], array.shape[1:], strict=True)
-    )
-    if not same or array.dtype.kind not in "fiub":
+    if not spec.fits(array) or array.dtype.kind not in "fiub":
         wanted = "[" + ", ".join("rows" if n is None else str(n) for n in spec.shape) + "]"
         raise UsageError(
             f"--golden: {spec.name!r} is {array.dtype} {list(array.shape)}, and {spec.dtype} {wanted} is wanted",
@@ -124,7 +121,7 @@ def _fitting(path: Path, spec: TensorSpec, array: np.ndarray) -> np.ndarray:
 
 
 def _rows(path: Path, signature: PolicySignature, given: Mapping[str, np.ndarray]) -> int:
-    free = {s.name for s in (*signature.inputs, *signature.outputs) if s.shape and s.shape[0] is None}
+    free = {s.name for s in (*signature.inputs, *signature.outputs) if s.batched}
     counts = {name: len(array) for name, array in given.items() if name in free}
     if not counts or min(counts.values()) != max(counts.values()) or not min(counts.values()):
         said = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
@@ -135,7 +132,3 @@ def _rows(path: Path, signature: PolicySignature, given: Mapping[str, np.ndarray
             fix="give every array a row for each recorded step",
         )
     return min(counts.values())
-
-
-def _part(spec: TensorSpec, array: np.ndarray, first: int, last: int) -> np.ndarray:
-    return array[first:last] if spec.shape and spec.shape[0] is None else array

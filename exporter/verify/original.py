@@ -75,9 +75,9 @@ class Original:
         part = {}
         for spec in self.signature.inputs:
             array = feeds[spec.name]
-            free = bool(spec.shape) and spec.shape[0] is None
-            rows = np.minimum(np.arange(first, first + count), array.shape[0] - 1) if free else None
-            part[spec.name] = array if rows is None else array[rows]
+            if spec.batched:
+                array = array[np.minimum(np.arange(first, first + count), array.shape[0] - 1)]
+            part[spec.name] = array
         return part
 
     def _answers(self, feeds: Arrays) -> dict[str, np.ndarray]:

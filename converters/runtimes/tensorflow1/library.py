@@ -10,25 +10,22 @@ import os
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-_DTYPES: Mapping[int, np.dtype[Any]] = MappingProxyType(
-    {
-        1: np.dtype(np.float32),
-        2: np.dtype(np.float64),
-        3: np.dtype(np.int32),
-        4: np.dtype(np.uint8),
-        5: np.dtype(np.int16),
-        6: np.dtype(np.int8),
-        9: np.dtype(np.int64),
-        10: np.dtype(np.bool_),
-        17: np.dtype(np.uint16),
-        19: np.dtype(np.float16),
-    }
-)
+_DTYPES: Mapping[int, np.dtype[Any]] = {
+    1: np.dtype(np.float32),
+    2: np.dtype(np.float64),
+    3: np.dtype(np.int32),
+    4: np.dtype(np.uint8),
+    5: np.dtype(np.int16),
+    6: np.dtype(np.int8),
+    9: np.dtype(np.int64),
+    10: np.dtype(np.bool_),
+    17: np.dtype(np.uint16),
+    19: np.dtype(np.float16),
+}
 _NUMBERS = {dtype: number for number, dtype in _DTYPES.items()}
 
 
@@ -52,47 +49,45 @@ class _Output(ctypes.Structure):
 
 
 #: Function → (what it returns, what it takes). tensorflow/c/c_api.h.
-_FUNCTIONS: Mapping[str, tuple[Any, tuple[Any, ...]]] = MappingProxyType(
-    {
-        "TF_Version": (_string, ()),
-        "TF_NewStatus": (_pointer, ()),
-        "TF_DeleteStatus": (None, (_pointer,)),
-        "TF_GetCode": (_int, (_pointer,)),
-        "TF_Message": (_string, (_pointer,)),
-        "TF_NewBufferFromString": (_pointer, (_string, _size)),
-        "TF_DeleteBuffer": (None, (_pointer,)),
-        "TF_NewGraph": (_pointer, ()),
-        "TF_DeleteGraph": (None, (_pointer,)),
-        "TF_NewImportGraphDefOptions": (_pointer, ()),
-        "TF_DeleteImportGraphDefOptions": (None, (_pointer,)),
-        "TF_GraphImportGraphDef": (None, (_pointer, _pointer, _pointer, _pointer)),
-        "TF_GraphOperationByName": (_pointer, (_pointer, _string)),
-        "TF_OperationNumOutputs": (_int, (_pointer,)),
-        "TF_NewSessionOptions": (_pointer, ()),
-        "TF_DeleteSessionOptions": (None, (_pointer,)),
-        "TF_SetConfig": (None, (_pointer, _string, _size, _pointer)),
-        "TF_NewSession": (_pointer, (_pointer, _pointer, _pointer)),
-        "TF_CloseSession": (None, (_pointer, _pointer)),
-        "TF_DeleteSession": (None, (_pointer, _pointer)),
-        "TF_SessionRun": (
-            None,
-            (
-                *(_pointer, _pointer),  # session, run options
-                *(ctypes.POINTER(_Output), ctypes.POINTER(_pointer), _int),  # what is fed
-                *(ctypes.POINTER(_Output), ctypes.POINTER(_pointer), _int),  # what is fetched
-                *(_pointer, _int),  # operations to run besides
-                *(_pointer, _pointer),  # run metadata, status
-            ),
+_FUNCTIONS: Mapping[str, tuple[Any, tuple[Any, ...]]] = {
+    "TF_Version": (_string, ()),
+    "TF_NewStatus": (_pointer, ()),
+    "TF_DeleteStatus": (None, (_pointer,)),
+    "TF_GetCode": (_int, (_pointer,)),
+    "TF_Message": (_string, (_pointer,)),
+    "TF_NewBufferFromString": (_pointer, (_string, _size)),
+    "TF_DeleteBuffer": (None, (_pointer,)),
+    "TF_NewGraph": (_pointer, ()),
+    "TF_DeleteGraph": (None, (_pointer,)),
+    "TF_NewImportGraphDefOptions": (_pointer, ()),
+    "TF_DeleteImportGraphDefOptions": (None, (_pointer,)),
+    "TF_GraphImportGraphDef": (None, (_pointer, _pointer, _pointer, _pointer)),
+    "TF_GraphOperationByName": (_pointer, (_pointer, _string)),
+    "TF_OperationNumOutputs": (_int, (_pointer,)),
+    "TF_NewSessionOptions": (_pointer, ()),
+    "TF_DeleteSessionOptions": (None, (_pointer,)),
+    "TF_SetConfig": (None, (_pointer, _string, _size, _pointer)),
+    "TF_NewSession": (_pointer, (_pointer, _pointer, _pointer)),
+    "TF_CloseSession": (None, (_pointer, _pointer)),
+    "TF_DeleteSession": (None, (_pointer, _pointer)),
+    "TF_SessionRun": (
+        None,
+        (
+            *(_pointer, _pointer),  # session, run options
+            *(ctypes.POINTER(_Output), ctypes.POINTER(_pointer), _int),  # what is fed
+            *(ctypes.POINTER(_Output), ctypes.POINTER(_pointer), _int),  # what is fetched
+            *(_pointer, _int),  # operations to run besides
+            *(_pointer, _pointer),  # run metadata, status
         ),
-        "TF_AllocateTensor": (_pointer, (_int, ctypes.POINTER(_int64), _int, _size)),
-        "TF_DeleteTensor": (None, (_pointer,)),
-        "TF_TensorType": (_int, (_pointer,)),
-        "TF_NumDims": (_int, (_pointer,)),
-        "TF_Dim": (_int64, (_pointer, _int)),
-        "TF_TensorByteSize": (_size, (_pointer,)),
-        "TF_TensorData": (_pointer, (_pointer,)),
-    }
-)
+    ),
+    "TF_AllocateTensor": (_pointer, (_int, ctypes.POINTER(_int64), _int, _size)),
+    "TF_DeleteTensor": (None, (_pointer,)),
+    "TF_TensorType": (_int, (_pointer,)),
+    "TF_NumDims": (_int, (_pointer,)),
+    "TF_Dim": (_int64, (_pointer, _int)),
+    "TF_TensorByteSize": (_size, (_pointer,)),
+    "TF_TensorData": (_pointer, (_pointer,)),
+}
 
 
 def load_library(path: str) -> ctypes.CDLL:

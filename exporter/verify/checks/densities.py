@@ -76,8 +76,7 @@ def _rows(trial: Trial, case: Case, count: int, run: int = 0) -> dict[str, np.nd
     feeds = {}
     for spec in trial.signature.inputs:
         array = case.feeds[spec.name]
-        free = bool(spec.shape) and spec.shape[0] is None
-        array = np.repeat(array[:1], count, axis=0) if free else array
+        array = np.repeat(array[:1], count, axis=0) if spec.batched else array
         noise = spec.role is Role.NOISE
         feeds[spec.name] = rng.standard_normal(array.shape).astype(np.float32) if noise else array
     return feeds
