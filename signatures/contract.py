@@ -159,7 +159,8 @@ def parse(content: Any) -> Contract:
         tuple(n.integer(0) for n in source["goals"].items(1000)),
         None if source["activation"].missing else source["activation"].text(),
     )
-    files = {_key(path, entry): _file(entry) for path, entry in whole["files"].members().items()}
+    entries = whole["files"].members()
+    files = {_key(p, e): FileEntry(_sha256(e["sha256"]), e["bytes"].integer(0)) for p, e in entries.items()}
     made = known(
         name=tool["name"].text(),
         version=tool["version"].text(),
@@ -353,10 +354,6 @@ def _sha256(entry: Field) -> str:
     if not isinstance(entry.value, str) or not _SHA256.fullmatch(entry.value):
         raise entry.error("is no sha256 in hexadecimal")
     return entry.value
-
-
-def _file(entry: Field) -> FileEntry:
-    return FileEntry(_sha256(entry["sha256"]), entry["bytes"].integer(0))
 
 
 def _key(path: str, entry: Field) -> str:

@@ -86,11 +86,11 @@ def checked(content: Any, signature: PolicySignature) -> dict[str, Any]:
 def remaining(labels: Mapping[str, Any], signature: PolicySignature) -> dict[str, Any]:
     """The labels of what ``signature`` still has: an export with other options may have left something out."""
     wanted = sizes(signature)
-    named = labels.get("observations", {})
+    named, actions, branches = (labels.get(key, {}) for key in PARTS)
     kept: dict[str, Any] = {
         "observations": {n: t for n, t in named.items() if wanted["observations"].get(n) == len(t)},
-        "actions": labels.get("actions", []) if len(labels.get("actions", [])) == wanted["actions"] else [],
-        "branches": labels.get("branches", []) if _lengths(labels) == wanted["branches"] else [],
+        "actions": actions if len(actions) == wanted["actions"] else [],
+        "branches": branches if [len(texts) for texts in branches] == wanted["branches"] else [],
     }
     return {key: kept[key] for key in PARTS if kept[key]}
 
@@ -104,10 +104,6 @@ def sizes(signature: PolicySignature) -> dict[str, Any]:
         "actions": 0 if continuous is None else continuous.shape[-1] or 0,
         "branches": list(signature.branches),
     }
-
-
-def _lengths(labels: Mapping[str, Any]) -> list[int]:
-    return [len(texts) for texts in labels.get("branches", [])]
 
 
 def _counted(texts: Sequence[object], size: int, where: str, of: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from exporter.cli.group import FILE
-from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines
+from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
 from signatures.errors import UsageError
 from signatures.records import dataclass
 
@@ -136,15 +136,11 @@ class Console:
         self._report(report)
 
     def _notes(self, notes: Sequence[str]) -> None:
-        if not self.quiet:
-            from exporter.tables import paragraph
-
-            for note in notes:
-                say_lines(paragraph(note, "  note: ", "    "))
+        for note in () if self.quiet else notes:
+            say_paragraph(note, "  note: ", "    ")
 
     def _report(self, report: ParityReport) -> None:
         from exporter.reports.summary import comparison_table, failure_lines, not_run_line, parity_table, verdict
-        from exporter.tables import paragraph
 
         if not self.quiet and report.comparisons:
             for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
@@ -152,22 +148,21 @@ class Console:
                 say(line[len(failed) :], mark=failed, colour="red")
         for line in failure_lines(report):
             indent = line[: len(line) - len(line.lstrip())]
-            say_lines(paragraph(line.lstrip(), indent, f"{indent}    "))
+            say_paragraph(line.lstrip(), indent, f"{indent}    ")
         missing = not_run_line(report)
         if not self.quiet and report.passed is not None and missing is not None:
-            say_lines(paragraph(missing, rest="  "))
-        say_lines(paragraph(verdict(report), rest="  "), colour=_COLOURS[report.passed])
+            say_paragraph(missing)
+        say_paragraph(verdict(report), colour=_COLOURS[report.passed])
 
     def whole(self, reports: Sequence[ParityReport]) -> None:
         """What came of several policies, in one line."""
         if len(reports) < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
             return
         from exporter.reports.summary import whole_summary
-        from exporter.tables import paragraph
 
         verdicts = {r.passed for r in reports}
         colour = _COLOURS[False if False in verdicts else None if None in verdicts else True]
-        say_lines(paragraph(whole_summary(reports), rest="  "), colour=colour)
+        say_paragraph(whole_summary(reports), colour=colour)
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""
@@ -180,15 +175,13 @@ class Console:
             ]
             self.json({"profiles": entries})
             return
-        from exporter.tables import paragraph
-
         width = max(len(p.name) for p in PROFILES)
         indent = " " * (width + 2)
         for profile in PROFILES:
-            say_lines(paragraph(profile.purpose, f"{profile.name:{width}}  ", indent))
+            say_paragraph(profile.purpose, f"{profile.name:{width}}  ", indent)
             details = [f"writes {', '.join(profile.formats)}"]
             details += [f"also called {', '.join(profile.aliases)}"] if profile.aliases else []
-            say_lines(paragraph("; ".join(details), indent, indent))
+            say_paragraph("; ".join(details), indent, indent)
 
     def next_step(self, results: Sequence[ExportResult], names: str, profile: str | None = None) -> None:
         """What to do next, in a line or two."""
@@ -209,10 +202,7 @@ class Console:
             say(f"next: {typed('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
-            from exporter.tables import paragraph
-
-            note = "note: Unity looks up other names: export with --for unity6 (--for help: the others)"
-            say_lines(paragraph(note, rest="  "))
+            say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
         say(f"next: {_next(results)}")
 
     def json(self, content: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from exporter.cli.terminal import say, say_json, say_lines
+from exporter.cli.terminal import say, say_json, say_lines, say_paragraph
 from signatures.errors import UsageError
 
 #: Part of the confinement of a runtime's process → what it means.
@@ -25,7 +25,7 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
         return
     from converters.runtimes.confinement import in_force
     from converters.runtimes.registry import available_runtimes
-    from exporter.tables import paragraph, table
+    from exporter.tables import table
 
     found = available_runtimes()
     kept = in_force()
@@ -40,9 +40,9 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     say()
     if held:
         sandbox = " (a browser has its own sandbox)" if not lacking else ""
-        say_lines(paragraph(f"{', '.join(held)}{sandbox}", "a runtime's process ", "  "))
+        say_paragraph(f"{', '.join(held)}{sandbox}", "a runtime's process ")
     if lacking:
-        say_lines(paragraph(", ".join(lacking), "not on this system: ", "  "))
+        say_paragraph(", ".join(lacking), "not on this system: ")
 
 
 @runtimes_command.command("install")

@@ -37,6 +37,13 @@ def say_lines(text: str, *, colour: str | None = None, keep: str = "", err: bool
     _echo(safe if colour is None else click.style(safe, fg=colour), err=err, nl=nl)
 
 
+def say_paragraph(text: str, first: str = "", rest: str = "  ", *, colour: str | None = None) -> None:
+    """Print one text after ``first``, wrapped with ``rest`` before the lines that follow."""
+    from exporter.tables import paragraph
+
+    say_lines(paragraph(text, first, rest), colour=colour)
+
+
 def _inert(text: str) -> str:
     """A text in which no log of a CI finds a command."""
     return _COMMANDS.sub(lambda found: found[0] + _UNSEEN, text)

@@ -79,7 +79,8 @@ class _Candidate:
     def fed(self, feeds: Feeds) -> dict[str, np.ndarray]:
         """What it is fed, by its own names, for the reference's inputs."""
         rows = next((len(a) for a in feeds.values() if a.ndim), 1)
-        given = {p.name: _cast(feeds[name], p.dtype) for name, p in self.inputs.items()}
+        own = [(p, feeds[name]) for name, p in self.inputs.items()]
+        given = {p.name: array.astype(p.dtype or array.dtype, copy=False) for p, array in own}
         ranks = {p.name: len(p.shape or ()) for p in self.ports.inputs}
         for name, value in self.constant.items():
             given[name] = np.full([1] * ranks[name], rows, np.int32) if value is None else np.asarray(value)
@@ -443,7 +444,3 @@ def _renamed(candidate: _Candidate, model: LoadedModel) -> Run:
         return [{n: answer[candidate.outputs[n]] for n in fetch} for answer in answers]
 
     return run
-
-
-def _cast(array: np.ndarray, dtype: str | None) -> np.ndarray:
-    return array if dtype is None or array.dtype.name == dtype else array.astype(dtype)

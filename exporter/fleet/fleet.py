@@ -133,7 +133,8 @@ class _Crew:
                     outcome = self._heard(worker)
                     if outcome is None:
                         continue
-                    self._settle(worker.at)
+                    self.turns.ends(worker.at)
+                    self._give_names()
                     self._next(worker, next(todo, None))
                     yield outcome
 
@@ -159,10 +160,6 @@ class _Crew:
             return None
         assert isinstance(message, Outcome)
         return message
-
-    def _settle(self, index: int) -> None:
-        self.turns.ends(index)
-        self._give_names()
 
     def _give_names(self) -> None:
         for _, worker, names in self.turns.answers():

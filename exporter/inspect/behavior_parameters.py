@@ -9,7 +9,7 @@ import textwrap
 
 from converters.targets.unity.checker import UnityVerdict
 from converters.targets.unity.findings import Thrown
-from exporter.reports.markup import Markup, el
+from exporter.reports.markup import Markup, el, svg_file
 
 _WIDTH, _LINE, _MARGIN, _VALUE = 560, 22, 16, 250
 _LETTERS = 78
@@ -51,29 +51,25 @@ def behavior_parameters(verdict: UnityVerdict) -> str:
         parts += [el("text", line, x=_MARGIN + 10, y=y + 5 + 18 * i) for i, line in enumerate(lines)]
         y += height + 8
     title = f"Behavior Parameters for {verdict.path.name}, {verdict.consumer.title}"
-    drawing = el(
-        "svg",
+    return svg_file(
         el("title", title),
         el("style", Markup(_STYLE)),
         el("rect", class_="paper", x=1, y=1, width=_WIDTH - 2, height=y - 2, rx=6),
         *parts,
-        xmlns="http://www.w3.org/2000/svg",
-        viewBox=f"0 0 {_WIDTH} {y}",
         width=_WIDTH,
         height=y,
-        role="img",
     )
-    return f"{drawing}\n"
 
 
 def _rows(verdict: UnityVerdict) -> list[Row]:
     brain = verdict.brain
+    vector = next((s.shape[0] for s in reversed(brain.sensors) if len(s.shape) == 1), 0)
     modes = [mode for mode, said in verdict.accepted.items() if said]
     rows: list[Row] = [
         (0, f"Behavior Parameters (Script)        {verdict.consumer.package}", None),
         (0, "Behavior Name", verdict.path.stem),
         (0, "Vector Observation", None),
-        (1, "Space Size", str(brain.vector_observation_size or _vector(verdict))),
+        (1, "Space Size", str(brain.vector_observation_size or vector)),
         (1, "Stacked Vectors", str(brain.stacked)),
         (0, "Actions", None),
         (1, "Continuous Actions", str(brain.continuous)),
@@ -88,10 +84,6 @@ def _rows(verdict: UnityVerdict) -> list[Row]:
         rows.append((0, "Sensor components, in the order of their names", None))
         rows += [(1, f"{i} {s.name}", "×".join(map(str, s.shape))) for i, s in others]
     return rows
-
-
-def _vector(verdict: UnityVerdict) -> int:
-    return next((s.shape[0] for s in reversed(verdict.brain.sensors) if len(s.shape) == 1), 0)
 
 
 def _messages(verdict: UnityVerdict) -> list[tuple[str, bool]]:

@@ -88,7 +88,7 @@ def _verdict_text(verdict: UnityVerdict) -> str:
     else:
         assumed = " (assumed from the file)" if verdict.assumed else ""
         lines += [printable(f"  the agent{assumed}: {_agent_text(verdict.brain)}")]
-        same = len({_outcome(m) for m in verdict.modes.values()}) == 1
+        same = len({(m.load, m.checks, m.check_throws) for m in verdict.modes.values()}) == 1
         for mode, found in list(verdict.modes.items())[: 1 if same else None]:
             lines += _mode_lines("" if same else f", {_MODES[mode]}", found)
     if verdict.misread:
@@ -103,10 +103,6 @@ def _verdict_text(verdict: UnityVerdict) -> str:
 def _summary(verdict: UnityVerdict) -> str:
     yes = [_MODES[mode] for mode, said in verdict.accepted.items() if said]
     return "accepted" if len(yes) == len(_MODES) else f"accepted with {yes[0]} only" if yes else "not accepted"
-
-
-def _outcome(found: ModeVerdict) -> tuple[Any, ...]:
-    return found.load, found.checks, found.check_throws
 
 
 def _mode_lines(title: str, found: ModeVerdict) -> list[str]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from exporter.reports.layers import Block
 from exporter.reports.layout import layout
-from exporter.reports.markup import Markup, el
+from exporter.reports.markup import Markup, el, svg
 from exporter.verify.difference import BINS, FIRST, LAST
 from exporter.verify.findings import Finding
 
@@ -62,7 +62,7 @@ def histograms(output: str, comparisons: Sequence[Finding]) -> Markup:
             x = edge(min(max(math.log10(c.tolerance.atol), first), last))
             parts.append(el("line", class_="bound", x1=x, x2=x, y1=base - 20, y2=base))
     described = f"{output}: histogram of absolute differences for {len(comparisons)} comparisons, in decades"
-    return _svg(parts, right + 12, bottom + 22, described)
+    return svg(parts, width=right + 12, height=bottom + 22, aria_label=described)
 
 
 def _decades(comparisons: Sequence[Finding]) -> tuple[float, float]:
@@ -125,7 +125,8 @@ def drift(output: str, comparisons: Sequence[Finding], pairs: Sequence[tuple[str
             el("polyline", title, class_=f"line {colour}", points=" ".join(f"{a:.1f},{b:.1f}" for a, b in points))
         )
         parts += [el("circle", class_=f"dot {colour}", cx=a, cy=b, r=2.5) for a, b in points]
-    return _svg(parts, right + 8, bottom + 38, f"{output}: worst difference per step with the memory fed back")
+    described = f"{output}: worst difference per step with the memory fed back"
+    return svg(parts, width=right + 8, height=bottom + 38, aria_label=described)
 
 
 def colour_of(number: int) -> str:
@@ -136,7 +137,7 @@ def colour_of(number: int) -> str:
 def diagram(blocks: Sequence[Block]) -> Markup:
     """The layers of a policy as boxes, from its inputs at the top to its outputs at the bottom."""
     parts, width, height, described = diagram_parts(blocks)
-    return _svg(parts, width, height, described)
+    return svg(parts, width=width, height=height, aria_label=described)
 
 
 def diagram_parts(blocks: Sequence[Block]) -> tuple[list[Markup], float, float, str]:
@@ -173,18 +174,6 @@ def diagram_parts(blocks: Sequence[Block]) -> tuple[list[Markup], float, float, 
     described = f"Layers from {names['input']} to {names['output']}: {layers}"
     height = placed.height
     return parts, math.ceil(placed.width), height, described
-
-
-def _svg(parts: Sequence[Markup], width: float, height: float, described: str) -> Markup:
-    return el(
-        "svg",
-        parts,
-        viewBox=f"0 0 {width:g} {height:g}",
-        width=float(width),
-        height=float(height),
-        role="img",
-        aria_label=described,
-    )
 
 
 def _power(exponent: int) -> Markup:

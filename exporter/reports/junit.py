@@ -42,7 +42,9 @@ def _suites(entry: Entry) -> Iterable[ET.Element]:
             ET.SubElement(properties, "property", name=name, value=_text(value))
         for (label, runtime, output), comparisons in ran.get(kind, {}).items():
             place = f"{report.policy}.{label}.{runtime}"
-            case = ET.SubElement(suite_element, "testcase", classname=_text(place), name=_text(_case_name(output)))
+            case = ET.SubElement(
+                suite_element, "testcase", classname=_text(place), name=_text("runs" if output == "*" else output)
+            )
             _outcome(case, comparisons)
         for runtime, reason in missing.get(kind, {}).items():
             place = f"{report.policy}.{kind}.{runtime}"
@@ -62,10 +64,6 @@ def _properties(entry: Entry, kind: str) -> Iterable[tuple[str, str]]:
         version = report.runtimes.get(name, {}).get("version")
         if version:
             yield f"version.{name}", version
-
-
-def _case_name(output: str) -> str:
-    return "runs" if output == "*" else output
 
 
 def _outcome(case: ET.Element, comparisons: Sequence[Finding]) -> None:

@@ -193,7 +193,7 @@ def _described(block: Block, graph: Graph) -> tuple[str, str]:
             words.append(f"dense {width}")
     elif _has_weights(first):
         words.append("matrix product" if traits(first).layer == "dense" else "convolution")
-    elif _normalises(ops):
+    elif "Sub" in ops and ("RealDiv" in ops or "Mul" in ops) and sum(ops.values()) <= _NORMALISER:
         words.append("normalise")
     elif any(map(_draws, block.nodes)):
         words.append("draw")
@@ -203,12 +203,8 @@ def _described(block: Block, graph: Graph) -> tuple[str, str]:
     return ", ".join(words), " · ".join(op if n == 1 else f"{op} ×{n}" for op, n in ops.items())
 
 
-def _normalises(ops: Mapping[str, int]) -> bool:
-    return "Sub" in ops and ("RealDiv" in ops or "Mul" in ops) and sum(ops.values()) <= _NORMALISER
-
-
 def _activations(nodes: Iterable[Node], ops: Mapping[str, int], *, lstm: bool) -> list[str]:
-    names = sorted({traits(n).activation for n in nodes} - {""}, key=_last_of_all)
+    names = sorted({traits(n).activation for n in nodes} - {""}, key=lambda name: (name == "softmax", name))
     if lstm:
         names = [n for n in names if n not in _GATES]
     words = ["swish" if n == "sigmoid" and ops.get("Mul") else n for n in names]
@@ -221,11 +217,6 @@ def _activations(nodes: Iterable[Node], ops: Mapping[str, int], *, lstm: bool) -
     if ops.get("ArgMax"):
         words.append("argmax")
     return words
-
-
-def _last_of_all(activation: str) -> tuple[bool, str]:
-    """A softmax comes after the other activations of its box."""
-    return activation == "softmax", activation
 
 
 def _plain_title(nodes: Sequence[Node]) -> str:

@@ -45,6 +45,18 @@ def el(tag: str, /, *children: Child, **attributes: str | int | float | None) ->
     return Markup(opening if tag in _VOID else f"{opening}{escaped(children)}</{tag}>")
 
 
+def svg(*children: Child, width: float, height: float, **more: str | None) -> Markup:
+    """A picture of so many pixels."""
+    xmlns, box = more.pop("xmlns", None), f"0 0 {width:g} {height:g}"
+    sizes = {"width": float(width), "height": float(height)}
+    return el("svg", *children, xmlns=xmlns, viewBox=box, **sizes, role="img", **more)
+
+
+def svg_file(*children: Child, width: float, height: float) -> str:
+    """A picture as a file of its own."""
+    return f"{svg(*children, width=width, height=height, xmlns='http://www.w3.org/2000/svg')}\n"
+
+
 def notebook(title: str, *tables: tuple[Sequence[str], Rows]) -> Markup:
     """A result as a notebook shows it, in its own style: a line of text, and tables of a head and rows."""
     return el("div", el("p", title), [_table(head, rows) for head, rows in tables], class_=_PLAIN)

@@ -9,7 +9,7 @@ from typing import Any
 from converters.policy import Policy
 from exporter.reports.charts import diagram_parts
 from exporter.reports.layers import Block, blocks_of
-from exporter.reports.markup import Markup, el
+from exporter.reports.markup import Markup, el, svg_file
 from signatures.errors import UsageError
 from signatures.spec import TensorSpec
 
@@ -53,8 +53,7 @@ def picture(policy: Policy) -> str:
     line = f"{signature.family}, {signature.action_space} actions"
     width = max(inner, _TITLE * len(policy.name), _LINE * len(line)) + 2 * _MARGIN
     height += _HEAD + _MARGIN
-    drawing = el(
-        "svg",
+    return svg_file(
         el("title", f"{policy.name}: {line}"),
         el("desc", described),
         el("style", Markup(_STYLE)),
@@ -62,13 +61,9 @@ def picture(policy: Policy) -> str:
         el("text", policy.name, class_="name", x=_MARGIN, y=34),
         el("text", line, class_="line", x=_MARGIN, y=55),
         el("g", parts, transform=f"translate({(width - inner) / 2:g} {_HEAD})"),
-        xmlns="http://www.w3.org/2000/svg",
-        viewBox=f"0 0 {width:g} {height:g}",
         width=width,
         height=height,
-        role="img",
     )
-    return f"{drawing}\n"
 
 
 def _sized(block: Block, specs: Mapping[str, TensorSpec], labels: Mapping[str, Any]) -> Block:

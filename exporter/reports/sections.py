@@ -36,17 +36,14 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Child]], nu
         first, *rest = row
         cells: list[Child] = [el("th", first, scope="row")]
         for cell, kind in zip(rest, kinds[1:], strict=True):
-            cells.append(cell if _is_cell(cell) else el("td", cell, class_=kind))
+            is_cell = isinstance(cell, Markup) and cell.startswith("<td")
+            cells.append(cell if is_cell else el("td", cell, class_=kind))
         body.append(el("tr", cells))
     small = "small" if len(head) < 4 else None
     whole = el(
         "table", el("caption", el("span", caption)), el("thead", el("tr", heads)), el("tbody", body), class_=small
     )
     return el("div", whole, class_="scroll", tabindex=0, role="region", aria_label=caption)
-
-
-def _is_cell(cell: Child) -> bool:
-    return isinstance(cell, Markup) and cell.startswith("<td")
 
 
 def _wide(*content: Child) -> Markup:

@@ -24,7 +24,8 @@ _MAIN = "main.mjs"
 
 def one_file(site: Mapping[str, bytes]) -> bytes:
     """The files of a site (by path) as one HTML file. Raises DamagedFileError where a file of the bundle is no JSON."""
-    script = f'"use strict";\n{_bundled(site)}'
+    bundled = "\n".join(_as_function(name, _without_comments(site[name].decode())) for name in modules_of(site))
+    script = f'"use strict";\n{bundled}'
     style = _without_comments(site["page.css"].decode())
     files = {name: _embedded(name, data) for name, data in sorted(site.items()) if PurePosixPath(name).suffix in DATA}
     held = _as_json(files).replace("<", "\\u003c")
@@ -86,11 +87,6 @@ def modules_of(site: Mapping[str, bytes]) -> list[str]:
 
     visit(_MAIN)
     return list(done)
-
-
-def _bundled(site: Mapping[str, bytes]) -> str:
-    """The modules as functions that give what they export."""
-    return "\n".join(_as_function(name, _without_comments(site[name].decode())) for name in modules_of(site))
 
 
 def _as_function(name: str, text: str) -> str:

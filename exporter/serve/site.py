@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -114,7 +114,8 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
     policy = _checked(folder)
     found = scene_of(policy.name, policy.signature, scene)
     opponent = None if found is None or found.side is None else _opponent(policy, found)
-    site = {path.relative_to(PAGE).as_posix(): path.read_bytes() for path in sorted(PAGE.rglob("*")) if _ours(path)}
+    own = sorted(path for path in PAGE.rglob("*") if path.is_file() and path.suffix in TYPES)
+    site = {path.relative_to(PAGE).as_posix(): path.read_bytes() for path in own}
     if found is not None:
         site[_VIEWS] = f'import {{ viewOf as own }} from "./{found.id}.mjs";\nexport const viewOf = own;\n'.encode()
     site["policy.mjs"] = POLICY_MODULE.read_bytes()
@@ -158,13 +159,7 @@ def _asking_at_once(site: Mapping[str, bytes]) -> bytes:
 def write_site(site: Mapping[str, bytes], place: Path) -> None:
     """Write a site, in place of an older one of ours. Raises BundleError where something else is in the way."""
     with writing(place):
-        if place.is_symlink() or (place.exists() and not _replaceable(place)):
-            raise BundleError(
-                "already exists and is not a page of ours",
-                where=str(place),
-                why=f"it has no {SITE} that says so",
-                fix="move it, or choose another folder with --out",
-            )
+        _check_free(place, _is_site, f"it has no {SITE} that says so", "folder")
         with stage(place) as new:
             for name, data in site.items():
                 target = new / name
@@ -176,16 +171,20 @@ def write_site(site: Mapping[str, bytes], place: Path) -> None:
 def write_file(page: bytes, place: Path) -> None:
     """Write a page of one file, in place of an older one. Raises BundleError where something else is in the way."""
     with writing(place):
-        if place.is_symlink() or (place.exists() and not _is_page(place)):
-            raise BundleError(
-                "already exists and is not a page of ours",
-                where=str(place),
-                why=f"it does not say that {MADE_BY} wrote it",
-                fix="move it, or choose another name with --out",
-            )
+        _check_free(place, _is_page, f"it does not say that {MADE_BY} wrote it", "name")
         with stage(place) as new:
             (new / place.name).write_bytes(page)
             (new / place.name).replace(place)
+
+
+def _check_free(place: Path, is_ours: Callable[[Path], bool], why: str, other: str) -> None:
+    if place.is_symlink() or (place.exists() and not is_ours(place)):
+        raise BundleError(
+            "already exists and is not a page of ours",
+            where=str(place),
+            why=why,
+            fix=f"move it, or choose another {other} with --out",
+        )
 
 
 def _is_page(place: Path) -> bool:
@@ -195,7 +194,7 @@ def _is_page(place: Path) -> bool:
         return MARK in file.read(_HEAD)
 
 
-def _replaceable(place: Path) -> bool:
+def _is_site(place: Path) -> bool:
     if not place.is_dir():
         return False
     if not any(place.iterdir()):
@@ -205,10 +204,6 @@ def _replaceable(place: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(content, dict) and content.get("made_by") == MADE_BY
-
-
-def _ours(path: Path) -> bool:
-    return path.is_file() and path.suffix in TYPES
 
 
 def _checked(folder: Path) -> Bundle:

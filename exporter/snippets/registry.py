@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from string import Template
 from typing import Any
@@ -44,18 +44,16 @@ TARGETS: tuple[Target, ...] = (
 )
 
 
-def _of_formats() -> Iterator[Target]:
-    """The snippets that formats bring themselves."""
-    for found in WRITTEN.values():
-        for code in found.snippets:
-            yield Target(code.name, code.title, code.language, (found.key,), partial(_filled, found, code))
-
-
 def _filled(found: Format, code: Code, bundle: Bundle) -> str:
     return Template(code.text).substitute(path=quoted(bundle.path(found.main_of(bundle.name))))
 
 
-TARGETS += tuple(_of_formats())
+# The snippets that formats bring themselves.
+TARGETS += tuple(
+    Target(code.name, code.title, code.language, (found.key,), partial(_filled, found, code))
+    for found in WRITTEN.values()
+    for code in found.snippets
+)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +58,6 @@ class Bisector:
         self._stack = contextlib.ExitStack()
         self._sources: dict[str, str] | None = None
         self._compared: set[Path] = set()
-        self._own: Graph | None = None
 
     def close(self) -> None:
         """Free what was loaded to look inside."""
@@ -89,7 +88,7 @@ class Bisector:
         if participant.path is None or participant.fed is not None or participant.path in self._compared:
             return []
         self._compared.add(participant.path)
-        if not self._differing(self._runnable(), participant, feeds):
+        if not self._differing(self._runnable, participant, feeds):
             return []
         graph = self.graph()  # a bundle's graph is that of its .bytes, which may be what is wrong
         return [] if graph is None else self._differing(graph, participant, feeds)
@@ -125,7 +124,7 @@ class Bisector:
         return self._graph
 
     def _graphs(self) -> Iterator[Graph]:
-        yield self._runnable()
+        yield self._runnable
         with contextlib.suppress(ExportModelError, OSError):
             yield runnable(read_graph(self.tested.reference.read_bytes()))
         saved = self.tested.artefacts.get("saved_model")
@@ -133,10 +132,9 @@ class Bisector:
             with contextlib.suppress(ExportModelError, OSError):
                 yield runnable(saved_graph(saved))
 
+    @cached_property
     def _runnable(self) -> Graph:
-        if self._own is None:
-            self._own = runnable(self.tested.graph)
-        return self._own
+        return runnable(self.tested.graph)
 
     def _within(self, participant: Participant) -> InnerTensors:
         key = (participant.name, participant.runtime)

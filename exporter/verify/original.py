@@ -41,9 +41,6 @@ class Original:
         #: an action without chance → the action it belongs to
         self.plain = {head.plain.name: head.spec for head in signature.heads if head.plain is not None}
 
-    def _drawn(self, name: str) -> bool:
-        return self.signature.output(name).role is Role.SAMPLED
-
     def _derivable(self, spec: TensorSpec) -> bool:
         if spec.name in {h.name for h in self.signature.heads}:
             return False
@@ -82,7 +79,8 @@ class Original:
 
     def _answers(self, feeds: Arrays) -> dict[str, np.ndarray]:
         placed = self._feeds(feeds, zero_noise=False)
-        fetches = {name: self.source.fetches[name] for name in self.source.fetches if not self._drawn(name)}
+        asked = self.source.fetches.items()
+        fetches = {name: tensor for name, tensor in asked if self.signature.output(name).role is not Role.SAMPLED}
         logits = [b for b in self.source.branches if b is not None] if self._has_logits() else []
         parts = {s.name: self.source.parts[s.name] for s in self.signature.outputs if s.name in self.source.parts}
         tensors = [*fetches.values(), *(p.tensor for given in parts.values() for p in given), *logits]

@@ -18,13 +18,12 @@ from converters.runtimes.base import Runtime, RuntimeInfo
 from converters.runtimes.javascript.node import (
     INSTALL_NODE,
     INSTALL_TFJS,
-    JS_SOURCE,
     SPEEDS,
-    check_packages,
     install_packages,
     js_home,
     node_executable,
     package_version,
+    runner_command,
 )
 from signatures.errors import RuntimeUnavailableError
 
@@ -88,16 +87,12 @@ def _find(name: str, packages: tuple[str, ...]) -> RuntimeInfo:
 
 
 def _command(name: str) -> list[str]:
-    node, chromium = node_executable(), chromium_executable()
-    if node is None or chromium is None:
-        what = "Node" if node is None else "Chromium"
+    chromium = chromium_executable()
+    if chromium is None and node_executable() is not None:
         raise RuntimeUnavailableError(
-            f"{what} is not installed",
-            fix=INSTALL_NODE if node is None else f"{INSTALL_CHROMIUM}, or let {CHROMIUM_VARIABLE} name it",
+            "Chromium is not installed", fix=f"{INSTALL_CHROMIUM}, or let {CHROMIUM_VARIABLE} name it"
         )
-    known = ["--known"] if check_packages(js_home()) else []
-    script = str(JS_SOURCE / "browser.mjs")
-    return [node, script, "--runtime", name, "--modules", str(js_home()), "--chromium", chromium, *known]
+    return runner_command("browser.mjs", name, "--chromium", str(chromium))
 
 
 def _runtime(name: str, kind: str, *packages: str, arithmetic: Arithmetic = "processor") -> Runtime:

@@ -187,16 +187,22 @@ def _find(name: str, packages: tuple[str, ...], install: str) -> RuntimeInfo:
     return RuntimeInfo(name, has_node and has_packages, versions[0] if has_packages else None, " && ".join(steps))
 
 
-def _command(name: str) -> list[str]:
+def node_command(script: Path, *arguments: str) -> list[str]:
+    """The command that runs ``script``. Raises RuntimeUnavailableError where Node is not installed."""
     node = node_executable()
     if node is None:
         raise RuntimeUnavailableError("Node is not installed", fix=INSTALL_NODE)
-    known = ["--known"] if check_packages(js_home()) else []
-    return [node, str(JS_SOURCE / "runner.mjs"), "--runtime", name, "--modules", str(js_home()), *known]
+    return [node, str(script), *arguments]
+
+
+def runner_command(script: str, name: str, *arguments: str) -> list[str]:
+    """The command of a runtime of npm packages, by a script in ``js/``. Raises RuntimeUnavailableError."""
+    command = node_command(JS_SOURCE / script, "--runtime", name, "--modules", str(js_home()), *arguments)
+    return [*command, "--known"] if check_packages(js_home()) else command
 
 
 def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Runtime:
-    find, command = partial(_find, name, packages, how), partial(_command, name)
+    find, command = partial(_find, name, packages, how), partial(runner_command, "runner.mjs", name)
     return Runtime(
         *(name, find, command, install_packages),
         sessions_alike=format_ == "onnx",

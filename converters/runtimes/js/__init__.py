@@ -8,8 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from converters.runtimes.base import Runtime, RuntimeInfo
-from converters.runtimes.javascript.node import INSTALL_NODE, node_executable
-from signatures.errors import RuntimeUnavailableError
+from converters.runtimes.javascript.node import INSTALL_NODE, node_command, node_executable
 
 KERNELS = Path(__file__).resolve().parent / "kernels"
 """The modules that a page takes as well; ``model.mjs`` is the one to import."""
@@ -24,10 +23,7 @@ def _find() -> RuntimeInfo:
 
 
 def _command() -> list[str]:
-    node = node_executable()
-    if node is None:
-        raise RuntimeUnavailableError("Node is not installed", fix=INSTALL_NODE)
-    return [node, str(KERNELS.with_name("runner.mjs")), _VERSION]
+    return node_command(KERNELS.with_name("runner.mjs"), _VERSION)
 
 
 RUNTIMES = (

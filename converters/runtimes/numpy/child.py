@@ -7,7 +7,8 @@ What no other runtime loads (a ``.nn``, formats that name numpy alone) runs here
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,34 +25,23 @@ from signatures.errors import ExportModelError
 
 
 class _Model:
-    def __init__(self, graph: Graph) -> None:
-        self.graph = graph
+    def __init__(self, compute: Callable[[Tensors, Sequence[str], Jitter | None], Tensors]) -> None:
+        self.compute = compute
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        return run_graph(self.graph, feeds, fetch, _jitter(request))
+        seed = request.get("jitter")
+        jitter = None if seed is None else Jitter(seed, request.get("arithmetic", "processor"))
+        return self.compute(feeds, fetch, jitter)
 
 
-class _NnModel:
-    def __init__(self, data: bytes) -> None:
-        from converters.barracuda.answers import NnPolicy
-
-        self.policy = NnPolicy(data)
-
-    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        return self.policy.run(feeds, fetch, _jitter(request))
-
-
-def _jitter(request: Mapping[str, Any]) -> Jitter | None:
-    seed = request.get("jitter")
-    return None if seed is None else Jitter(seed, request.get("arithmetic", "processor"))
-
-
-def _load(header: Mapping[str, Any]) -> _Model | _NnModel:
+def _load(header: Mapping[str, Any]) -> _Model:
     reseed(int(header.get("seed", 0)))
     path, key = Path(header["path"]), header.get("format", "bytes")
-    if key == "bytes":
-        return _Model(read_runnable(path.read_bytes()))
-    return _NnModel(path.read_bytes()) if key == "nn" else _Model(_read_back(path, key))
+    if key == "nn":
+        from converters.barracuda.answers import NnPolicy
+
+        return _Model(NnPolicy(path.read_bytes()).run)
+    return _Model(partial(run_graph, read_runnable(path.read_bytes()) if key == "bytes" else _read_back(path, key)))
 
 
 def _read_back(path: Path, key: str) -> Graph:

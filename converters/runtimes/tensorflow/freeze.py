@@ -114,7 +114,8 @@ def keras_call(model: Any) -> tuple[Callable[..., Any], list[Any], list[str]]:
     """(what a Keras model computes at inference, its arguments' TensorSpecs with a free batch, their names)."""
     import tensorflow as tf  # noqa: TID251  the model proves that it is loaded
 
-    names = [_argument(t.name, i) for i, t in enumerate(model.inputs)]
+    # A layer's name as an argument's: what comes after the last slash, without the output's number.
+    names = [t.name.split(":")[0].rsplit("/", 1)[-1] or f"input_{i}" for i, t in enumerate(model.inputs)]
     specs = [
         tf.TensorSpec([None, *t.shape[1:]], t.dtype, name=name) for name, t in zip(names, model.inputs, strict=True)
     ]
@@ -168,8 +169,3 @@ def named_function(call: Callable[..., Any], specs: Sequence[Any], keys: Callabl
         return dict(zip(keys(len(results)), results, strict=True))
 
     return tf.function(named).get_concrete_function(*specs)
-
-
-def _argument(name: str, number: int) -> str:
-    """A layer's name as an argument's: what comes after the last slash, without the output's number."""
-    return name.split(":")[0].rsplit("/", 1)[-1] or f"input_{number}"

@@ -42,9 +42,5 @@ def _install(release: Release, progress: Progress) -> Path:
     return install(release, progress)
 
 
-def _runtime(release: Release) -> Runtime:
-    # A library of an old TensorFlow reads frozen graphs; SavedModels would need the wheel's Python code.
-    return Runtime(release.runtime, partial(_find, release), partial(_command, release), partial(_install, release))
-
-
-RUNTIMES = tuple(_runtime(release) for release in RELEASES)
+#: A library of an old TensorFlow reads frozen graphs; SavedModels would need the wheel's Python code.
+RUNTIMES = tuple(Runtime(r.runtime, partial(_find, r), partial(_command, r), partial(_install, r)) for r in RELEASES)

@@ -7,23 +7,12 @@ this process, not its parent.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from converters.runtimes.child import claim_stdout, serve
 from converters.runtimes.tensorflow1.library import LegacyError, LegacySession, library_version, load_library
-from converters.runtimes.wire import Tensors
-
-
-class _Model:
-    """A session as converters.runtimes.child wants it."""
-
-    def __init__(self, session: LegacySession) -> None:
-        self.session = session
-
-    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        return self.session.run(feeds, fetch)
 
 
 def main() -> None:
@@ -32,8 +21,8 @@ def main() -> None:
     name, path = sys.argv[1:]
     library = load_library(path)
 
-    def load(header: Mapping[str, Any]) -> _Model:
-        return _Model(LegacySession(Path(header["path"]).read_bytes(), library))
+    def load(header: Mapping[str, Any]) -> LegacySession:
+        return LegacySession(Path(header["path"]).read_bytes(), library)
 
     serve(name, library_version(library), load, (LegacyError,), out)
 

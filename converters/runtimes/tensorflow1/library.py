@@ -158,7 +158,7 @@ class LegacySession:
             library.TF_DeleteSessionOptions(options)
         return session
 
-    def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> dict[str, np.ndarray]:
+    def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str], _: object = None) -> dict[str, np.ndarray]:
         """Values of the tensors in ``fetch``, by the names they were asked under; any tensor may be fed."""
         inputs = (_Output * len(feeds))(*(self._output(name) for name in feeds))
         outputs = (_Output * len(fetch))(*(self._output(name) for name in fetch))

@@ -73,7 +73,8 @@ def _started_alike(
     single = _one_row_at_a_time(participant)
     count = STARTS if single or any(s.role is Role.VISUAL for s in trial.signature.inputs) else DRAWS
     shown: dict[int, int] = {}
-    for branch, part in enumerate(np.split(np.exp(log_probs.astype(np.float64)), _edges(trial), axis=1)):
+    edges = np.cumsum(trial.signature.branches)[:-1]
+    for branch, part in enumerate(np.split(np.exp(log_probs.astype(np.float64)), edges, axis=1)):
         same = np.square(part / part.sum(axis=1, keepdims=True)).sum(axis=1)
         if same.min() ** count < FALSE_ALARM:
             shown[branch] = int(same.argmin())
@@ -99,10 +100,6 @@ def _of_rows(run: Run, action: str, rows: Sequence[Feeds], count: int, *, single
         inputs = [{n: np.repeat(a, count, axis=0) for n, a in row.items()} for row in rows]
     drawn = [answer[action] for answer in run(inputs, [action])]
     return np.concatenate(drawn).reshape(len(rows), count, -1)
-
-
-def _edges(trial: Trial) -> np.ndarray:
-    return np.cumsum(trial.signature.branches)[:-1]
 
 
 def _one_row_at_a_time(participant: Participant) -> bool:
