@@ -1,17 +1,20 @@
-"""Names of the policies of a run: each its own, whatever the sources are called."""
+"""Names of the policies of a run: each its own, whatever the sources are called and whoever exports them."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import field
 from pathlib import Path, PurePath, PurePosixPath
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from converters.fetch import address_of, shown
 from signatures.contract import safe_name
+from signatures.records import dataclass
 
 #: A name, and why it is another than the source's.
 Claimed = tuple[str, str | None]
+Who = TypeVar("Who")
 
 
 class Naming(Protocol):
@@ -45,6 +48,49 @@ class Names:
         found = next(wish for wish in wishes if wish.casefold() not in self._taken)
         self._taken[found.casefold()] = path
         return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {shown(other)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What a worker asks: names for the policies of its source."""
+
+    path: Path
+    names: Sequence[str]
+
+
+@dataclass
+class Turns(Generic[Who]):
+    """Who waits for names: each until all sources before its own have theirs, or have ended without; so names do not
+    depend on who is quick.
+    """
+
+    names: Names
+    _asking: dict[int, tuple[Who, Claim]] = field(default_factory=dict)
+    _ended: set[int] = field(default_factory=set)
+    _first: int = 0
+
+    def asks(self, number: int, who: Who, claim: Claim) -> None:
+        """Someone asks for the names of a source."""
+        self._asking[number] = (who, claim)
+
+    def ends(self, number: int) -> None:
+        """A source has ended."""
+        self._asking.pop(number, None)
+        if number >= self._first:
+            self._ended.add(number)
+
+    def answers(self) -> Iterator[tuple[int, Who, list[Claimed]]]:
+        """Those whose turn it is: the source's number, who asked, and the names."""
+        while True:
+            number = self._first
+            if number in self._ended:
+                self._ended.remove(number)
+            elif number not in self._asking:
+                return
+            self._first += 1
+            if number in self._asking:
+                who, claim = self._asking.pop(number)
+                yield number, who, self.names.claim(claim.path, claim.names)
 
 
 def _wishes(path: Path, name: str) -> Iterator[str]:

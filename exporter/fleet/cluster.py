@@ -24,11 +24,10 @@ from converters.fetch import address_of, shown
 from converters.runtimes.pool import RuntimePool
 from exporter import __version__
 from exporter.export.labels import read_labels
-from exporter.export.names import Claimed
+from exporter.export.names import Claim, Claimed, Turns
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter
-from exporter.fleet.turns import Turns
-from exporter.fleet.worker import Claim, Outcome, Wanted, exported
+from exporter.fleet.worker import Outcome, Wanted, exported
 from signatures.errors import RuntimeUnavailableError, SourceError
 
 #: Seconds in which a scheduler answers.

@@ -18,12 +18,11 @@ from typing import Any
 
 from converters.fetch import shown
 from converters.runtimes.pool import RuntimePool
-from exporter.export.names import Names
+from exporter.export.names import Claim, Names, Turns
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter
 from exporter.fleet.ledger import Ledger
-from exporter.fleet.turns import Turns
-from exporter.fleet.worker import Claim, Outcome, Wanted, exported, work
+from exporter.fleet.worker import Outcome, Wanted, exported, work
 from signatures.errors import SourceError, UsageError
 
 #: How long a worker may take to clean up when it is told to end.

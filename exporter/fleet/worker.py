@@ -14,7 +14,7 @@ from typing import Any
 from converters.fetch import shown
 from converters.runtimes.child import end_with_parent
 from converters.runtimes.pool import RuntimePool
-from exporter.export.names import Claimed, Naming
+from exporter.export.names import Claim, Claimed, Naming
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter, ExportResult, near
 from exporter.fleet.ledger import Stamp, State, stamps, state
@@ -62,14 +62,6 @@ class Wanted:
 
     answers: bool = False
     entries: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """What a worker asks: names for the policies of its source."""
-
-    path: Path
-    names: Sequence[str]
 
 
 def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, wanted: Wanted) -> Outcome:

@@ -22,7 +22,8 @@ class Destinations:
 
     def prepare(self) -> None:
         """Make the folders, before anything that takes long. Raises UsageError where a file cannot be written."""
-        paths = [p for p in self._files() if p is not None]
+        files = (self.junit, None if self.markdown == Path("-") else self.markdown, self.html)
+        paths = [p for p in files if p is not None]
         for path in paths:
             if path.is_dir():
                 raise UsageError("is a folder", where=str(path), fix="name a file for the report")
@@ -30,9 +31,6 @@ class Destinations:
                 raise UsageError("is named for two reports", where=str(path), fix="give each a file of its own")
             with _reporting(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-
-    def _files(self) -> tuple[Path | None, ...]:
-        return (self.junit, None if self.markdown == Path("-") else self.markdown, self.html)
 
     def write(self, entries: Sequence[Entry], echo: Callable[[str], None]) -> None:
         """Write all of them, each whole; all are made before the first is written. Raises UsageError."""

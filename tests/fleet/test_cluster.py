@@ -16,10 +16,11 @@ from typing import Any
 
 import pytest
 
+from exporter.export.names import Claim
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet import cluster as fleet_cluster
 from exporter.fleet.fleet import export_fleet
-from exporter.fleet.worker import Claim, Outcome, Wanted
+from exporter.fleet.worker import Outcome, Wanted
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT, export_model

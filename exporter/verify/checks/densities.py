@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.checks.draws import DEPENDENT, DRAWS, likely
-from exporter.verify.checks.seeds import REPEATED, repeated
+from exporter.verify.checks.draws import DEPENDENT, DRAWS, REPEATED, likely, repeated
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant

@@ -1,14 +1,17 @@
-"""Classes that are drawn: many times for one input, against the reference's log-probabilities."""
+"""Classes that are drawn: many times for one input, against the reference's log-probabilities; and after two starts,
+which draw differently: with a seed of its own a sampler plays the same game every time.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
 
-from exporter.verify.checks.seeds import REPEATED, repeated
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import RUNTIMES
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Feeds, Participant, Run
@@ -17,11 +20,15 @@ from exporter.verify.trial import Trial
 from signatures.roles import Role
 from signatures.sampling import ONE_ALLOWED
 
+Arrays = dict[str, np.ndarray]
 #: Draws for one input; all draws together, where a run takes long.
 DRAWS = 512
 FEW = 2 * DRAWS
 #: Draws that two starts are compared by, where a run takes long.
 STARTS = 48
+REPEATED = "its draws are the same after every start: a sampler has a fixed seed"
+#: Where all sessions of a process begin alike whatever the model, two processes are what tells.
+_ALIKE = frozenset(r.name for r in RUNTIMES if r.sessions_alike)
 DEPENDENT = "its draws are not independent: rows {} apart draw alike"
 #: Where float32 has few digits left, a runtime's probabilities may be others within rounding.
 _LEFT_OUT = frozenset(("1e3", "denormals", "one number far away"))
@@ -90,6 +97,34 @@ def _started_alike(
 
     alike = repeated(trial, participant, ask)
     return {branch: row for branch, row in shown.items() if str(branch) in alike}
+
+
+def repeated(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays]) -> set[str]:
+    """What of the answers of ``ask`` is drawn alike after two starts, by its key.
+
+    Nothing where it cannot be started again. A file that another runtime has drawn from is not started in a second
+    process for it: the seed would be the file's.
+    """
+    if participant.again is None or participant.path is None:
+        return set()
+    apart = participant.runtime in _ALIKE
+    if apart and participant.path in trial.started:
+        return set()
+    trial.started.add(participant.path)
+    one = _asked(participant, trial.pool, ask)
+    if not apart:
+        other = _asked(participant, trial.pool, ask)
+    else:
+        with RuntimePool() as second:
+            other = _asked(participant, second, ask)
+    return {name for name, drawn in one.items() if np.array_equal(drawn, other[name])}
+
+
+def _asked(participant: Participant, pool: RuntimePool, ask: Callable[[Run], Arrays]) -> dict[str, np.ndarray]:
+    assert participant.again is not None
+    model, run = participant.again(pool)
+    with model:
+        return ask(run)
 
 
 def _of_rows(run: Run, action: str, rows: Sequence[Feeds], count: int, *, single: bool) -> np.ndarray:
