@@ -237,7 +237,6 @@ def _tensors(entries: Field, roles: Any) -> tuple[TensorSpec, ...]:
 
 
 def _check_sizes(whole: Field, inputs: tuple[TensorSpec, ...]) -> None:
-    """Raise FieldError where an agent would be fed more than any is."""
     if sum(math.prod(n for n in s.shape if n is not None) for s in inputs) > _MOST_FED:
         raise whole["inputs"].error(f"has more than {_MOST_FED} numbers for an agent")
     if sum(n.integer(1, _MOST_ACTIONS) for n in whole["branches"].items()) > _MOST_ACTIONS:

@@ -56,6 +56,8 @@ _FAR_NOISE = 6.0
 
 #: Quoted: naming the generator's class would load numpy.random, which an export that verifies nothing does not need.
 Style: TypeAlias = "Callable[[np.random.Generator, TensorSpec, tuple[int, ...]], np.ndarray]"
+#: Images from 0 to 1, whatever style the rest has.
+Pixels: TypeAlias = "Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]"
 
 
 def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -> list[Case]:
@@ -74,8 +76,8 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
     large = _large_batch(signature)
     if any(s.role is Role.VISUAL for s in signature.inputs):
-        cases.append(_case(signature, rng, "pixels at their ends", 3, _pixel_ends))
-        cases.append(_case(signature, rng, f"typical, batch {large}", large, _light))
+        cases.append(_case(signature, rng, "pixels at their ends", 3, _typical, pixels=_ends))
+        cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical, pixels=_dim_and_bright))
         if any(_is_free(s) for s in signature.inputs):
             pattern = len(_opposed(signature))
             if pattern * _pixels(signature) <= MAX_PIXELS:
@@ -116,6 +118,7 @@ def _case(
     batch: int,
     style: Style,
     masks: Callable[[np.random.Generator, int, Sequence[int]], np.ndarray] | None = None,
+    pixels: Pixels | None = None,
 ) -> Case:
     feeds = {}
     for spec in signature.inputs:
@@ -124,12 +127,17 @@ def _case(
             branches = signature.branches if sum(signature.branches) == shape[-1] else (shape[-1],)
             feeds[spec.name] = (masks or _all_allowed)(rng, batch, branches).astype(spec.dtype)
         else:
-            feeds[spec.name] = np.asarray(_other(signature, rng, spec, shape, style), dtype=spec.dtype)
+            feeds[spec.name] = np.asarray(_other(signature, rng, spec, shape, style, pixels), dtype=spec.dtype)
     return Case(name, feeds, batch)
 
 
 def _other(
-    signature: PolicySignature, rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...], style: Style
+    signature: PolicySignature,
+    rng: np.random.Generator,
+    spec: TensorSpec,
+    shape: tuple[int, ...],
+    style: Style,
+    pixels: Pixels | None,
 ) -> np.ndarray:
     if spec.role is Role.PREV_ACTION:
         sizes = signature.branches or (2,)
@@ -137,13 +145,10 @@ def _other(
             return rng.integers(0, sizes[0], shape)
         return np.stack([rng.integers(0, sizes[min(i, len(sizes) - 1)], shape[0]) for i in range(shape[1])], axis=1)
     if spec.role is Role.VISUAL:
-        pixels = _ends(rng, shape) if style is _pixel_ends else rng.random(shape)
-        if style is _light:
-            pixels = _dim_and_bright(rng, pixels)
-        return pixels * float((spec.distribution or {}).get("high", 1.0))
-    drawn = style in (_typical, _light, _pixel_ends)
+        drawn = rng.random(shape) if pixels is None else pixels(rng, shape)
+        return drawn * float((spec.distribution or {}).get("high", 1.0))
     if spec.role is Role.NOISE:
-        return rng.standard_normal(shape) if drawn else rng.uniform(-_FAR_NOISE, _FAR_NOISE, shape)
+        return rng.standard_normal(shape) if style is _typical else rng.uniform(-_FAR_NOISE, _FAR_NOISE, shape)
     if spec.role is Role.MEMORY_IN:
         return rng.standard_normal(shape) * _MEMORIES.get(style, 0.5)
     if np.dtype(spec.dtype).kind in "iu":
@@ -166,21 +171,12 @@ def _typical(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...])
     return np.asarray(mean + std * rng.standard_normal(shape))
 
 
-def _light(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """Of images, which are dim, bright, flat; what else is observed is typical."""
-    return _typical(rng, spec, shape)
-
-
-def _dim_and_bright(rng: np.random.Generator, pixels: np.ndarray) -> np.ndarray:
-    """Images of which each has a range of its own within 0..1, but for the first third."""
+def _dim_and_bright(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Images that are dim, bright, flat: each has a range of its own within 0..1, but for the first third."""
+    pixels = rng.random(shape)
     low, high = np.sort(rng.random((2, len(pixels), *(1,) * (pixels.ndim - 1))), axis=0)
     low[: len(pixels) // 3], high[: len(pixels) // 3] = 0, 1
     return np.asarray(low + (high - low) * pixels)
-
-
-def _pixel_ends(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """Of images; what else is observed is typical."""
-    return _typical(rng, spec, shape)
 
 
 def _ends(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -209,7 +205,6 @@ def _large(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -
 
 
 def _alone(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """One number is 1, the others are 0."""
     rows, count = (shape[0] if shape else 1), _numbers((None, *shape[1:]))
     made = np.zeros((rows, count))
     if count:
@@ -222,7 +217,6 @@ def _bits(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) ->
 
 
 def _equal(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """All numbers of a row are the same one."""
     rows = rng.uniform(-3.0, 3.0, (*shape[:1], *(1,) * (len(shape) - 1)))
     return np.asarray(np.broadcast_to(rows, shape))
 
@@ -276,7 +270,6 @@ def _denormals(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...
 
 
 def _is_free(spec: TensorSpec) -> bool:
-    """Whether a style decides its values."""
     decided = (Role.MASKS, Role.PREV_ACTION, Role.VISUAL, Role.NOISE, Role.MEMORY_IN, Role.PARAMETER)
     return spec.role not in decided and np.dtype(spec.dtype).kind not in "iu"
 

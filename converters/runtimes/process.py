@@ -148,7 +148,6 @@ class RuntimeProcess:
 
     @property
     def _streams(self) -> tuple[BinaryIO, BinaryIO]:
-        """The process's stdin and stdout."""
         process = self._process
         if process is None or process.stdin is None or process.stdout is None:
             raise RunFailedError(f"{self.name} is not running")

@@ -78,8 +78,6 @@ def run_fleet(
 
 
 class _Tally:
-    """What became of the sources so far."""
-
     def __init__(self, sources: int) -> None:
         self.sources, self.done, self.unchanged = sources, 0, 0
         self.policies, self.verified, self.disagree, self.refused = 0, 0, 0, 0

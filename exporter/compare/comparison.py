@@ -276,7 +276,6 @@ def _match(
     aliases: Mapping[str, Sequence[str]],
     made: frozenset[str],
 ) -> _Candidate:
-    """The candidate's ports for the reference's names, and what does not fit."""
     problems: list[_Problem] = []
 
     def port_of(spec: TensorSpec, ports: Sequence[Port]) -> Port | None:
@@ -437,7 +436,6 @@ def _same_numbers(
 
 
 def _renamed(candidate: _Candidate, model: LoadedModel) -> Run:
-    """A run under canonical names."""
 
     def run(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
         answers = model.run_all([candidate.fed(feeds) for feeds in inputs], [candidate.outputs[n] for n in fetch])

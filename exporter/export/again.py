@@ -244,7 +244,6 @@ def _source_of(source: Path, contract: Contract, step: int | None, trust_source:
 
 
 def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
-    """How to run the source of a bundle."""
     named = [m for m in found.models if m.name is not None and printable(m.name) == contract.origin.model]
     original = (named or list(found.models))[0].original
     with naming(found.path):

@@ -110,8 +110,6 @@ class _Worker:
 
 @dataclass
 class _Crew:
-    """Workers, each with one source at a time."""
-
     options: ExportOptions
     wanted: Wanted
     turns: Turns[_Worker]

@@ -110,8 +110,6 @@ def _silent(text: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Asking:
-    """Asks the process that knows all names."""
-
     pipe: Connection
 
     def claim(self, path: Path, names: Sequence[str]) -> list[Claimed]:

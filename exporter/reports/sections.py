@@ -145,7 +145,6 @@ def agreement(entry: Entry) -> Markup:
 
 
 def _breakable(name: str) -> Child:
-    """A name that may be broken after a colon."""
     head, colon, rest = name.partition(":")
     return [head, colon, el("wbr"), rest] if colon else name
 

@@ -69,7 +69,6 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
 
 
 def _model(bundle: Bundle) -> str:
-    """The file, and which ML-Agents reads it."""
     if bundle.made_for is not None:
         from converters.targets.profiles import profile
 

@@ -82,7 +82,6 @@ def _kind(spec: TensorSpec) -> str:
 
 
 def _array(spec: TensorSpec) -> str:
-    """An example of one agent's input."""
     shape, kind = example_shape(spec), _TYPES[spec.dtype]
     if not shape:
         return f"new TFTensor(({kind})0)"

@@ -75,7 +75,6 @@ def _url(bundle: Bundle, relative: str) -> str:
 
 
 def _agents(bundle: Bundle) -> str:
-    """Acting with policy.mjs, which draws and remembers."""
     lines = ["const decision = await agents.decide({"]
     for spec in bundle.signature.observations:
         lines += _entry(bundle, spec, _flat(spec))
@@ -121,7 +120,6 @@ def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: s
 
 
 def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:
-    """The previous actions as the next step's input."""
     shape = list(example_shape(spec))
     if tensorflow:
         return f'previous = tf.tensor({taken}.flat(), {shape}, "int32");'

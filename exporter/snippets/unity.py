@@ -146,7 +146,6 @@ def _scope(bundle: Bundle) -> str:
 
 
 def _faults(bundle: Bundle, generation: Generation) -> list[str]:
-    """Why the Internal Brain of a generation cannot run the policy."""
     signature = bundle.signature
     roles = {s.role for s in signature.inputs}
     vectors = [s for s in signature.inputs if s.role is Role.VECTOR]

@@ -159,8 +159,6 @@ class Bisector:
 
 
 class _Search:
-    """One failure."""
-
     def __init__(
         self,
         graph: Graph,
@@ -195,7 +193,6 @@ class _Search:
         return Bisection(None, reason="no tensor that leads to it differs by more than the tolerance")
 
     def _drawn(self, nodes: Sequence[Node]) -> set[str]:
-        """The samplers, and what depends on them."""
         drawn: set[str] = set()
         for node in nodes:
             if node.op in SAMPLERS or any(split_ref(r)[0] in drawn for r in node.inputs):

@@ -108,7 +108,6 @@ class Original:
     def _deterministic(
         self, head: TensorSpec, feeds: Arrays, results: Arrays, scores: Sequence[np.ndarray]
     ) -> np.ndarray:
-        """The action without chance that belongs to ``head``."""
         if head.role is Role.CONTINUOUS:
             if not self.source.noise:
                 return results[head.name]

@@ -152,7 +152,6 @@ def loading(
 
 
 def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:
-    """Feed only what a signature takes."""
     if signature is None:
         return model.run_all
     names = frozenset(signature[0])

@@ -43,8 +43,6 @@ _pointer, _string, _int, _int64, _size = (
 
 
 class _Output(ctypes.Structure):
-    """TF_Output: one output of an operation."""
-
     _fields_ = (("operation", _pointer), ("index", _int))
 
 

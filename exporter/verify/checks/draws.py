@@ -143,7 +143,6 @@ def _one_row_at_a_time(participant: Participant) -> bool:
 
 
 def _drawn(trial: Trial, participant: Participant, action: str, rows: Sequence[Feeds]) -> np.ndarray:
-    """[inputs, draws, branches]: classes drawn for each of ``rows``."""
     single = _one_row_at_a_time(participant)
     cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
     count = max(1, FEW // len(rows)) if single or cameras else DRAWS
