@@ -22,6 +22,7 @@ from converters.onnx.importer.table import TABLE
 from converters.onnx.memories import OnnxMemory, separate_memories
 from converters.onnx.proto import array_of, decoded, load_external, tensors
 from converters.onnx.rows import Reading, dims_of, read_rows
+from converters.understand.memories import looks_like_state
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
 from signatures.records import dataclass
@@ -212,7 +213,7 @@ def _outputs(importer: Importer, names: Sequence[str]) -> tuple[dict[str, str], 
                 f"nothing makes the output {name!r}", why="the model was cut or edited", fix="export the model again"
             )
     needed = [n for n in broken if n.split(":")[0] in ACTION_NAMES]
-    if broken and (needed or not _computed(outputs, importer)):
+    if broken and (needed or all(map(looks_like_state, _computed(outputs, importer)))):
         raise joined_errors([broken[n] for n in needed or broken])
     return outputs, {**missing, **{name: error.what for name, error in broken.items()}}
 

@@ -126,7 +126,7 @@ def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
             return {name: role}
     raise DamagedFileError(
         "its policy has no deviation of its own",
-        why="it depends on the observation, or the distribution is no Gaussian: which, the weights do not tell",
+        why="it has none, or one that depends on the observation, or is no Gaussian: which, the weights do not tell",
         fix=EXPORT_ONNX,
     )
 

@@ -118,6 +118,15 @@ def test_an_output_that_no_policy_needs_is_left_out(tmp_path: Path) -> None:
     assert any("the output other is left out" in note for note in policy.signature.notes)
 
 
+def test_a_memory_alone_is_no_policy_that_was_asked_for(tmp_path: Path) -> None:
+    """The action was dropped with a note, and the file then had "no policy"; what is quantised says what to give."""
+    nodes = [node("DynamicQuantizeLinear", ["x"], ["q", "s", "z"]), node("MatMulInteger", ["q", "q"], "moves")]
+    message = model([*nodes, node("Relu", ["x"], "h_out")], X, ["moves", "h_out"])
+    with pytest.raises(UnsupportedOpError, match=r"QuantizeLinear.*also: MatMulInteger") as caught:
+        read(message, tmp_path)
+    assert "the model is quantised" in str(caught.value)
+
+
 def test_strings_that_no_policy_needs_are_no_matter(tmp_path: Path) -> None:
     text = helper.make_tensor("t", TensorProto.STRING, [1], [b"a name"])
     message = model([node("Constant", [], "label", value=text), node("Relu", ["x"], "action")], X, ["action"])

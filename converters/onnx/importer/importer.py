@@ -214,12 +214,26 @@ def joined_errors(errors: Sequence[UnsupportedOpError]) -> UnsupportedOpError:
     return UnsupportedOpError(what, issues=issues, where=first.where, why=first.why, fix=first.fix)
 
 
+_QUANTISED = frozenset(
+    (
+        *("QuantizeLinear", "DequantizeLinear", "DynamicQuantizeLinear"),
+        *("MatMulInteger", "ConvInteger", "QLinearMatMul", "QLinearConv"),
+    )
+)
+
+
 def _unknown(op: Op) -> tuple[str, str, str]:
     if op.domain not in STANDARD:
         return (
             "its domain is not ONNX's own",
             "ops of other domains are private to one runtime",
             "export the model without that runtime's optimisations, with ONNX's own ops (domain 'ai.onnx') only",
+        )
+    if op.kind in _QUANTISED:
+        return (
+            "no entry of the table of ONNX ops covers it",
+            "the model is quantised: it computes in integers, which not all formats have, and of which runtimes differ",
+            "give the float32 model that it was made of (float16 is read, too)",
         )
     return (
         "no entry of the table of ONNX ops covers it",
