@@ -21,8 +21,9 @@ _NOT_POLICY = ("critic.", "value_heads.")
 _OTHERS = {
     "a2c_network.": "rl_games",
     **dict.fromkeys(("log_std_parameter", "policy_layer.", "net_container.", "state_preprocessor"), "skrl"),
-    "actor.preprocess.": "Tianshou",
-    "encoder.actor_encoder.": "RLlib",
+    **dict.fromkeys(("actor.preprocess.", "model.model.model."), "Tianshou"),
+    **dict.fromkeys(("encoder.actor_encoder.", "_logits._model.", "_hidden_layers.0._model."), "RLlib"),
+    "action_parameterization.": "Sample Factory",
 }
 
 
@@ -63,7 +64,7 @@ def _is_actor(policy: Mapping[Any, Any]) -> bool:
 
 
 def _other_trainer(value: Any) -> str:
-    """Who else wrote a checkpoint, by the names of its tensors (rl_games 1.6, skrl 2, Tianshou 2, RLlib 2)."""
+    """Who else wrote it, by its tensors' names (rl_games 1.6, skrl 2, Tianshou 2, RLlib 2, Sample Factory 2)."""
     names = [n for n in value if isinstance(n, str)] if isinstance(value, dict) else []
     for part in ("model", "policy"):
         inner = value.get(part) if names else None

@@ -317,8 +317,8 @@ def _named(module: str, name: str) -> Any:
         raise NotAPolicyError(
             f"its pickle asks for {module[:100]}.{name[:100]}",
             why="only tensors and plain containers are built from a checkpoint, and nothing in it is run; a file that "
-            "asks for more may be an attack, or no checkpoint of a policy",
-            fix=_FIX,
+            "asks for more may be an attack, or a module that was saved whole",
+            fix=f"{_FIX}; a module that torch.save wrote whole must be exported to ONNX (torch.onnx.export)",
         )
     return found
 
