@@ -8,9 +8,9 @@ sb3_contrib/common/{maskable,recurrent}/policies.py, {qrdqn,tqc}/policies.py. Th
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from signatures.records import dataclass
 from signatures.roles import Role
 
 _EXPORT_ONNX = "export the model to ONNX in its own project (torch.onnx.export), and give that"
+#: What a space is: one, or several by their keys.
+Observed: TypeAlias = "Space | Mapping[str, Space]"
 #: What a forbidden action's logit becomes (sb3_contrib/common/maskable/distributions.py).
 _FORBIDDEN = -1e8
 #: What no action depends on.
@@ -45,21 +47,8 @@ class _Family:
 
     algorithm: str
     activation: str
-    kind: str
+    build: Callable[[_Built, Observed], None]
     squashed: bool = False
-
-
-#: By the module of the policy's class.
-_FAMILIES = {
-    "stable_baselines3.common.policies": _Family("", "Tanh", "actor_critic"),
-    "sb3_contrib.common.maskable.policies": _Family("MaskablePPO", "Tanh", "actor_critic"),
-    "sb3_contrib.common.recurrent.policies": _Family("RecurrentPPO", "Tanh", "actor_critic"),
-    "stable_baselines3.sac.policies": _Family("SAC", "ReLU", "gaussian_actor", True),
-    "sb3_contrib.tqc.policies": _Family("TQC", "ReLU", "gaussian_actor", True),
-    "stable_baselines3.td3.policies": _Family("TD3", "ReLU", "actor", True),
-    "stable_baselines3.dqn.policies": _Family("DQN", "ReLU", "values"),
-    "sb3_contrib.qrdqn.policies": _Family("QRDQN", "ReLU", "quantiles"),
-}
 
 
 @dataclass
@@ -102,14 +91,7 @@ def to_graph(
     )
     observed = space_of(data, "observation_space")
     _check_class(kwargs, observed)
-    builders = {
-        "actor_critic": _actor_critic,
-        "gaussian_actor": _gaussian_actor,
-        "actor": _actor,
-        "values": _values,
-        "quantiles": _quantiles,
-    }
-    builders[family.kind](made, observed)
+    family.build(made, observed)
     weights.check_all_read()
     algorithm = family.algorithm or _on_policy(data)
     memory = ("h", "c") if "recurrent_out" in made.outputs else ()
@@ -180,7 +162,7 @@ def _activation(kwargs: Mapping[str, Any], family: _Family, wanted: str | None) 
     return said
 
 
-def _check_class(kwargs: Mapping[str, Any], observed: Space | Mapping[str, Space]) -> None:
+def _check_class(kwargs: Mapping[str, Any], observed: Observed) -> None:
     """Raise SourceError where the observations go through an extractor of the user's own."""
     text = str(kwargs.get("features_extractor_class", ""))
     name = text.strip("<>'").rpartition(".")[2].strip("'")
@@ -195,7 +177,7 @@ def _check_class(kwargs: Mapping[str, Any], observed: Space | Mapping[str, Space
 # ------------------------------------------------------------------ observations
 
 
-def _features(made: _Built, observed: Space | Mapping[str, Space], module: str) -> str:
+def _features(made: _Built, observed: Observed, module: str) -> str:
     """The features of all observations, side by side; ``module`` holds the extractor's weights."""
     if isinstance(observed, Space):
         return _encoded(made, "observation", observed, module)
@@ -247,7 +229,7 @@ def _nature(net: Network, image: str, module: str) -> str:
 # ------------------------------------------------------------------ families
 
 
-def _actor_critic(made: _Built, observed: Space | Mapping[str, Space]) -> None:
+def _actor_critic(made: _Built, observed: Observed) -> None:
     """``ActorCriticPolicy`` and its maskable and recurrent kin: Gaussian, categorical or Bernoulli actions."""
     net, own = made.net, "pi_features_extractor"
     own = own if net.state.under(f"{own}.") else "features_extractor"
@@ -273,7 +255,7 @@ def _actor_critic(made: _Built, observed: Space | Mapping[str, Space]) -> None:
     _continuous(made, out, _state_dependent(made, x, "log_std", net.width(out)))
 
 
-def _gaussian_actor(made: _Built, observed: Space | Mapping[str, Space]) -> None:
+def _gaussian_actor(made: _Built, observed: Observed) -> None:
     """``Actor`` of SAC and TQC: a mean and a deviation that depends on the observation, squashed by tanh."""
     net = made.net
     x = net.mlp(_features(made, observed, "actor.features_extractor"), "actor.latent_pi", made.activation)
@@ -288,19 +270,19 @@ def _gaussian_actor(made: _Built, observed: Space | Mapping[str, Space]) -> None
     _continuous(made, mean, _state_dependent(made, x, "actor.log_std", net.width(mean)))
 
 
-def _actor(made: _Built, observed: Space | Mapping[str, Space]) -> None:
+def _actor(made: _Built, observed: Observed) -> None:
     """``Actor`` of TD3 and DDPG: tanh of a mean; what they add to explore belongs to training."""
     x = _features(made, observed, "actor.features_extractor")
     _continuous(made, made.net.mlp(x, "actor.mu", made.activation, ends=True), None)
 
 
-def _values(made: _Built, observed: Space | Mapping[str, Space]) -> None:
+def _values(made: _Built, observed: Observed) -> None:
     """``QNetwork``: the action of the highest value."""
     x = _features(made, observed, "q_net.features_extractor")
     _highest(made, made.net.mlp(x, "q_net.q_net", made.activation, ends=True))
 
 
-def _quantiles(made: _Built, observed: Space | Mapping[str, Space]) -> None:
+def _quantiles(made: _Built, observed: Observed) -> None:
     """``QuantileNetwork``: the mean of each action's quantiles is its value."""
     net = made.net
     x = _features(made, observed, "quantile_net.features_extractor")
@@ -342,11 +324,7 @@ def _continuous(made: _Built, mean: str, spread: str | None) -> None:
     net = made.net
     net.at("action")
     if net.width(mean) != made.actions.size:
-        raise DamagedFileError(
-            f"its network has {net.width(mean)} actions, and its space {made.actions.size}",
-            why="they are of different models",
-            fix="save the model again: model.save",
-        )
+        raise _mixed(f"its network has {net.width(mean)} actions, and its space {made.actions.size}")
     value = mean
     if spread is not None:
         shape = net.add("Shape", [mean], "shape", out_type=INT32)
@@ -364,6 +342,10 @@ def _continuous(made: _Built, mean: str, spread: str | None) -> None:
         made.notes.append(f"its actions are {made.actions.shape} in the environment; here they stand in one row")
     net.output("action", value)
     made.outputs["action"] = Role.ACTION
+
+
+def _mixed(what: str) -> DamagedFileError:
+    return DamagedFileError(what, why="they are of different models", fix="save the model again: model.save")
 
 
 def _bound(net: Network, limits: np.ndarray, name: str) -> str | None:
@@ -384,11 +366,7 @@ def _categorical(made: _Built, logits: str) -> None:
     net.at("action")
     columns = 1 if bits and width == len(sizes) else 0
     if width != (len(sizes) if columns else sum(sizes)):
-        raise DamagedFileError(
-            f"its network has {width} logits, and its action space {sum(sizes)} actions",
-            why="they are of different models",
-            fix="save the model again: model.save",
-        )
+        raise _mixed(f"its network has {width} logits, and its action space {sum(sizes)} actions")
     parts, start = [], 0
     for size in sizes:
         step = columns or size
@@ -416,13 +394,22 @@ def _masks(made: _Built, count: int, logits: str) -> str:
 def _highest(made: _Built, values: str) -> None:
     net = made.net
     if made.actions.kind != "Discrete" or net.width(values) != made.actions.size:
-        raise DamagedFileError(
-            f"its network values {net.width(values)} actions, and its space has {made.actions.size}",
-            why="they are of different models",
-            fix="save the model again: model.save",
-        )
+        raise _mixed(f"its network values {net.width(values)} actions, and its space has {made.actions.size}")
     net.output("q_values", values)
     net.at("action")
     best = net.add("ArgMax", [values, net.ints(1, "axis")], output_type=INT64)
     net.output("action", net.reshape(best, (-1, 1)))
     made.outputs |= {"action": Role.ACTION, "q_values": Role.OTHER}
+
+
+#: By the module of the policy's class.
+_FAMILIES = {
+    "stable_baselines3.common.policies": _Family("", "Tanh", _actor_critic),
+    "sb3_contrib.common.maskable.policies": _Family("MaskablePPO", "Tanh", _actor_critic),
+    "sb3_contrib.common.recurrent.policies": _Family("RecurrentPPO", "Tanh", _actor_critic),
+    "stable_baselines3.sac.policies": _Family("SAC", "ReLU", _gaussian_actor, True),
+    "sb3_contrib.tqc.policies": _Family("TQC", "ReLU", _gaussian_actor, True),
+    "stable_baselines3.td3.policies": _Family("TD3", "ReLU", _actor, True),
+    "stable_baselines3.dqn.policies": _Family("DQN", "ReLU", _values),
+    "sb3_contrib.qrdqn.policies": _Family("QRDQN", "ReLU", _quantiles),
+}

@@ -40,7 +40,7 @@ def observation_names(dressing: Dressing) -> list[tuple[str, TensorSpec]]:
 def take_observation(dressing: Dressing, name: str, spec: TensorSpec) -> None:
     """An input of the consumer for an observation: vectors [B, n], buffers [B, a, b], images [B, C, H, W]."""
     if spec.role is Role.VISUAL:
-        _take_image(dressing, name, spec)
+        take_image(dressing, name, spec, "NCHW")
         return
     shape = spec.shape if len(spec.shape) > 1 else (None, 1)
     if None in shape[1:]:
@@ -48,16 +48,20 @@ def take_observation(dressing: Dressing, name: str, spec: TensorSpec) -> None:
     dressing.give_in(spec, dressing.take(name, spec, (None, *shape[1:])))
 
 
-def _take_image(dressing: Dressing, name: str, spec: TensorSpec) -> None:
-    builder = dressing.builder
+#: Layout that the consumer has → the axes of an image of the other one in it, and the way back.
+_TURNS = {"NCHW": ((2, 0, 1), (0, 2, 3, 1)), "NHWC": ((1, 2, 0), (0, 3, 1, 2))}
+
+
+def take_image(dressing: Dressing, name: str, spec: TensorSpec, layout: str) -> None:
+    """An input of the consumer for an image: [B, C, H, W], or as TensorFlow had it: [B, H, W, C]."""
     done: Mapping[str, object] = dressing.policy.signature.preprocess.get(spec.name, {})
-    nhwc = done.get("layout", "NHWC") == "NHWC"
     if len(spec.shape) != 4 or None in spec.shape[1:]:
         _unknown_length(dressing, spec)
     _, *sizes = spec.shape
-    tensor = dressing.take(name, spec, (None, sizes[2], sizes[0], sizes[1]) if nhwc else (None, *sizes))
+    same, (places, back) = done.get("layout", "NHWC") == layout, _TURNS[layout]
+    tensor = dressing.take(name, spec, (None, *(sizes if same else (sizes[i] for i in places))))
     tensor = _as_colours(dressing, name, tensor, done)
-    dressing.give_in(spec, builder.transpose(tensor, [0, 2, 3, 1]) if nhwc else tensor)
+    dressing.give_in(spec, tensor if same else dressing.builder.transpose(tensor, back))
 
 
 def take_joined(dressing: Dressing, name: str, vectors: list[TensorSpec]) -> None:
@@ -80,19 +84,6 @@ def take_joined(dressing: Dressing, name: str, vectors: list[TensorSpec]) -> Non
         dressing.give_in(spec, dressing.builder.slice(taken, 1, begin, begin + width))
     names = ", ".join(f"{s.name} ({w})" for s, w in zip(vectors, known, strict=True))
     dressing.notes.append(f"{name} is {names}, one behind the other")
-
-
-def take_image_rows(dressing: Dressing, name: str, spec: TensorSpec) -> None:
-    """An input of the consumer for an image as TensorFlow had it: [B, H, W, C]."""
-    builder = dressing.builder
-    done: Mapping[str, object] = dressing.policy.signature.preprocess.get(spec.name, {})
-    if len(spec.shape) != 4 or None in spec.shape[1:]:
-        _unknown_length(dressing, spec)
-    _, *sizes = spec.shape
-    nhwc = done.get("layout", "NHWC") == "NHWC"
-    tensor = dressing.take(name, spec, (None, *sizes) if nhwc else (None, sizes[1], sizes[2], sizes[0]))
-    tensor = _as_colours(dressing, name, tensor, done)
-    dressing.give_in(spec, tensor if nhwc else builder.transpose(tensor, [0, 3, 1, 2]))
 
 
 def refuse_lost_memory(dressing: Dressing, name: str) -> NoReturn:

@@ -81,7 +81,7 @@ def _take_observations(dressing: Dressing, generation: Generation) -> dict[str, 
     images: dict[str, object] = {}
     for number, spec in enumerate(s for s in signature.observations if s.role is Role.VISUAL):
         name = f"{generation.visual}{number}"
-        feeding.take_image_rows(dressing, name, spec)
+        feeding.take_image(dressing, name, spec, "NHWC")
         images[name] = {"layout": "NHWC", "range": [0, 1], "from_bytes": "divide by 255"}
     if images and generation.pictures is not None:
         dressing.notes.append(f"pictures are taken from 0 to 1; {generation.pictures}")
