@@ -30,11 +30,9 @@ class Weights(Protocol):
 
     def arrays(self, layer: Layer) -> Arrays:
         """All of a layer's."""
-        ...
 
     def among(self, layers: Sequence[Layer]) -> Mapping[str, Weights]:
         """Those of each layer of a model, by its name."""
-        ...
 
 
 class Groups:

@@ -105,15 +105,19 @@ class _Builder:
     def fresh(self, wish: str) -> str:
         return self._names.fresh(wish)
 
-    def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
-        sunk = self._sunk(op, inputs, attributes) if outputs == 1 else ""
+    def emit(self, op: str, inputs: Sequence[str], **attributes: Any) -> str:
+        sunk = self._sunk(op, inputs, attributes)
         if sunk:
             return sunk
+        (name,) = self.emit_several(op, inputs, 1, **attributes)
+        if op == "Transpose":
+            self._transposed[name] = (inputs[0], tuple(attributes["perm"]))
+        return name
+
+    def emit_several(self, op: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> tuple[str, ...]:
         names = [self.fresh(f"{self._prefix}/{op}" if self._prefix else op) for _ in range(outputs)]
         self.nodes.append(messages.node(op, inputs, names, names[0], **attributes))
-        if op == "Transpose":
-            self._transposed[names[0]] = (inputs[0], tuple(attributes["perm"]))
-        return names[0] if outputs == 1 else tuple(names)
+        return tuple(names)
 
     def _sunk(self, op: str, inputs: Sequence[str], attributes: Mapping[str, Any]) -> str:
         """A node behind transposes put in front of them, empty where that is not to be done: two that undo each other
@@ -129,7 +133,7 @@ class _Builder:
         if any(i not in self._transposed and i not in self._scalars for i in inputs):
             return ""
         moved = self.emit(op, [self._transposed[i][0] if i in self._transposed else i for i in inputs], **attributes)
-        return str(self.emit("Transpose", [moved], perm=list(turned[0][1])))
+        return self.emit("Transpose", [moved], perm=list(turned[0][1]))
 
     def const(self, array: np.ndarray, hint: str = "const") -> str:
         # Of a large one the first numbers tell it from nearly all others.

@@ -17,6 +17,7 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     as_int64,
+    by_shape,
     constant_input,
     inserted,
     not_constant,
@@ -181,14 +182,12 @@ def _squeeze(node: Node, x: np.ndarray) -> np.ndarray:
     return np.squeeze(x, _squeeze_axes(node, x.shape))
 
 
-def _infer_squeeze(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
+@by_shape
+def _infer_squeeze(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     if not node.attrs["squeeze_dims"] and any(isinstance(d, str) and d != BATCH for d in shape):
         raise not_constant(node, "a list of axes to squeeze")
     axes = _squeeze_axes(node, shape)
-    return [TensorType(args[0].dtype, tuple(d for i, d in enumerate(shape) if i not in axes))]
+    return [d for i, d in enumerate(shape) if i not in axes]
 
 
 def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
@@ -203,13 +202,11 @@ def _expand_dims(node: Node, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return np.expand_dims(x, int(axis.reshape(())))
 
 
-def _infer_expand_dims(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    if args[0].shape is None:
-        return [TensorType(args[0].dtype, None)]
-    axis = int(require_constant(node, args, 1, "an axis").reshape(()))
-    dims = list(args[0].shape)
-    dims.insert(axis + len(dims) + 1 if axis < 0 else axis, 1)
-    return [TensorType(args[0].dtype, tuple(dims))]
+@by_shape
+def _infer_expand_dims(
+    node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols
+) -> Sequence[Dim]:
+    return inserted(shape, int(require_constant(node, args, 1, "an axis").reshape(()))) or ()
 
 
 def _lower_expand_dims(node: Node, builder: OnnxBuilder) -> Any:
@@ -222,14 +219,12 @@ def _transpose(node: Node, x: np.ndarray, permutation: np.ndarray) -> np.ndarray
     return np.asarray(x.transpose([int(p) for p in permutation]), order="C")
 
 
-def _infer_transpose(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
+@by_shape
+def _infer_transpose(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     permutation = require_constant(node, args, 1, "a permutation").tolist()
     if sorted(permutation) != list(range(len(shape))):
         raise shape_error(node, args, f"{permutation} is no permutation of {len(shape)} axes")
-    return [TensorType(args[0].dtype, tuple(shape[p] for p in permutation))]
+    return [shape[p] for p in permutation]
 
 
 def _lower_transpose(node: Node, builder: OnnxBuilder) -> Any:
@@ -380,7 +375,7 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
         return (value,)
     if builder.splits:
         lengths = builder.const(np.array(sizes, np.int64), "sizes")
-        return builder.emit("Split", [value, lengths], outputs=len(sizes), axis=axis)
+        return builder.emit_several("Split", [value, lengths], len(sizes), axis=axis)
     bounds = [0, *itertools.accumulate(int(s) for s in sizes)]
     starts = [builder.const(np.array([b], np.int64), "bound") for b in bounds]
     on = builder.const(np.array([axis], np.int64), "axis")

@@ -43,27 +43,24 @@ class OnnxBuilder(Protocol):
 
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""
-        ...
 
     def type_of(self, reference: str) -> TensorType:
         """What is known of a tensor of the graph."""
-        ...
 
-    def emit(self, op: str, inputs: Sequence[str], *, outputs: int = 1, **attributes: Any) -> Any:
-        """Append an ONNX node; returns the name of its output, or a tuple of names if ``outputs`` is above 1."""
-        ...
+    def emit(self, op: str, inputs: Sequence[str], **attributes: Any) -> str:
+        """Append an ONNX node; returns the name of its output."""
+
+    def emit_several(self, op: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> tuple[str, ...]:
+        """Append an ONNX node of so many outputs; returns their names."""
 
     def const(self, array: np.ndarray, hint: str = "const") -> str:
         """An initializer; equal arrays share one."""
-        ...
 
     def producer(self, reference: str) -> Node:
         """The node of the graph that makes a tensor."""
-        ...
 
     def holds(self, value: str, reference: str, axes: Sequence[int]) -> None:
         """Note that ``value`` is a tensor of the graph with its axes in another order (numpy's ``transpose``)."""
-        ...
 
 
 class NodeBuilder(Protocol):
@@ -73,11 +70,9 @@ class NodeBuilder(Protocol):
         self, op: str, inputs: Sequence[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
     ) -> str:
         """A new node under a fresh name like ``name``; returns its output 0."""
-        ...
 
     def const(self, array: np.ndarray, name: str) -> str:
         """A new Const under a fresh name like ``name``."""
-        ...
 
 
 class GraphBuilder(NodeBuilder, Protocol):
@@ -85,23 +80,18 @@ class GraphBuilder(NodeBuilder, Protocol):
 
     def constant_of(self, reference: str) -> np.ndarray | None:
         """The value of a tensor of the old graph that is a Const."""
-        ...
 
     def producer(self, reference: str) -> Node:
         """The node of the old graph that makes a tensor."""
-        ...
 
     def shape_of(self, reference: str) -> Shape:
         """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
-        ...
 
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
-        ...
 
     def resolve(self, reference: str) -> str:
         """Where a tensor of the old graph is now."""
-        ...
 
 
 Lower = Callable[[Node, OnnxBuilder], Any]
@@ -219,6 +209,16 @@ def type_attr(name: str = "T", derive: str = "in:0") -> Attr:
 # ------------------------------------------------------------------ helpers for infer rules
 
 
+def by_shape(rule: Callable[[Node, Sequence[TensorType], tuple[Dim, ...], Symbols], Sequence[Dim]]) -> Infer:
+    """Result has the dtype of input 0, and the shape that ``rule`` makes of its shape; of no known shape none."""
+
+    def infer(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+        shape = args[0].shape
+        return [TensorType(args[0].dtype, None if shape is None else tuple(rule(node, args, shape, symbols)))]
+
+    return infer
+
+
 def same_as(position: int = 0, *, count: int | None = None) -> Infer:
     """Result has the dtype and shape of input ``position`` (of ``count``)."""
 
@@ -318,8 +318,7 @@ def direct(onnx_op: str, **attributes: Any) -> Lower:
     """A lowering to one ONNX node with the same inputs."""
 
     def lower(node: Node, builder: OnnxBuilder) -> str:
-        value: str = builder.emit(onnx_op, [builder.value(r) for r in node.inputs], **attributes)
-        return value
+        return builder.emit(onnx_op, [builder.value(r) for r in node.inputs], **attributes)
 
     return lower
 
@@ -348,16 +347,13 @@ def reshaped(builder: OnnxBuilder, value: str, result: Shape) -> str:
     if not result or 0 in result or sum(isinstance(d, str) for d in result) > 1:
         return ""
     target = np.array([d if isinstance(d, int) else -1 for d in result], np.int64)
-    made: str = builder.emit("Reshape", [value, builder.const(target, "shape")])
-    return made
+    return builder.emit("Reshape", [value, builder.const(target, "shape")])
 
 
 def _with_axes(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[int]) -> str:
     if builder.opset < 13:
-        made: str = builder.emit(onnx_op, [value], axes=[int(a) for a in axes])
-    else:
-        made = builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
-    return made
+        return builder.emit(onnx_op, [value], axes=[int(a) for a in axes])
+    return builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
 
 
 def inserted(shape: Shape, axis: int) -> tuple[Dim, ...] | None:

@@ -15,6 +15,7 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
+    by_shape,
     constant_input,
     require_constant,
     shape_error,
@@ -207,10 +208,8 @@ def _pad(node: Node, x: np.ndarray, paddings: np.ndarray, value: np.ndarray | No
     return np.pad(x, [(int(a), int(b)) for a, b in paddings], constant_values=fill)
 
 
-def _infer_pad(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
+@by_shape
+def _infer_pad(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     paddings = require_constant(node, args, 1, "paddings")
     if paddings.shape != (len(shape), 2):
         raise shape_error(node, args, "paddings must hold a pair for each axis")
@@ -218,7 +217,7 @@ def _infer_pad(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list
     for size, (before, after) in zip(shape, paddings.tolist(), strict=True):
         both = before + after
         dims.append(size + both if isinstance(size, int) else size if both == 0 else symbols.fresh())
-    return [TensorType(args[0].dtype, tuple(dims))]
+    return dims
 
 
 def _lower_pad(node: Node, builder: OnnxBuilder) -> Any:

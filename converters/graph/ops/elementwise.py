@@ -96,8 +96,7 @@ def _pair(name: str) -> Lower:
         if inverse is not None and not builder.constant_first and kinds[0].constant is not None:
             values[1], onnx_op = builder.emit(inverse[0], values[1:]), inverse[1]
             values.reverse()
-        result: str = builder.emit(onnx_op, values)
-        return result
+        return builder.emit(onnx_op, values)
 
     return lower
 
@@ -136,7 +135,7 @@ def _lower_erf(node: Node, builder: OnnxBuilder) -> Any:
         return builder.emit("Erf", [x])
 
     def with_number(op: str, value: str, number: float) -> str:
-        return str(builder.emit(op, [value, builder.const(np.asarray(number, FLOAT32))]))
+        return builder.emit(op, [value, builder.const(np.asarray(number, FLOAT32))])
 
     size = builder.emit("Abs", [x])
     t = builder.emit("Reciprocal", [with_number("Add", with_number("Mul", size, 0.3275911), 1)])
@@ -264,7 +263,7 @@ def _bounded(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
         return value
     largest = np.finfo(np.float32).max
     low, high = (builder.const(np.array(s * largest, np.float32), w) for s, w in ((-1, "lowest"), (1, "highest")))
-    return str(builder.emit("Clip", [value, low, high]))
+    return builder.emit("Clip", [value, low, high])
 
 
 def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:

@@ -16,6 +16,7 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     as_int64,
+    by_shape,
     constant_input,
     inserted,
     not_constant,
@@ -24,7 +25,7 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.ops.older import broadcast_to
-from converters.graph.types import INT32, Symbols, TensorType, broadcast, product
+from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
 
 T = type_attr()
 
@@ -55,12 +56,10 @@ def _tile(node: Node, x: np.ndarray, multiples: np.ndarray) -> np.ndarray:
     return np.tile(x, [int(m) for m in multiples])
 
 
-def _infer_tile(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
+@by_shape
+def _infer_tile(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     multiples = target_dims(args[1].value, args[1], symbols) or [symbols.fresh()] * len(shape)
-    return [TensorType(args[0].dtype, tuple(product((d, m), symbols) for d, m in zip(shape, multiples, strict=True)))]
+    return [product((d, m), symbols) for d, m in zip(shape, multiples, strict=True)]
 
 
 def _lower_tile(node: Node, builder: OnnxBuilder) -> Any:

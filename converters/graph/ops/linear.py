@@ -15,6 +15,7 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     Precision,
+    by_shape,
     constant_input,
     require_constant,
     same_as,
@@ -120,9 +121,9 @@ def activation(name: str, x: np.ndarray) -> np.ndarray:
 def lower_activation(name: str, value: str, builder: OnnxBuilder) -> str:
     """``activation`` in ONNX, which calls all of them as TensorFlow does but has no Relu6."""
     if name != "Relu6":
-        return str(builder.emit(name, [value]))
+        return builder.emit(name, [value])
     low, high = (builder.const(np.array(bound, np.float32), "bound") for bound in (0, 6))
-    return str(builder.emit("Min", [builder.emit("Max", [value, low]), high]))
+    return builder.emit("Min", [builder.emit("Max", [value, low]), high])
 
 
 def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) -> np.ndarray:
@@ -167,16 +168,13 @@ def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[.
     return kernel
 
 
-def _infer_reduction(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = args[0].shape
+@by_shape
+def _infer_reduction(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     keep = bool(node.attrs["keep_dims"])
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
     axes = _axes(node, require_constant(node, args, 1, "the axes to reduce over"), len(shape))
     if any(a >= len(shape) or a < 0 for a in axes):
         raise shape_error(node, args, f"axes {axes} are outside the tensor's rank")
-    kept: list[Dim] = [1 if i in axes else d for i, d in enumerate(shape) if keep or i not in axes]
-    return [TensorType(args[0].dtype, tuple(kept))]
+    return [1 if i in axes else d for i, d in enumerate(shape) if keep or i not in axes]
 
 
 def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
@@ -359,24 +357,19 @@ def _reduced(
     if onnx_op == "ReduceSum":
         return _summed(builder, value, kind, axes, keepdims)
     if builder.opset >= 18:
-        axes_value = builder.const(np.array(axes, np.int64), "axes")
-        result: str = builder.emit(onnx_op, [value, axes_value], keepdims=int(keepdims))
-    else:
-        result = builder.emit(onnx_op, [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
-    return result
+        return builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")], keepdims=int(keepdims))
+    return builder.emit(onnx_op, [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
 
 
 def _summed(builder: OnnxBuilder, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool) -> str:
     assert kind.shape is not None
     if builder.opset < 13:
-        summed: str = builder.emit("ReduceSum", [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
-        return summed
+        return builder.emit("ReduceSum", [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
     shape, last = list(kind.shape), len(kind.shape) - 1
     lengths = [n for n in (shape[a] for a in axes) if isinstance(n, int)]
     if list(axes) != [last] and kind.dtype.kind == "f" and len(lengths) == len(axes) and builder.opset < 18:
         mean = _reduced(builder, "ReduceMean", value, kind, axes, keepdims)
-        counted: str = builder.emit("Mul", [mean, builder.const(np.array(math.prod(lengths), kind.dtype), "count")])
-        return counted
+        return builder.emit("Mul", [mean, builder.const(np.array(math.prod(lengths), kind.dtype), "count")])
     for axis in axes:
         value = _column(builder, value, shape, axis, kind.dtype)
         shape[axis] = 1

@@ -13,6 +13,7 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
+    by_shape,
     constant_input,
     not_constant,
     require_constant,
@@ -32,10 +33,9 @@ def _slice(node: Node, x: np.ndarray, begin: np.ndarray, size: np.ndarray) -> np
     return x[index]
 
 
-def _infer_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape, begin, size = args[0].shape, args[1].constant, args[2].constant
-    if shape is None:
-        return [TensorType(args[0].dtype, None)]
+@by_shape
+def _infer_slice(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
+    begin, size = args[1].constant, args[2].constant
     dims: list[Dim] = []
     for i, length in enumerate(shape):
         start = None if begin is None else int(begin[i])
@@ -46,7 +46,7 @@ def _infer_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
             dims.append(length - start)
         else:
             dims.append(length if wanted == -1 and start == 0 else symbols.fresh())
-    return [TensorType(args[0].dtype, tuple(dims))]
+    return dims
 
 
 def _lower_slice(node: Node, builder: OnnxBuilder) -> Any:

@@ -95,7 +95,6 @@ class Operation(Protocol):
     @property
     def op(self) -> str:
         """The op's name."""
-        ...
 
 
 def traits(node: Operation) -> OpDef:
