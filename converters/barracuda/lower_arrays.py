@@ -18,6 +18,8 @@ from converters.graph.nodes import ref
 from converters.graph.ops.slicing import strided_steps
 from converters.graph.types import BATCH, Dim
 
+#: What is refused, and why.
+_CUTS_AGENTS = "it cuts agents out of the batch", "a policy answers for every agent"
 _MIXED = "the numbers of one agent stay in one row of a .nn"
 
 
@@ -199,7 +201,7 @@ def taken(b: NnBuilder, value: Value, axis: int, start: int, stop: int) -> Value
     if (start, stop) == (0, length):
         return value
     if length == BATCH:
-        raise b.refused("it cuts agents out of the batch", "a policy answers for every agent")
+        raise b.refused(*_CUTS_AGENTS)
     place = value.axes[axis]
     assert place is not None
     axes = tuple(None if i == axis and stop - start == 1 else a for i, a in enumerate(value.axes))
@@ -231,7 +233,7 @@ def slice_(b: NnBuilder, args: Sequence[Value]) -> Value:
         length = value.shape[axis]
         if isinstance(length, str):
             if first != 0 or count != -1:
-                raise b.refused("it cuts agents out of the batch", "a policy answers for every agent")
+                raise b.refused(*_CUTS_AGENTS)
             continue
         value = taken(b, value, axis, int(first), length if count == -1 else int(first) + int(count))
     return value
@@ -251,13 +253,13 @@ def strided_slice(b: NnBuilder, args: Sequence[Value]) -> Value:
         length = value.shape[axis]
         if step[0] == "take":
             if isinstance(length, str):
-                raise b.refused("it cuts agents out of the batch", "a policy answers for every agent")
+                raise b.refused(*_CUTS_AGENTS)
             index = int(step[1]) % length
             value = taken(b, value, axis, index, index + 1)
             gone.append(axis)
         elif isinstance(length, str):
             if step[1] not in (None, 0) or step[2] is not None or step[3] != 1:
-                raise b.refused("it cuts agents out of the batch", "a policy answers for every agent")
+                raise b.refused(*_CUTS_AGENTS)
         else:
             indices = list(range(*slice(step[1], step[2], step[3]).indices(length)))
             value = chosen(b, value, axis, indices)

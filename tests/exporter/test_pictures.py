@@ -17,7 +17,7 @@ from converters import schema
 from converters.frozen_graph.encode import as_read
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.tensorboard.events import FILE_NAME, event_file
+from converters.tensorboard import FILE_NAME, event_file
 from exporter import export_model as export
 from exporter.export.sources import read_source
 from fixtures import path as fixture
