@@ -214,7 +214,7 @@ def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
         yield
     except OSError as error:
         raise BundleError(
-            what, where=str(place), why=error.strerror, fix="make room or rights there, or choose another place"
+            what, where=str(place), why=error.strerror, fix="free some space or allow writing, or choose another place"
         ) from error
 
 

@@ -23,7 +23,9 @@ def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
     try:
         content = read_options(path, f"--labels {path}", toml=path.suffix.lower() == ".toml")
     except (ValueError, RecursionError) as error:  # a JSON, TOML or UTF-8 error is a ValueError
-        raise UsageError(f"--labels {path}: is no JSON or TOML", why=str(error)[:200], fix="mend the file") from error
+        raise UsageError(
+            f"--labels {path}: is neither JSON nor TOML", why=str(error)[:200], fix="correct the file"
+        ) from error
     if not isinstance(content, dict):
         raise UsageError(f"--labels {path}: is no table", fix="see docs/acting.md for its form")
     return content

@@ -87,7 +87,7 @@ class Ledger:
                 file.write(json.dumps(entry) + "\n")
         except OSError as error:
             raise BundleError(
-                "cannot be written", where=str(self._path), why=error.strerror, fix="make room"
+                "cannot be written", where=str(self._path), why=error.strerror, fix="free some space"
             ) from error
 
 

@@ -66,7 +66,7 @@ def _fetched(address: str, folder: Path) -> Path:
     with asking(address):
         found = _files(system, place)
     if not found:
-        raise SourceError("nothing lies there", where=shown(address), fix="check the address")
+        raise SourceError("there is nothing there", where=shown(address), fix="check the address")
     if len(found) > MAX_FILES:
         raise SourceError(
             f"has {len(found)} files, and of one source {MAX_FILES} are fetched",

@@ -51,9 +51,7 @@ def _rule(entry: Any, where: str) -> ToleranceRule:
         raise UsageError(f"has an unknown key {unknown[0]!r}", where=where, fix=_FIX)
     reason = entry.get("reason")
     if not isinstance(reason, str) or not reason.strip():
-        raise UsageError(
-            "gives no reason", where=where, why="a tolerance other than the default is data with a reason", fix=_FIX
-        )
+        raise UsageError("gives no reason", where=where, why="a tolerance other than the default needs one", fix=_FIX)
     known = {"format": [*WRITTEN, "reference"], "runtime": [r.name for r in RUNTIMES]}
     for key in ("policy", "format", "runtime", "output"):
         value = entry.get(key)

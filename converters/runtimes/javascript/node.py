@@ -98,7 +98,7 @@ def install_packages(progress: Progress) -> Path:
             "the npm packages cannot be installed",
             where=str(target),
             why=str(error),
-            fix=f"make room or rights there, or let {JS_VARIABLE} name a folder that holds the node_modules",
+            fix=f"free some space or allow writing, or let {JS_VARIABLE} name a folder that holds the node_modules",
         ) from error
     progress(f"the npm packages are in {target}")
     if js_home() != target:

@@ -49,7 +49,7 @@ def install(release: Release, progress: Progress) -> Path:
             f"TensorFlow {release.version} cannot be installed",
             where=str(target),
             why=str(error),
-            fix="make room or rights there",
+            fix="free some space, or allow writing there",
         ) from error
     progress(f"TensorFlow {release.version} is in {target}")
     return target

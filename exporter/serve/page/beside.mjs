@@ -39,7 +39,7 @@ function checked(contract) {
   });
   const whole = tensors(contract?.inputs) && tensors(contract?.outputs) && contract.outputs.length > 0 && Array.isArray(contract.branches);
   if (!whole) throw new Error("it holds no contract of export-model: drop what export-model wrote");
-  return { ...contract, name: String(contract.name ?? "the other").slice(0, 80) };
+  return { ...contract, name: String(contract.name ?? "the other").replace(/[^\w.-]/g, "\ufffd").slice(0, 80) };
 }
 
 /** Whether a policy can act in place of another; an Error says what differs. */
