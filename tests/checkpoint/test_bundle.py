@@ -25,7 +25,7 @@ VALUES = st.dictionaries(
     min_size=1,
     max_size=8,
 )
-FRESH = examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FRESH = examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 @FRESH

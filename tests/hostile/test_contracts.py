@@ -17,7 +17,9 @@ def trial(tmp_path_factory: pytest.TempPathFactory, processes: RuntimePool) -> T
     return Trial(tmp_path_factory.mktemp("contracts"), processes)
 
 
-@settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(st.integers(0, len(POLICIES) - 1), changes, st.sampled_from(BEYOND))
 def test_a_hostile_contract_is_refused_or_harmless(
     trial: Trial, which: int, how: list[tuple[int, str, Any]], beyond: str | None

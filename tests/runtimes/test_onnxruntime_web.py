@@ -142,7 +142,9 @@ def test_every_dtype_crosses_bit_for_bit(runner: Runner, tmp_path: Path, dtype: 
     assert got.tobytes() == values.tobytes()
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(
     array=st.sampled_from(DTYPES).flatmap(
         lambda dtype: arrays.arrays(

@@ -69,7 +69,9 @@ def test_bfloat16_is_the_upper_half_of_float32(tmp_path: Path) -> None:
 
 
 @given(st.permutations([0, 1, 2]), st.integers(0, 5))
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 def test_strides_and_offsets(tmp_path: Path, order: list[int], offset: int) -> None:
     """Whatever view of a storage was saved: numpy's own transposes say what it holds."""
     writer = Writer()
@@ -247,7 +249,9 @@ def test_what_is_written_here_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("form", WHOLE)
 @given(data=st.data())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 def test_damaged_archives_give_our_errors_only(form: str, data: st.DataObject, tmp_path: Path) -> None:
     changed = bytearray(WHOLE[form])
     for _ in range(data.draw(st.integers(1, 4))):
@@ -271,7 +275,9 @@ def test_damaged_archives_give_our_errors_only(form: str, data: st.DataObject, t
 
 
 @given(data=st.data())
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 def test_damaged_pickles_give_our_errors_only(data: st.DataObject, tmp_path: Path) -> None:
     """Below the archive's checksums: the pickle alone is changed, the rest fits."""
     writer = Writer()
@@ -288,7 +294,9 @@ def test_damaged_pickles_give_our_errors_only(data: st.DataObject, tmp_path: Pat
 
 
 @given(st.dictionaries(st.sampled_from(sorted(SMALL)), st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 def test_weights_of_other_shapes_give_our_errors_only(tmp_path: Path, shapes: dict[str, tuple[int, ...]]) -> None:
     changed = {**SMALL, **{n: np.ones(s, np.float32) for n, s in shapes.items()}}
     path = saved(tmp_path, checkpoint(changed))
