@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops.approximations import APPROXIMATIONS
+from converters.graph.ops.approximations import APPROXIMATIONS, RANGES
 from converters.graph.ops.base import OpDef
 from converters.graph.shapes import run_kernel
 
@@ -53,7 +53,8 @@ class Jitter:
         if entry.precision == "summed":
             results = self._added_up(entry, node, operands, results)
         known = self._approximations.get(entry.name, _ELSE if entry.precision == "approximate" else (1.0, 0.0))
-        return [self._moved(r, *known) for r in results]
+        moved = [self._moved(r, *known) for r in results]
+        return [r.clip(*RANGES[entry.name]) for r in moved] if entry.name in RANGES else moved
 
     def _signs(self, shape: tuple[int, ...]) -> np.ndarray:
         return np.where(self._random.random(shape) < 0.5, -1, 1)

@@ -47,6 +47,14 @@ _GRAPHICS = {
     "Softplus": (7, 1.1e-7),
     "Tanh": (6, 1.4e-7),
 }
+#: One unit in the last place above 1: Eigen's tanh in TensorFlow 1.4 gives that.
+_ONE = 1 + 2.0**-23
+#: What no runtime's function goes beyond, however it approximates it (measured there, too): log(1 - tanh(x)² + 1e-6) of
+#: a number farther above 1 would be no number.
+RANGES: Mapping[str, tuple[float, float]] = {
+    **dict.fromkeys(("Cos", "Erf", "Sin", "Tanh"), (-_ONE, _ONE)),
+    **dict.fromkeys(("Sigmoid", "Softmax"), (0.0, _ONE)),
+}
 APPROXIMATIONS: Mapping[Arithmetic, Mapping[str, tuple[float, float]]] = {
     "processor": _PROCESSOR,
     "graphics": {**_PROCESSOR, **_GRAPHICS},
