@@ -16,6 +16,7 @@ import numpy as np
 
 from converters.folders import OwnFolder, scratch_folder, size_of
 from converters.runtimes.memory import Memory
+from converters.runtimes.patience import allowed, computed
 from converters.runtimes.python import confined
 from converters.runtimes.wire import FramingError, Tensors, read_frame, write_frame
 from signatures.errors import ExportModelError, RuntimeUnavailableError
@@ -23,7 +24,7 @@ from signatures.errors import ExportModelError, RuntimeUnavailableError
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
 TIMEOUT = 300.0
 #: Seconds after which it is looked at again whether one has taken too long.
-_LOOK = 5.0
+_LOOK = 1.0
 
 #: Bytes that several runs are fed in one request: answers are held until the last of them, and one that takes longer
 #: than ``TIMEOUT`` is taken for dead.
@@ -43,8 +44,14 @@ class RunFailedError(ExportModelError):
 class RuntimeProcess:
     """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
 
-    def __init__(self, name: str, command: Sequence[str], *, confined: bool = True) -> None:
-        """``confined``: it may not write outside a folder of its own, nor reach a network (confinement.py)."""
+    def __init__(
+        self, name: str, command: Sequence[str], *, confined: bool = True, endless: set[str] | None = None
+    ) -> None:
+        """``confined``: it may not write outside a folder of its own, nor reach a network (confinement.py).
+
+        ``endless``: files that this or another runtime was stopped with, which are not loaded again; one that has no
+        end before its first answer is added. None where the models are no stranger's, or slow by themselves (Keras).
+        """
         self.name = name
         self.command = list(command)
         self.confined = confined
@@ -59,6 +66,9 @@ class RuntimeProcess:
         self._closed = threading.Event()
         self._memory: Memory | None = None
         self._loaded = 0
+        self._endless = endless
+        #: the model that has not answered yet, the processor time at which the process is stopped, how much that gives
+        self._first: tuple[str, float, float] | None = None
 
     def launch(self) -> None:
         """Start the process if it is not running, and do not wait for it: it gets ready beside what is done next.
@@ -114,20 +124,34 @@ class RuntimeProcess:
         return self.version
 
     def load(self, path: str, **options: Any) -> LoadedModel:
-        """Load a model; raises RunFailedError with the runtime's own message."""
+        """Load a model; raises RunFailedError with the runtime's own message, or where it computes for ever."""
         self.start()
+        if path in (self._endless or ()):
+            raise RunFailedError(f"not run in {self.name}", why="a runtime was stopped while it computed this file")
         self._loaded += 1
         identity = f"m{self._loaded}"
         size, memory = size_of(Path(path)), self._memory
         if memory is not None:
             memory.allow(size)
         try:
-            self.request({"cmd": "load", "id": identity, "path": path, **options})
+            with self.first(path, size):
+                self.request({"cmd": "load", "id": identity, "path": path, **options})
         except RunFailedError:
             if memory is not None:
                 memory.release(size)
             raise
-        return LoadedModel(self, identity, size)
+        return LoadedModel(self, identity, size, path)
+
+    @contextlib.contextmanager
+    def first(self, path: str, size: int) -> Iterator[None]:
+        """What is asked inside has little processor time (patience.py): a model is loaded, or answers once."""
+        process = self._process
+        before = None if process is None or self._endless is None else computed(process.pid)
+        self._first = None if before is None else (path, before + allowed(size), allowed(size))
+        try:
+            yield
+        finally:
+            self._first = None
 
     def unload(self, identity: str, size: int) -> None:
         """Free a model of that many bytes."""
@@ -168,6 +192,12 @@ class RuntimeProcess:
             status = _ended(process)
             said = self._last_errors()
             self.close()
+            if self._first is not None and self._first[0] in (self._endless or ()):
+                raise RunFailedError(
+                    f"{self.name} was stopped: it did not come to an end",
+                    why=f"to load this file, or answer its first input, {self._first[2]:.0f} s of computing are enough",
+                    fix="the file may loop for ever; no other runtime is given it",
+                ) from error
             raise RunFailedError(
                 f"{self.name} ended while it was working (status {status})",
                 why=said or (str(error) if isinstance(error, FramingError) else "it printed nothing"),
@@ -182,7 +212,14 @@ class RuntimeProcess:
     def _watch(self, process: subprocess.Popen[bytes], closed: threading.Event) -> None:
         """End a process whose answer takes too long. One thread for all requests: there are dozens for each policy."""
         while not closed.wait(min(_LOOK, TIMEOUT)):
-            if self._busy and time.monotonic() - self._asked > TIMEOUT:
+            if not self._busy:
+                continue
+            first, endless = self._first, self._endless
+            if first is not None and endless is not None and (computed(process.pid) or 0) > first[1]:
+                endless.add(first[0])
+                process.kill()
+                return
+            if time.monotonic() - self._asked > TIMEOUT:
                 process.kill()
                 return
 
@@ -226,12 +263,15 @@ class RuntimeProcess:
         self.close()
 
 
-def _requests(inputs: Sequence[Mapping[str, np.ndarray]]) -> Iterator[tuple[int, int]]:
-    """From where to where ``inputs`` go into one request: as many as ``_REQUEST`` bytes hold, one at least."""
+def _requests(inputs: Sequence[Mapping[str, np.ndarray]], *, alone: bool) -> Iterator[tuple[int, int]]:
+    """From where to where ``inputs`` go into one request: as many as ``_REQUEST`` bytes hold, one at least.
+
+    ``alone``: the first of them goes by itself.
+    """
     first = size = 0
     for number, feeds in enumerate(inputs):
         size += sum(array.nbytes for array in feeds.values())
-        if size > _REQUEST and number > first:
+        if (size > _REQUEST and number > first) or (alone and number == 1):
             yield first, number
             first, size = number, sum(array.nbytes for array in feeds.values())
     if inputs:
@@ -250,8 +290,9 @@ def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
 class LoadedModel:
     """A model in a runtime's process."""
 
-    def __init__(self, process: RuntimeProcess, identity: str, size: int) -> None:
-        self._process, self._identity, self._size = process, identity, size
+    def __init__(self, process: RuntimeProcess, identity: str, size: int, path: str) -> None:
+        self._process, self._identity, self._size, self._path = process, identity, size, path
+        self._answered = False
 
     def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str], **request: Any) -> Tensors:
         """The outputs in ``fetch`` by name; raises RunFailedError. ``request`` is for what one runtime alone can do."""
@@ -277,14 +318,22 @@ class LoadedModel:
         return self._run_all(inputs, [{}] * len(inputs), outputs)
 
     def _run(self, header: Mapping[str, Any], feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
-        _, results = self._process.request({"cmd": "run", "id": self._identity, **header}, dict(feeds))
+        _, results = self._asked({"cmd": "run", "id": self._identity, **header}, dict(feeds))
         return self._checked(results, fetch)
+
+    def _asked(self, header: Mapping[str, Any], tensors: Tensors) -> tuple[dict[str, Any], Tensors]:
+        if self._answered:
+            return self._process.request(header, tensors)
+        with self._process.first(self._path, self._size):
+            answer = self._process.request(header, tensors)
+        self._answered = True
+        return answer
 
     def _run_all(
         self, inputs: Sequence[Mapping[str, np.ndarray]], headers: Sequence[Mapping[str, Any]], fetch: Sequence[str]
     ) -> list[Tensors]:
         found: list[Tensors] = []
-        for first, last in _requests(inputs):
+        for first, last in _requests(inputs, alone=not self._answered):
             keys: dict[int, str] = {}  # what several runs are fed is sent once
             tensors: Tensors = {}
             runs = []
@@ -292,7 +341,7 @@ class LoadedModel:
                 for array in feeds.values():
                     tensors[keys.setdefault(id(array), str(len(keys)))] = array
                 runs.append({**header, "feeds": {name: keys[id(array)] for name, array in feeds.items()}})
-            _, results = self._process.request({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
+            _, results = self._asked({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
             answers: list[Tensors] = [{} for _ in runs]
             for key, array in results.items():
                 number, _, name = key.partition("/")

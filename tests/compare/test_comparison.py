@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -210,6 +211,37 @@ def test_an_op_that_the_runtime_does_not_know(bundles: Bundles, tmp_path: Path, 
     failure = only_failure(compare_artefacts(fixture("continuous"), [file], runtimes=RUNTIMES, pool=pool))
     assert (failure.kind, failure.output) == ("failure", "*")
     assert "Betainc" in failure.reason
+
+
+def endless(model: onnx.ModelProto) -> None:
+    """Its action is added up in a loop that has no bound, and goes on as long as it is true that true is true."""
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["again"], ["still"]), helper.make_node("Add", ["sum", "sum"], ["more"])],
+        "body",
+        [
+            helper.make_tensor_value_info("turn", onnx.TensorProto.INT64, []),
+            helper.make_tensor_value_info("again", onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info("sum", onnx.TensorProto.FLOAT, None),
+        ],
+        [
+            helper.make_tensor_value_info("still", onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info("more", onnx.TensorProto.FLOAT, None),
+        ],
+    )
+    model.graph.initializer.append(numpy_helper.from_array(np.array(True), "true"))
+    last = next(node for node in model.graph.node if "action" in node.output)
+    last.output[list(last.output).index("action")] = "before"
+    model.graph.node.append(helper.make_node("Loop", ["", "true", "before"], ["action"], body=body))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system says how long a child has computed")
+def test_a_candidate_that_loops_for_ever_is_stopped(
+    bundles: Bundles, tmp_path: Path, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("converters.runtimes.patience.FIRST", 3.0)
+    made = edited(bundles("continuous") / "continuous.onnx", tmp_path / "endless.onnx", endless)
+    report = compare_artefacts(bundles("continuous"), [made], runtimes="onnxruntime", pool=pool)
+    assert "did not come to an end" in only_failure(report).reason
 
 
 def test_an_input_that_is_missing_or_too_much(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
-from converters.runtimes import process
+from converters.runtimes import patience, process
+from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 
 _PROGRAM = """
@@ -18,13 +20,15 @@ while True:
     header, _ = read_frame(sys.stdin.buffer)
     if header["cmd"] == "hang":
         time.sleep(3600)
+    while header["cmd"] == sys.argv[1]:
+        pass
     write_frame(out, {"ok": True, "version": "1"})
 """
 
 
 def test_one_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "_LOOK", 0.1)
-    with RuntimeProcess("slow", [sys.executable, "-c", _PROGRAM]) as slow:
+    with RuntimeProcess("slow", [sys.executable, "-c", _PROGRAM, ""]) as slow:
         slow.start()
         monkeypatch.setattr(process, "TIMEOUT", 0.3)
         time.sleep(0.5)  # nobody asked: that is no hanging
@@ -33,3 +37,19 @@ def test_one_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(process, "TIMEOUT", 0.3)
         with pytest.raises(RunFailedError, match="ended while it was working"):
             slow.request({"cmd": "hang"})
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system says how long a child has computed")
+@pytest.mark.parametrize("command", ["load", "run"])
+def test_what_computes_for_ever_is_stopped_once_for_all_runtimes(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "_LOOK", 0.05)
+    monkeypatch.setattr(patience, "FIRST", 0.2)
+    model = tmp_path / "model"
+    model.touch()
+    pool = RuntimePool({name: lambda: [sys.executable, "-c", _PROGRAM, command] for name in ("one", "other")})
+    with pool, pytest.raises(RunFailedError, match="one was stopped: it did not come to an end"):
+        pool.process("one").load(str(model)).run({}, [])
+    with pool, pytest.raises(RunFailedError, match="not run in other"):
+        pool.process("other").load(str(model))
