@@ -62,8 +62,9 @@ lint: install
 types: install
 	$(BIN)/mypy
 
+DAILY := not (runtimes or slow or corpus or legacy or browser or peers)
 check: lint types
-	EXPORT_MODEL_TEST_DAILY=1 $(PYTEST) -n 2 --dist worksteal -q -m "not (runtimes or slow or corpus or legacy or browser or peers)"
+	EXPORT_MODEL_TEST_DAILY=1 $(PYTEST) -n 2 --dist worksteal -q -m "$(DAILY)"
 
 test: install
 	$(MAKE) --jobs 2 browser lint types # one fetches, the others compute
@@ -92,6 +93,7 @@ fuzz: install
 	$(BIN)/python -m tests.fuzz --count $(N)
 	$(BIN)/python -m tests.hostile.contracts
 	$(BIN)/python -m tests.hostile.kills
+	EXPORT_MODEL_TEST_ANEW=1 $(PYTEST) -n 2 --dist worksteal -q -m "$(DAILY)"
 
 train: install .venv-train/.installed
 	OMP_NUM_THREADS=1 PYTHONPATH=. .venv-train/bin/python -m fixtures.train

@@ -40,9 +40,10 @@ FULL = "EXPORT_MODEL_TEST_FULL"
 DAILY = "EXPORT_MODEL_TEST_DAILY"
 
 #: No time limit per example, nor for making one: on a busy machine it says nothing of the code. Each test has pytest's
-#: own. The same examples in every run: what is drawn anew is ``make fuzz``'s.
+#: own. The same examples in every run, but where this is set (by ``make fuzz``): they are drawn anew.
+ANEW = "EXPORT_MODEL_TEST_ANEW"
 SLOW = (HealthCheck.too_slow,)
-settings.register_profile("busy", deadline=None, derandomize=True, suppress_health_check=SLOW)
+settings.register_profile("busy", deadline=None, derandomize=ANEW not in os.environ, suppress_health_check=SLOW)
 settings.load_profile("busy")
 
 #: Rooms whose tests start runtimes, browsers, servers or the program; and what tests of other rooms then ask for.

@@ -6,6 +6,7 @@ text if it failed. What native code prints goes to stderr; stdout carries frames
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import threading
@@ -66,6 +67,7 @@ def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception
     models: dict[str, Model] = {}
     caught: tuple[type[Exception], ...] = (*faults, KeyError, ValueError, TypeError, OSError)
     source = sys.stdin.buffer
+    gc.freeze()  # what was imported is not looked at again
     while True:
         try:
             header, tensors = read_frame(source)
@@ -86,6 +88,7 @@ def serve(runtime: str, version: str, load: Loader, faults: tuple[type[Exception
                 write_frame(out, {"ok": True}, _runs(models[header["id"]], header["runs"], tensors))
             elif command == "unload":
                 models.pop(header["id"], None)
+                gc.collect()  # TensorFlow's graphs hold themselves, and their weights
                 write_frame(out, {"ok": True})
             else:
                 write_frame(out, {"ok": False, "error": f"unknown command {command!r}"})

@@ -123,8 +123,11 @@ class RuntimeProcess:
             self._memory = Memory(self._process.pid)
         return self.version
 
-    def load(self, path: str, **options: Any) -> LoadedModel:
-        """Load a model; raises RunFailedError with the runtime's own message, or where it computes for ever."""
+    def load(self, path: str, *, answered: bool = False, **options: Any) -> LoadedModel:
+        """Load a model; raises RunFailedError with the runtime's own message, or where it computes for ever.
+
+        ``answered``: it did so once, and has the time of any request.
+        """
         self.start()
         if path in (self._endless or ()):
             raise RunFailedError(f"not run in {self.name}", why="a runtime was stopped while it computed this file")
@@ -134,13 +137,13 @@ class RuntimeProcess:
         if memory is not None:
             memory.allow(size)
         try:
-            with self.first(path, size):
+            with contextlib.nullcontext() if answered else self.first(path, size):
                 self.request({"cmd": "load", "id": identity, "path": path, **options})
         except RunFailedError:
             if memory is not None:
                 memory.release(size)
             raise
-        return LoadedModel(self, identity, size, path)
+        return LoadedModel(self, identity, size, path, answered=answered)
 
     @contextlib.contextmanager
     def first(self, path: str, size: int) -> Iterator[None]:
@@ -290,9 +293,9 @@ def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
 class LoadedModel:
     """A model in a runtime's process."""
 
-    def __init__(self, process: RuntimeProcess, identity: str, size: int, path: str) -> None:
+    def __init__(self, process: RuntimeProcess, identity: str, size: int, path: str, *, answered: bool) -> None:
         self._process, self._identity, self._size, self._path = process, identity, size, path
-        self._answered = False
+        self._answered = answered
 
     def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str], **request: Any) -> Tensors:
         """The outputs in ``fetch`` by name; raises RunFailedError. ``request`` is for what one runtime alone can do."""

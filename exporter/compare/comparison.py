@@ -386,7 +386,7 @@ def _participants(
     for runtime in chosen:
         again = loading(runtime, path, candidate.ports.options, partial(_renamed, candidate))
         try:
-            model, run = again(pool)
+            model, run = again(pool, False)
         except RunFailedError as error:
             failure(candidate.label, runtime, error, "*")
             for problem in candidate.problems:

@@ -30,6 +30,9 @@ Feeds = Mapping[str, np.ndarray]
 Failure = Callable[[str, str, RunFailedError, str], None]
 #: What is fetched for each of several inputs.
 Run = Callable[[Sequence[Feeds], Sequence[str]], list[dict[str, np.ndarray]]]
+#: Loads an artefact in a pool: the model, to be unloaded, and how to run that. Of one that ``answered`` before nobody
+#: fears that it has no end.
+Loading = Callable[[RuntimePool, bool], tuple[LoadedModel, Run]]
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,8 @@ class Participant:
     path: Path | None = None
     #: what the model itself is fed, where any tool may have made it: its own names for the policy's inputs
     fed: Callable[[Feeds], Feeds] | None = None
-    #: loads it anew in a pool: the model, to be unloaded, and how to run that
-    again: Callable[[RuntimePool], tuple[LoadedModel, Run]] | None = None
+    #: loads it anew
+    again: Loading | None = None
 
     @property
     def name(self) -> str:
@@ -116,7 +119,7 @@ def participants_of(
             running = partial(_predicting, names) if WRITTEN[kind].predicts else partial(_limited, limit)
             again = loading(runtime, path, WRITTEN[kind].loader(key), running)
             try:
-                model, run = again(pool)
+                model, run = again(pool, False)
             except RunFailedError as error:
                 failure(label, runtime, error, "*")
                 continue
@@ -139,13 +142,11 @@ def in_order(results: Iterable[Finding], tested: PolicyUnderTest) -> tuple[Findi
     return tuple(sorted(results, key=place))
 
 
-def loading(
-    runtime: str, path: Path, options: Mapping[str, Any], running: Callable[[LoadedModel], Run]
-) -> Callable[[RuntimePool], tuple[LoadedModel, Run]]:
+def loading(runtime: str, path: Path, options: Mapping[str, Any], running: Callable[[LoadedModel], Run]) -> Loading:
     """What loads an artefact, as often as it is called, and says by ``running`` how it is run."""
 
-    def load(pool: RuntimePool) -> tuple[LoadedModel, Run]:
-        model = pool.process(runtime).load(str(path), **options)
+    def load(pool: RuntimePool, answered: bool) -> tuple[LoadedModel, Run]:
+        model = pool.process(runtime).load(str(path), answered=answered, **options)
         return model, running(model)
 
     return load

@@ -46,7 +46,11 @@ def resident(peers: Peers, module: str, function: str) -> Iterator[Callable[[lis
 
         def run(arguments: list[str]) -> None:
             print(json.dumps(arguments), file=to, flush=True)
-            status, said = json.loads(back.readline() or '[-1, "it ended"]')
+            try:
+                status, said = json.loads(back.readline() or '[-1, "it ended"]')
+            except BaseException:  # the test was interrupted: this answer must not be the next one's
+                process.kill()
+                raise
             assert status == 0, f"{module} {arguments}: status {status}\n{said}"
 
         yield run

@@ -108,6 +108,28 @@ def test_memory_is_bounded_by_what_it_is_given(tmp_path: Path) -> None:
             model.run({"x": np.array([FREE * 2], np.int64)}, ["y"])
 
 
+CYCLIC = """
+import numpy as np, weakref
+from converters.runtimes.child import claim_stdout, serve
+loaded = weakref.WeakSet()
+class Model:
+    def __init__(self):
+        self.itself = self  # as TensorFlow's graphs are
+        loaded.add(self)
+    def run(self, feeds, fetch, request):
+        return {"alive": np.array(len(loaded))}
+serve("cyclic", "1", lambda header: Model(), (), claim_stdout())
+"""
+
+
+def test_a_model_that_was_unloaded_is_gone(tmp_path: Path) -> None:
+    """Its memory is not counted any more: kept by its own cycles, TensorFlow's died after some dozens of policies."""
+    with RuntimeProcess("cyclic", [*hungry()[:2], hungry()[2].replace(HUNGRY, CYCLIC)]) as process:
+        for _ in range(3):
+            with process.load(str(tmp_path)) as model:
+                assert model.run({}, ["alive"])["alive"] == 1
+
+
 def test_memory_grows_with_what_it_is_fed(tmp_path: Path) -> None:
     with RuntimeProcess("hungry", hungry()) as process:
         model = process.load(str(tmp_path))

@@ -20,7 +20,8 @@ while True:
     header, _ = read_frame(sys.stdin.buffer)
     if header["cmd"] == "hang":
         time.sleep(3600)
-    while header["cmd"] == sys.argv[1]:
+    end = time.process_time() + float(sys.argv[2])
+    while header["cmd"] == sys.argv[1] and time.process_time() < end:
         pass
     write_frame(out, {"ok": True, "version": "1"})
 """
@@ -28,7 +29,7 @@ while True:
 
 def test_one_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "_LOOK", 0.1)
-    with RuntimeProcess("slow", [sys.executable, "-c", _PROGRAM, ""]) as slow:
+    with RuntimeProcess("slow", [sys.executable, "-c", _PROGRAM, "", "0"]) as slow:
         slow.start()
         monkeypatch.setattr(process, "TIMEOUT", 0.3)
         time.sleep(0.5)  # nobody asked: that is no hanging
@@ -48,8 +49,17 @@ def test_what_computes_for_ever_is_stopped_once_for_all_runtimes(
     monkeypatch.setattr(patience, "FIRST", 0.2)
     model = tmp_path / "model"
     model.touch()
-    pool = RuntimePool({name: lambda: [sys.executable, "-c", _PROGRAM, command] for name in ("one", "other")})
+    pool = RuntimePool({name: lambda: [sys.executable, "-c", _PROGRAM, command, "inf"] for name in ("one", "other")})
     with pool, pytest.raises(RunFailedError, match="one was stopped: it did not come to an end"):
         pool.process("one").load(str(model)).run({}, [])
     with pool, pytest.raises(RunFailedError, match="not run in other"):
         pool.process("other").load(str(model))
+
+
+def test_a_model_that_answered_before_may_take_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "_LOOK", 0.05)
+    monkeypatch.setattr(patience, "FIRST", 0.2)
+    model = tmp_path / "model"
+    model.touch()
+    with RuntimePool({"slow": lambda: [sys.executable, "-c", _PROGRAM, "run", "1"]}) as pool:
+        assert pool.process("slow").load(str(model), answered=True).run({}, []) == {}

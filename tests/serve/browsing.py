@@ -93,7 +93,12 @@ class _Browser:
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
             print(json.dumps(request), file=self._process.stdin, flush=True)
-        answer = self._process.stdout.readline()
+        try:
+            answer = self._process.stdout.readline()
+        except BaseException:  # the test was interrupted: this answer must not be the next one's
+            _browser.cache_clear()
+            self._process.kill()
+            raise
         if not answer:
             _browser.cache_clear()  # the next visit has another
             self._process.wait()

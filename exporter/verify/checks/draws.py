@@ -122,7 +122,7 @@ def repeated(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays
 
 def _asked(participant: Participant, pool: RuntimePool, ask: Callable[[Run], Arrays]) -> dict[str, np.ndarray]:
     assert participant.again is not None
-    model, run = participant.again(pool)
+    model, run = participant.again(pool, True)
     with model:
         return ask(run)
 
