@@ -1,7 +1,7 @@
 """Keras models as sources: ``.keras``, ``.h5`` and TensorFlow.js layers models, a list of layers and their weights.
 
 They are read as data. What is more than the layers of ``layers/table.py`` is left to Keras itself, for ``.keras`` and
-``.h5`` whose giver the caller trusts: it is frozen by TensorFlow (frozen.py).
+``.h5`` whose giver the caller trusts: it is frozen by TensorFlow (children.py).
 """
 
 from __future__ import annotations

@@ -134,6 +134,8 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
         origin = node.origin if index == 0 else f"{node.name}:{index}"
         pins.append(Node(name, "Identity", (reference,), origin=origin))
     roles = {node_of(t.name): role for k, t in signature.inputs.items() if (role := _role(graph, k, t)) is not None}
+    joined = [action for action, keys in _actions(signature).items() if len(keys) > 1]
+    moved.update({action: scope.fresh(f"{action}/inner") for action in joined if action in taken})
     pins += _several_actions(signature, scope)
     nodes = [*graph.renamed(moved).nodes, *(p.with_inputs(renamed_ref(r, moved) for r in p.inputs) for p in pins)]
     return Graph(topological(nodes)), {moved.get(n, n): role for n, role in roles.items()}
@@ -173,9 +175,14 @@ def _several_actions(signature: ModelSignature, scope: NameScope) -> list[Node]:
         if len(keys) == 1:
             continue  # it is pinned under that name
         columns = []
+        kinds = {key: tensor.dtype for key in keys if (tensor := signature.outputs[key]).dtype is not None}
+        common = np.result_type(*kinds.values())
         for key in keys:
             dims = signature.outputs[key].shape.dims
             columns.append(names[key])
+            if kinds[key] != common:
+                nodes.append(Node(scope.fresh("action/cast"), "Cast", (columns[-1],), {"DstT": common}))
+                columns[-1] = nodes[-1].name
             if dims is not None and len(dims) == 1:
                 fed = (columns[-1], const([-1, 1], "column_shape"))
                 nodes.append(Node(scope.fresh("action/column"), "Reshape", fed, {}))

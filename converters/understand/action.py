@@ -6,13 +6,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node
+from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import passes_on, traits
 from converters.graph.shapes import infer_types
 from signatures.records import dataclass
 from signatures.roles import Role
 
 _MAX_LEAVES = 1024
+#: Clips of classes one after the other that are looked through: each asks what lies behind it anew.
+_MAX_CLIPS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,18 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
     return leaves
 
 
+def _clips_behind(graph: Graph, node: Node) -> int:
+    """How many times classes are clipped one after the other until ``node``."""
+    found: dict[str, int] = {}
+    for each in graph.nodes:
+        bound = graph.constant(each.inputs[1]) if each.op == "Minimum" else None
+        clips = bound is not None and bound.dtype.kind in "iu"
+        found[each.name] = max((found.get(node_of(r), 0) for r in each.inputs), default=0) + clips
+        if each.name == node.name:
+            break
+    return found[node.name]
+
+
 def clips_nothing(graph: Graph, node: Node, width: Callable[[Graph, str], int | None]) -> bool:
     """Whether a node holds classes within bounds that they cannot leave (TF-Agents clips to the action's space).
 
@@ -112,6 +126,8 @@ def clips_nothing(graph: Graph, node: Node, width: Callable[[Graph, str], int | 
         return False
     if node.op == "Maximum":
         return bool((bound <= 0).all())
+    if _clips_behind(graph, node) > _MAX_CLIPS:
+        return False
     widths = [width(graph, leaf) for leaf in _leaves(graph, node.inputs[0])]
     return all(w is not None and bool((bound >= w - 1).all()) for w in widths)
 

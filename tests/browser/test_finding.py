@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from converters.runtimes.base import RuntimeInfo
-from converters.runtimes.javascript import browser
+from converters.runtimes.javascript import browser, node
 from converters.runtimes.javascript.browser import (
     CHROMIUM_VARIABLE,
     RUNTIMES,
@@ -93,7 +93,7 @@ def test_webgl_does_not_ask_for_the_wasm_backend(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(browser, "node_executable", lambda: "node")
+    monkeypatch.setattr(node, "node_executable", lambda: "node")
     monkeypatch.setattr(browser, "chromium_executable", lambda: None)
     with pytest.raises(RuntimeUnavailableError, match="Chromium is not installed"):
         WEBGL.command()
@@ -102,7 +102,7 @@ def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> No
     assert command[0] == "node"
     assert command[2:4] == ["--runtime", "tfjs-webgl"]
     assert command[-3:] == ["--chromium", "chrome", "--known"]
-    monkeypatch.setattr(browser, "node_executable", lambda: None)
+    monkeypatch.setattr(node, "node_executable", lambda: None)
     with pytest.raises(RuntimeUnavailableError, match="Node is not installed"):
         WEBGL.command()
 

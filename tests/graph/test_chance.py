@@ -123,6 +123,17 @@ def test_a_class_held_within_bounds_that_it_cannot_leave_is_a_draw(most: int, me
     np.testing.assert_array_equal(run(policy, "deterministic_action")[0][:, 0], STATE.argmax(1))
 
 
+def test_clips_one_after_the_other_are_no_riddle() -> None:
+    """Each asked what lies behind it anew: thirty took hours."""
+    made = graph(
+        *(OBSERVATION, const("axis", 1), const("most", 2)),
+        node("clip0", "ArgMax", OBSERVATION.name, "axis", output_type=np.dtype("i4")),
+        *(node(f"clip{i}", "Minimum", f"clip{i - 1}", "most") for i in range(1, 60)),
+        node("action", "Identity", "clip59"),
+    )
+    np.testing.assert_array_equal(run(compiled(made), "action")[0].ravel(), STATE.argmax(axis=1))
+
+
 def epsilon_greedy(exploring: str, threshold: float) -> list[Node]:
     """``action`` [B]: where a uniform number is less than the threshold ``exploring``, else the largest of three."""
     exploration = {

@@ -12,6 +12,7 @@ from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
+from converters.graph.shapes import infer_types
 from converters.saved_model.lengths import without_counted
 from converters.saved_model.reader import read_saved_model
 from converters.saved_model.signature import ModelSignature, Tensor, expose
@@ -200,6 +201,21 @@ def test_parts_of_an_action_stand_side_by_side() -> None:
     hybrid, facts = made({**numbers, "action/jump": class_of["action/9"]})
     assert facts.outputs == {"discrete_actions": Role.ACTION, "continuous_actions": Role.ACTION}
     assert (hybrid["continuous_actions"].origin, hybrid["discrete_actions"].origin) == ("b:0", "c1:0")
+
+
+def test_parts_of_several_kinds_are_joined_beside_a_node_of_that_name() -> None:
+    """onnxruntime joins one dtype only; and the graph may have called something ``discrete_actions`` itself."""
+    x, rows = TensorShape((None, 2)), TensorShape((None,))
+    nodes = [Node("x", "Placeholder", attrs={"dtype": F32, "shape": x}), Node("discrete_actions", "Neg", ("x",))]
+    nodes += [Node("axis", "Const", value=np.array(1, np.int32))]
+    kinds = {"long": np.dtype("i8"), "short": np.dtype("i4")}
+    nodes += [Node(n, "ArgMax", ("discrete_actions", "axis"), {"output_type": kind}) for n, kind in kinds.items()]
+    parts = {f"action/{i}": Tensor(f"{n}:0", kinds[n], rows) for i, n in enumerate(kinds)}
+    joined, _ = with_facts(Graph(tuple(nodes)), ModelSignature({"x": Tensor("x:0", F32, x)}, parts))
+    assert joined["discrete_actions"].op == "ConcatV2"
+    assert {infer_types(joined)[r].dtype for r in joined["discrete_actions"].inputs[:-1]} == {np.dtype("i8")}
+    found = run_graph(joined, {"x": np.array([[1, -2], [0, 3]], np.float32)}, ["discrete_actions"])["discrete_actions"]
+    np.testing.assert_array_equal(found, [[1, 1], [0, 0]])
 
 
 def test_an_input_of_which_only_the_length_is_read_is_none() -> None:
