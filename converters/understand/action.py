@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -104,16 +104,17 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
     return leaves
 
 
-def _clips_behind(graph: Graph, node: Node) -> int:
-    """How many times classes are clipped one after the other until ``node``."""
-    found: dict[str, int] = {}
-    for each in graph.nodes:
-        bound = graph.constant(each.inputs[1]) if each.op == "Minimum" else None
-        clips = bound is not None and bound.dtype.kind in "iu"
-        found[each.name] = max((found.get(node_of(r), 0) for r in each.inputs), default=0) + clips
-        if each.name == node.name:
-            break
-    return found[node.name]
+def _clips_until(graph: Graph) -> Mapping[str, int]:
+    """How many times classes are clipped one after the other until a node, by its name."""
+    if _clips_until not in graph.made:
+        found: dict[str, int] = {}
+        for node in graph.nodes:
+            bound = graph.constant(node.inputs[1]) if node.op == "Minimum" else None
+            clips = bound is not None and bound.dtype.kind in "iu"
+            found[node.name] = max((found.get(node_of(r), 0) for r in node.inputs), default=0) + clips
+        graph.made[_clips_until] = found
+    known: Mapping[str, int] = graph.made[_clips_until]
+    return known
 
 
 def clips_nothing(graph: Graph, node: Node, width: Callable[[Graph, str], int | None]) -> bool:
@@ -126,7 +127,7 @@ def clips_nothing(graph: Graph, node: Node, width: Callable[[Graph, str], int | 
         return False
     if node.op == "Maximum":
         return bool((bound <= 0).all())
-    if _clips_behind(graph, node) > _MAX_CLIPS:
+    if _clips_until(graph)[node.name] > _MAX_CLIPS:
         return False
     widths = [width(graph, leaf) for leaf in _leaves(graph, node.inputs[0])]
     return all(w is not None and bool((bound >= w - 1).all()) for w in widths)
