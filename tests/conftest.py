@@ -7,10 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import os
-import pkgutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,13 +15,11 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-import converters
-import exporter
-import signatures
 from converters.formats import DEFAULTS, WRITTEN
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
+from tests.tracing import Tracing
 
 # pytest-xdist gives its workers 80; what a command prints is not to depend on how the tests are run.
 os.environ.pop("COLUMNS", None)
@@ -55,49 +50,18 @@ _ROOMS = frozenset(
 )
 _FIXTURE = "processes"
 
-#: Where one file after the other runs the same lines, coverage traces one in so many: Python takes nearly twice as long
-#: under it (3.11 has no other way), and the lines are the same.
-_TRACED = {"corpus": 8, "legacy": 8, "slow": 4}
-#: Of a test with more than so many cases, one in four.
-_MANY = 64
 
-
-@pytest.hookimpl(wrapper=True)
-def pytest_collection(session: pytest.Session) -> Iterator[Any]:
-    """All modules of the product are imported under coverage; then it rests until the first test.
-
-    pytest rewrites and imports the tests meanwhile, which took most of a minute in each worker.
-    """
-    plugins = session.config.pluginmanager
-    controller = plugins.getplugin("_cov").cov_controller if plugins.hasplugin("_cov") else None
-    if controller is None or not controller.started or plugins.hasplugin("dsession"):  # whose workers collect
-        return (yield)
-    for package in (signatures, converters, exporter):
-        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith("__main__"):
-                importlib.import_module(module.name)
-    controller.pause()
-    try:
-        return (yield)
-    finally:
-        controller.resume()
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Tracing(config), Tracing.NAME)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what ``make check`` leaves out, and of sweeps what coverage does; tell pytest-xdist the groups."""
-    families = Counter(item.nodeid.partition("[")[0] for item in items)
-    swept: Counter[str] = Counter()
+    config.pluginmanager.getplugin(Tracing.NAME).mark(items)
     for item in items:
         rooms = set(item.path.relative_to(Path(__file__).parent).parts)
         if rooms & _ROOMS or _FIXTURE in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.runtimes)
-        of = max((count for name, count in _TRACED.items() if item.get_closest_marker(name)), default=1)
-        if config.pluginmanager.hasplugin("_cov"):
-            family = item.nodeid.partition("[")[0]
-            of = max(of, 4 if families[family] > _MANY else 1)
-            if swept[family] % of:
-                item.add_marker(pytest.mark.no_cover)
-            swept[family] += 1
         groups = sorted({mark.args[0] for mark in item.iter_markers("xdist_group")})
         if groups and config.getoption("loadgroup", False) and hasattr(item, "_id"):
             # pytest-xdist 3.8 writes it to a field that pytest 9.2 no longer reads: each worker made all fixtures.
