@@ -255,13 +255,14 @@ def test_a_crawler_walks_ahead_and_lands_on_its_feet(bundle: Bundle, tmp_path: P
             ["wait", f"{STATUS}.seconds > 5"],
             ["click", "#pause"],
             ["eval", farthest],
-            ["eval", f"{farthest} / {STATUS}.seconds"],
+            ["eval", f"{farthest} / (globalThis.halted = Number({STATUS}.seconds))"],
             ["eval", height],
             ["drag", "#canvas", [0.55, 0.85], [0.58, 0.74]],
             ["eval", height],
             ["eval", ahead],
             ["click", "#pause"],
-            ["wait", f"{STATUS}.seconds > 15"],
+            # Not an hour fixed beforehand: a busy machine may have come to the pause late.
+            ["wait", f"{STATUS}.seconds > halted + 10"],
             ["eval", farthest],
         ],
     )
