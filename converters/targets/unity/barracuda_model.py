@@ -15,20 +15,7 @@ import numpy as np
 
 from converters.barracuda.format import NnModel, four_axes
 from converters.targets.unity.findings import Thrown, UnityThrows, null_reference
-from converters.targets.unity.model import (
-    ACTION_SHAPE,
-    CONTINUOUS,
-    CONTINUOUS_SHAPE,
-    DISCRETE,
-    DISCRETE_SHAPE,
-    IS_CONTINUOUS,
-    MEMORY_SIZE,
-    VERSION,
-    CheckedModel,
-    InputView,
-    action_output,
-    truncated,
-)
+from converters.targets.unity.model import MEMORY_SIZE, VERSION, CheckedModel, InputView, truncated
 from converters.targets.unity.onnx_file import Dims, OnnxFile, attributes
 from signatures.records import dataclass
 
@@ -65,6 +52,9 @@ class BarracudaModel(CheckedModel):
             )
         return truncated(found[0])
 
+    _deprecated = _first_of_shape = _first
+    _shape = constant
+
     @property
     def version(self) -> int:
         """The API version; a NullReferenceException where the file has none."""
@@ -79,33 +69,6 @@ class BarracudaModel(CheckedModel):
         """The outputs that a player fetches; finding them reads the version too."""
         self._first(VERSION)
         return super().fetched(deterministic)
-
-    def has_continuous(self, deterministic: bool) -> bool:
-        """By output and shape, or by ``is_continuous_control``."""
-        if not self.names_kinds:
-            return self._first(IS_CONTINUOUS) > 0
-        return self.has_output(action_output(CONTINUOUS, deterministic)) and self._first(CONTINUOUS_SHAPE) > 0
-
-    def has_discrete(self, deterministic: bool) -> bool:
-        """By output and shape, or by ``is_continuous_control``."""
-        if not self.names_kinds:
-            return self._first(IS_CONTINUOUS) == 0
-        return self.has_output(action_output(DISCRETE, deterministic)) and self.discrete_size > 0
-
-    @property
-    def continuous_size(self) -> int:
-        """The number of continuous actions in the file's constants."""
-        if not self.names_kinds:
-            return self._first(ACTION_SHAPE) if self._first(IS_CONTINUOUS) > 0 else 0
-        return self._first(CONTINUOUS_SHAPE) if CONTINUOUS_SHAPE in self.constants else 0
-
-    @property
-    def discrete_size(self) -> int:
-        """The sum of the branches in the file's constants."""
-        if not self.names_kinds:
-            return 0 if self._first(IS_CONTINUOUS) > 0 else self._first(ACTION_SHAPE)
-        shape = self.constants.get(DISCRETE_SHAPE)
-        return 0 if shape is None else sum(truncated(n) for n in shape)
 
 
 def of_onnx(file: OnnxFile) -> BarracudaModel:

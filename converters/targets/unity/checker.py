@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from converters.barracuda import format as nn_format
 from converters.fetch import Fetched, read_bytes
@@ -18,7 +18,7 @@ from converters.targets.unity.findings import Finding, Severity, Thrown, UnityTh
 from converters.targets.unity.model import CheckedModel
 from converters.targets.unity.onnx_file import OnnxFile, read_onnx_file
 from converters.targets.unity.overlooked import overlooked
-from converters.targets.unity.readings import Misreading, Reading, misreadings
+from converters.targets.unity.readings import Reading, misreadings
 from converters.targets.unity.settings import Brain
 from signatures.errors import ExportModelError, SourceError
 from signatures.records import dataclass
@@ -28,6 +28,7 @@ MODES = {"stochastic": False, "deterministic": True}
 _NN_FORMATS = range(16, 21)
 #: Barracuda takes its format's number from the first eight bytes, which hold a magic number too.
 _MAGIC = 255
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +124,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
         model = barracuda_model.of_onnx(file)
     else:
         model = sentis_model.of_onnx(file, consumer)
-    agent = brain or assumed_brain(model, onnx_ranks(file, model))
-    modes = {name: _mode(model, consumer, agent, deterministic, file) for name, deterministic in MODES.items()}
-    unsaid = overlooked(model, agent, _fetched(modes), _silent(modes), consumer, file)
-    return UnityVerdict(path, consumer, agent, None, modes, unsaid, wrong, brain is None)
+    return _imported(path, consumer, brain, model, onnx_ranks(file, model), file, wrong)
 
 
 def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:
@@ -142,57 +140,50 @@ def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdi
     if refused is not None:
         return UnityVerdict(path, consumer, brain or Brain(), refused, assumed=brain is None)
     parsed = nn_format.parse(data)
-    model = barracuda_model.of_nn(parsed)
-    agent = brain or assumed_brain(model, nn_ranks(parsed))
-    modes = {name: _mode(model, consumer, agent, deterministic, None) for name, deterministic in MODES.items()}
-    unsaid = overlooked(model, agent, _fetched(modes), _silent(modes), consumer)
-    return UnityVerdict(path, consumer, agent, None, modes, unsaid, assumed=brain is None)
+    return _imported(path, consumer, brain, barracuda_model.of_nn(parsed), nn_ranks(parsed))
 
 
-def _fetched(modes: Mapping[str, ModeVerdict]) -> dict[str, tuple[str, ...] | Thrown]:
-    """What a player fetches, of the modes in which it gets so far: past loading."""
-    return {name: mode.fetched for name, mode in modes.items() if mode.load is None}
-
-
-def _silent(modes: Mapping[str, ModeVerdict]) -> list[str]:
-    return [name for name, mode in modes.items() if mode.accepted]
+def _imported(
+    path: Path,
+    consumer: Consumer,
+    brain: Brain | None,
+    model: CheckedModel,
+    ranks: Sequence[int],
+    file: OnnxFile | None = None,
+    wrong: tuple[Finding, ...] = (),
+) -> UnityVerdict:
+    """The verdict on a model that was imported; ``ranks`` are the numbers of axes of its inputs."""
+    agent = brain or assumed_brain(model, ranks)
+    modes = {name: _mode(model, consumer, agent, deterministic, file) for name, deterministic in MODES.items()}
+    fetched = {name: mode.fetched for name, mode in modes.items() if mode.load is None}  # past loading
+    silent = [name for name, mode in modes.items() if mode.accepted]
+    unsaid = overlooked(model, agent, fetched, silent, consumer, file)
+    return UnityVerdict(path, consumer, agent, None, modes, unsaid, wrong, brain is None)
 
 
 def _mode(
     model: CheckedModel, consumer: Consumer, brain: Brain, deterministic: bool, file: OnnxFile | None
 ) -> ModeVerdict:
     if isinstance(model, sentis_model.SentisModel) and file is not None:
-        thrown = sentis_model.failure(file, consumer) or _throws(lambda: model.load(deterministic))
+        thrown = sentis_model.failure(file, consumer) or _tried(lambda: model.load(deterministic))
         if thrown is not None:
             return ModeVerdict(thrown, (), thrown, thrown)
-    checks: tuple[Finding, ...] = ()
-    check_throws = None
-    try:
-        checks = tuple(rules.check(model, brain, deterministic, consumer.profile))
-    except UnityThrows as raised:
-        check_throws = raised.thrown
-    fetched: tuple[str, ...] | Thrown
-    try:
-        fetched = model.fetched(deterministic)
-    except UnityThrows as raised:
-        fetched = raised.thrown
-    return ModeVerdict(_load(model, consumer), checks, check_throws, fetched)
+    checks = _tried(lambda: rules.check(model, brain, deterministic, consumer.profile))
+    fetched = _tried(lambda: model.fetched(deterministic))
+    load = _tried(lambda: rules.version_error(model, consumer.profile))
+    if isinstance(load, Finding):
+        load = Thrown("UnityAgentsException", load.message, load.where, load.fix)
+    if isinstance(checks, Thrown):
+        return ModeVerdict(load, (), checks, fetched)
+    return ModeVerdict(load, tuple(checks), None, fetched)
 
 
-def _load(model: CheckedModel, consumer: Consumer) -> Thrown | None:
+def _tried(step: Callable[[], _Result]) -> _Result | Thrown:
+    """What a step gives, or what it throws."""
     try:
-        error = rules.version_error(model, consumer.profile)
+        return step()
     except UnityThrows as raised:
         return raised.thrown
-    return None if error is None else Thrown("UnityAgentsException", error.message, error.where, error.fix)
-
-
-def _throws(step: Callable[[], None]) -> Thrown | None:
-    try:
-        step()
-    except UnityThrows as raised:
-        return raised.thrown
-    return None
 
 
 _SAYS = {
@@ -215,7 +206,8 @@ def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
         return ()
     found: dict[tuple[Reading, str, str], list[str]] = {}
     for reading in misreadings(model, [consumer.runtime]):
-        found.setdefault(_kind(reading), []).append(reading.construct.name)
+        op = {INPUT: "an input", OUTPUT: "an output"}.get(reading.construct.op, reading.construct.op)
+        found.setdefault((reading.rule.reading, op, reading.rule.says), []).append(reading.construct.name)
     return tuple(
         Finding(
             Severity.ERROR,
@@ -225,11 +217,6 @@ def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
         )
         for (kind, op, says), names in found.items()
     )
-
-
-def _kind(found: Misreading) -> tuple[Reading, str, str]:
-    op = {INPUT: "an input", OUTPUT: "an output"}.get(found.construct.op, found.construct.op)
-    return found.rule.reading, op, found.rule.says
 
 
 def _places(names: list[str]) -> str:

@@ -6,7 +6,7 @@ JSON and a stack, only its beginning is given.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from converters.targets.unity.consumers import Consumer, Engine
@@ -64,7 +64,7 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
                 f"node {layer} ({node.op_type})",
                 "Barracuda has no such operator: --for barracuda-3 writes the policy without it",
             )
-        why = _REFUSED[node.op_type](file, node, layer) if node.op_type in _REFUSED else None
+        why = _refused(file, node, layer)
         if why is not None:
             yield Thrown(
                 "OnnxImportException",
@@ -74,58 +74,28 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
             )
 
 
-def _split(file: OnnxFile, node: Any, layer: str) -> str | None:
-    del file
-    if "split" in attributes(node):
-        return None
-    return f"Unsupported default attribute `split` for node {layer} of type Split. Value is required."
-
-
-def _gemm(file: OnnxFile, node: Any, layer: str) -> str | None:
-    del layer
-    without = len(node.input) < 3 or not node.input[2]
-    constant = len(node.input) > 1 and file.is_constant(node.input[1])
-    return "required Input 2 was not found." if without and constant else None
-
-
-def _lstm(file: OnnxFile, node: Any, layer: str) -> str | None:
-    del file, layer
-    if len(node.input) < 4 or not node.input[3]:
-        return "required Input 3 was not found."
-    direction = attributes(node).get("direction")
-    if direction is not None and direction.s not in (b"", b"forward"):
-        return "Assertion failure. Value was False\nExpected: True"
+def _refused(file: OnnxFile, node: Any, layer: str) -> str | None:
+    """What is said to an operator in a form that is not taken; None to every other."""
+    held, given = attributes(node), dict(enumerate(node.input))
+    match node.op_type:
+        case "Split" if "split" not in held:
+            return f"Unsupported default attribute `split` for node {layer} of type Split. Value is required."
+        case "Gemm" if not given.get(2) and file.is_constant(given.get(1, "")):
+            return "required Input 2 was not found."
+        case "LSTM" if not given.get(3):
+            return "required Input 3 was not found."
+        case "LSTM" if "direction" in held and held["direction"].s not in (b"", b"forward"):
+            return "Assertion failure. Value was False\nExpected: True"
+        case "Conv" if 1 in given and not file.is_constant(given[1]):
+            return (
+                "Currently only constant tensors are supported for `W` input in node of type Conv. "
+                f"Instead {layer}.W is pointing to non constant node {given[1]}."
+            )
+        case "Constant" if "value" not in held:
+            return "Couldn't find attribute value of type Tensor"
+        case "Add" if any(getattr(file.producers.get(name), "op_type", "") == "Range" for name in node.input):
+            return "Assertion failure. Value was False\nExpected: True"
     return None
-
-
-def _conv(file: OnnxFile, node: Any, layer: str) -> str | None:
-    if len(node.input) < 2 or file.is_constant(node.input[1]):
-        return None
-    return (
-        "Currently only constant tensors are supported for `W` input in node of type Conv. "
-        f"Instead {layer}.W is pointing to non constant node {node.input[1]}."
-    )
-
-
-def _constant(file: OnnxFile, node: Any, layer: str) -> str | None:
-    del file, layer
-    return None if "value" in attributes(node) else "Couldn't find attribute value of type Tensor"
-
-
-def _add(file: OnnxFile, node: Any, layer: str) -> str | None:
-    del layer
-    ranges = [name for name in node.input if getattr(file.producers.get(name), "op_type", "") == "Range"]
-    return "Assertion failure. Value was False\nExpected: True" if ranges else None
-
-
-_REFUSED: dict[str, Callable[[OnnxFile, Any, str], str | None]] = {
-    "Split": _split,
-    "Gemm": _gemm,
-    "LSTM": _lstm,
-    "Conv": _conv,
-    "Constant": _constant,
-    "Add": _add,
-}
 
 
 # ------------------------------------------------------------------ Sentis, Inference Engine
@@ -174,11 +144,11 @@ def _attributes(node: Any, consumer: Consumer, opset: int) -> Iterator[Thrown]:
             "store the number as a tensor",
         )
     try:
-        schema = onnx.defs.get_schema(node.op_type, opset, "")
+        said: Mapping[str, Any] = onnx.defs.get_schema(node.op_type, opset, "").attributes
     except onnx.defs.SchemaError:
         return
     for name, attribute in held.items():
-        wanted = _attribute_type(schema.attributes[name]) if name in schema.attributes else attribute.type
+        wanted = int(said[name].type.value) if name in said else attribute.type
         if attribute.type not in (wanted, 0) and wanted in _TYPES:
             yield Thrown(
                 "OnnxImportException",
@@ -187,11 +157,6 @@ def _attributes(node: Any, consumer: Consumer, opset: int) -> Iterator[Thrown]:
                 f"{name} is a {_TYPES.get(attribute.type, 'graph')} in the file; "
                 f"--for {consumer.profile} writes it as the operator says",
             )
-
-
-def _attribute_type(attribute: Any) -> int:
-    """The schema's type of an attribute as AttributeProto.AttributeType."""
-    return int(attribute.type.value)
 
 
 def _identity_of_reshaped_output(file: OnnxFile, name: str) -> bool:

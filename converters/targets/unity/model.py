@@ -59,22 +59,43 @@ class CheckedModel(ABC):
         """The memory's size, 0 for none."""
 
     @abstractmethod
-    def has_continuous(self, deterministic: bool) -> bool:
-        """Whether there are continuous actions to fetch."""
+    def _deprecated(self, name: str) -> int:
+        """The number of one of the deprecated pair; throws where it is not there."""
 
     @abstractmethod
+    def _shape(self, name: str) -> np.ndarray | None:
+        """The numbers of a constant that holds the shape of an action; None where there is none."""
+
+    @abstractmethod
+    def _first_of_shape(self, name: str) -> int:
+        """The first of them, as it is read without a look whether it is there."""
+
+    def has_continuous(self, deterministic: bool) -> bool:
+        """Whether there are continuous actions to fetch: by output and shape, or by ``is_continuous_control``."""
+        if not self.names_kinds:
+            return self._deprecated(IS_CONTINUOUS) > 0
+        return self.has_output(action_output(CONTINUOUS, deterministic)) and self._first_of_shape(CONTINUOUS_SHAPE) > 0
+
     def has_discrete(self, deterministic: bool) -> bool:
-        """Whether there are discrete actions to fetch."""
+        """Whether there are discrete actions to fetch: by output and shape, or by ``is_continuous_control``."""
+        if not self.names_kinds:
+            return self._deprecated(IS_CONTINUOUS) == 0
+        return self.has_output(action_output(DISCRETE, deterministic)) and self.discrete_size > 0
 
     @property
-    @abstractmethod
     def continuous_size(self) -> int:
         """The number of continuous actions that the model says it has."""
+        if not self.names_kinds:
+            return self._deprecated(ACTION_SHAPE) if self._deprecated(IS_CONTINUOUS) > 0 else 0
+        return 0 if self._shape(CONTINUOUS_SHAPE) is None else self._first_of_shape(CONTINUOUS_SHAPE)
 
     @property
-    @abstractmethod
     def discrete_size(self) -> int:
         """The sum of the branches that the model says it has."""
+        if not self.names_kinds:
+            return 0 if self._deprecated(IS_CONTINUOUS) > 0 else self._deprecated(ACTION_SHAPE)
+        shape = self._shape(DISCRETE_SHAPE)
+        return 0 if shape is None else sum(map(truncated, shape))
 
     def has_output(self, name: str) -> bool:
         """Whether an output is found under this name."""
@@ -94,12 +115,9 @@ class CheckedModel(ABC):
 
     def fetched(self, deterministic: bool) -> tuple[str, ...]:
         """The outputs that a player fetches."""
-        prefix = DETERMINISTIC if deterministic else ""
-        names = []
-        if self.names_kinds:
-            names += [prefix + CONTINUOUS] if self.has_continuous(deterministic) else []
-            names += [prefix + DISCRETE] if self.has_discrete(deterministic) else []
-        elif self.has_continuous(deterministic) or self.has_discrete(deterministic):
+        kinds = ((CONTINUOUS, self.has_continuous(deterministic)), (DISCRETE, self.has_discrete(deterministic)))
+        names = [action_output(name, deterministic) for name, there in kinds if there]
+        if names and not self.names_kinds:
             names = [ACTION]
         return (*names, RECURRENT_OUT) if self.memory_size > 0 else tuple(names)
 

@@ -167,10 +167,6 @@ def _is_float(operand: Operand) -> bool:
     return operand.dtype is None or operand.dtype.kind == "f"
 
 
-def _truncates(c: Construct) -> bool:
-    return _cast_to("i")(c) and _fraction(c.operand(0), c)
-
-
 def _not_zero_or_one(c: Construct) -> bool:
     """A float cast to bool that is no mask: a mask is an input of that name."""
     return _cast_to("b")(c) and "mask" not in c.operand(0).name
@@ -294,20 +290,8 @@ def _identity_of_reshaped(c: Construct) -> bool:
     return source in c.model.outputs and made is not None and made.op == "Reshape"
 
 
-def _given_through(c: Construct) -> bool:
-    return c.operand(0).source is Source.INPUT
-
-
-def _valued(c: Construct) -> bool:
-    return "value" not in c.attributes
-
-
 def _many_dims(c: Construct) -> bool:
     return _rank(c.operand(0)) > 2 or _rank(c.operand(1)) > 2
-
-
-def _broadcast(c: Construct) -> bool:
-    return c.operand(1).fixed
 
 
 def _slopes(c: Construct) -> bool:
@@ -370,7 +354,8 @@ def _rules() -> Iterator[Rule]:
 
     last = _all(lambda c: bool(c.attribute("select_last_index", 0)))
     yield Rule(("ArgMax", "ArgMin"), wrong, _LATER, "select_last_index is not read", "ArgMax_06", last)
-    yield Rule(("Cast",), wrong, _BARRACUDA, "to an integer: fractions are kept", "Cast_01", _truncates)
+    truncated = _all(_cast_to("i"), lambda c: _fraction(c.operand(0), c))
+    yield Rule(("Cast",), wrong, _BARRACUDA, "to an integer: fractions are kept", "Cast_01", truncated)
     yield Rule(("Cast",), wrong, _NAMES, "to bool: the value is kept", "Cast_03", _not_zero_or_one)
     bounds = _all(lambda c: _computed(1)(c) or _computed(2)(c))
     yield Rule(("Clip",), wrong, _LATER, "a computed bound is not read", "Clip_07", bounds)
@@ -396,7 +381,8 @@ def _rules() -> Iterator[Rule]:
     hidden = _all(_of_image_input, lambda c: not c.given_out)
     yield Rule(("Transpose",), fails, _FIRST, "of an NHWC input", "Conv_15", hidden)
     unknown = "Barracuda 1.4 and later"
-    yield Rule(("Expand",), fails, _FIRST, f"to a constant shape, batch above 1; {unknown} do", "Expand_01", _broadcast)
+    says = f"to a constant shape, batch above 1; {unknown} do"
+    yield Rule(("Expand",), fails, _FIRST, says, "Expand_01", lambda c: c.operand(1).fixed)
     yield Rule(("Shape",), wrong, _LATER, "as an output: the batch is that of the import", "Shape_01", _seen)
     yield Rule(("TopK",), fails, _FIRST, f"{unknown} run it", "TopK_01")
     yield Rule(("ScatterND",), wrong, _NAMES[3:5], "other values", "ScatterND_01")
@@ -425,8 +411,10 @@ def _rules() -> Iterator[Rule]:
     yield Rule(four, wrong, _FIRST, "operands of different rank: another shape", "Add_10", _grows)
     yield Rule(four, fails, _FIRST, "a vector over the last axis of rank 3", "Add_06", _last_of_three)
     yield Rule(("Round",), wrong, _FIRST, "halves are not rounded to even", "Round_01")
-    yield Rule(("Constant",), refused, _NAMES[:7], "value_float and value_floats", "Constant_02", _valued)
-    yield Rule((OUTPUT,), refused, _NAMES[5:], "an input that is an output", "output_02", _given_through)
+    unheld = "value_float and value_floats"
+    yield Rule(("Constant",), refused, _NAMES[:7], unheld, "Constant_02", lambda c: "value" not in c.attributes)
+    through = "an input that is an output"
+    yield Rule((OUTPUT,), refused, _NAMES[5:], through, "output_02", lambda c: c.operand(0).source is Source.INPUT)
     again = "an Identity of an output that a Reshape makes"
     yield Rule((OUTPUT,), refused, _NAMES[7:], again, "beside the 352", _identity_of_reshaped)
 

@@ -71,7 +71,7 @@ def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str
         yield from _shapes(model, brain, _testers_of_version_2(brain), spared="visual_observation")
     elif model.version == LAST_VERSION:
         yield from _inputs_of_version_3(model, brain, deterministic, profile)
-        yield from _shapes(model, brain, _testers_of_version_3(brain))
+        yield from _shapes(model, brain, {_observation(i): _tester(sensor) for i, sensor in enumerate(brain.sensors)})
     yield from _actions(model, brain)
 
 
@@ -265,10 +265,6 @@ def culture_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(1 + c.isalnum() + c.isalpha(), _SIGNS.find(c), c.lower()) for c in name], name.swapcase()
 
 
-def _testers_of_version_3(brain: Brain) -> dict[str, Tester]:
-    return {_observation(i): _tester(sensor) for i, sensor in enumerate(brain.sensors)}
-
-
 def _testers_of_version_2(brain: Brain) -> dict[str, Tester]:
     testers: dict[str, Tester] = {VECTOR: lambda view: _vector(view, brain)}
     cameras = [s for s in brain.sensors if len(s.shape) == 3]
@@ -278,27 +274,19 @@ def _testers_of_version_2(brain: Brain) -> dict[str, Tester]:
 
 
 def _tester(sensor: Sensor) -> Tester:
-    tests = {1: _rank_one, 2: _rank_two, 3: _camera}
-    return lambda view: tests[len(sensor.shape)](view, sensor)
+    test = _camera if len(sensor.shape) == 3 else _row
+    return lambda view: test(view, sensor)
 
 
-def _rank_one(view: InputView, sensor: Sensor) -> Finding | None:
-    if sensor.shape[0] == view.channels:
-        return None
-    held = [view.channels]
-    if view.width > 1:
-        held = [view.channels, view.width]
-    if view.height > 1:
-        held = [view.height, view.width, view.channels]
-    return _mismatch("An Observation", list(sensor.shape), held, view, sensor)
-
-
-def _rank_two(view: InputView, sensor: Sensor) -> Finding | None:
-    if sensor.shape == (view.channels, view.width):
-        return None
+def _row(view: InputView, sensor: Sensor) -> Finding | None:
+    """A vector, or a list of entities."""
     held = [view.channels, view.width]
+    if list(sensor.shape) == held[: len(sensor.shape)]:
+        return None
     if view.height > 1:
         held = [view.height, view.width, view.channels]
+    elif len(sensor.shape) == 1 and view.width <= 1:
+        held = [view.channels]
     return _mismatch("An Observation", list(sensor.shape), held, view, sensor)
 
 

@@ -7,9 +7,11 @@ counts as 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from functools import cached_property
+from itertools import zip_longest
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,7 +30,6 @@ from converters.targets.unity.model import (
     VERSION,
     CheckedModel,
     InputView,
-    action_output,
     truncated,
 )
 from converters.targets.unity.onnx_file import Dims, OnnxFile, attributes
@@ -84,9 +85,13 @@ class SentisModel(CheckedModel):
             )
         return found.ravel()
 
-    def _number(self, name: str) -> int | None:
-        found = self._read(name, _SINGLE)
-        return None if found is None or not found.size else truncated(found[0])
+    def _shape(self, name: str) -> np.ndarray | None:
+        return self._read(name, _SINGLE)
+
+    def _first_of_shape(self, name: str) -> int:
+        """0 where it is not there."""
+        found = self._shape(name)
+        return 0 if found is None or not found.size else truncated(found[0])
 
     def _deprecated(self, name: str) -> int:
         found = self._read(name, _INT32)
@@ -97,40 +102,13 @@ class SentisModel(CheckedModel):
     @cached_property
     def version(self) -> int:
         """The API version; −1 where there is none, or none above 0."""
-        number = self._number(VERSION)
-        return number if number is not None and number > 0 else -1
+        number = self._first_of_shape(VERSION)
+        return number if number > 0 else -1
 
     @cached_property
     def memory_size(self) -> int:
         """The memory's size; 0 where the file does not say it."""
-        return self._number(MEMORY_SIZE) or 0
-
-    def has_continuous(self, deterministic: bool) -> bool:
-        """By output and shape, or by ``is_continuous_control``."""
-        if not self.names_kinds:
-            return self._deprecated(IS_CONTINUOUS) > 0
-        return self.has_output(action_output(CONTINUOUS, deterministic)) and (self._number(CONTINUOUS_SHAPE) or 0) > 0
-
-    def has_discrete(self, deterministic: bool) -> bool:
-        """By output and shape, or by ``is_continuous_control``."""
-        if not self.names_kinds:
-            return self._deprecated(IS_CONTINUOUS) == 0
-        return self.has_output(action_output(DISCRETE, deterministic)) and self.discrete_size > 0
-
-    @property
-    def continuous_size(self) -> int:
-        """The number of continuous actions in the file's constants."""
-        if not self.names_kinds:
-            return self._deprecated(ACTION_SHAPE) if self._deprecated(IS_CONTINUOUS) > 0 else 0
-        return self._number(CONTINUOUS_SHAPE) or 0
-
-    @property
-    def discrete_size(self) -> int:
-        """The sum of the branches in the file's constants."""
-        if not self.names_kinds:
-            return 0 if self._deprecated(IS_CONTINUOUS) > 0 else self._deprecated(ACTION_SHAPE)
-        shape = self._read(DISCRETE_SHAPE, _SINGLE)
-        return 0 if shape is None else sum(truncated(n) for n in shape)
+        return self._first_of_shape(MEMORY_SIZE)
 
 
 def of_onnx(file: OnnxFile, consumer: Consumer) -> SentisModel:
@@ -214,11 +192,8 @@ def _mismatch(file: OnnxFile, node: Any) -> Thrown | None:
 
 
 def _broadcasts(shapes: Sequence[Shape]) -> bool:
-    for axis in range(1, max((len(s) for s in shapes), default=0) + 1):
-        lengths = {s[-axis] for s in shapes if len(s) >= axis} - {1}
-        if len(lengths) > 1:
-            return False
-    return True
+    columns = zip_longest(*(s[::-1] for s in shapes), fillvalue=1)
+    return all(len(set(lengths) - {1}) < 2 for lengths in columns)
 
 
 def _product(file: OnnxFile, node: Any, shapes: Sequence[Shape]) -> str | None:
@@ -243,20 +218,13 @@ def _reshape(file: OnnxFile, node: Any, shapes: Sequence[Shape]) -> str | None:
     if 0 in before:
         return None
     lengths = [before[i] if n == 0 and i < len(before) else int(n) for i, n in enumerate(wanted.ravel())]
-    size, rest = _size(before), _size([n for n in lengths if n != -1])
+    size, rest = math.prod(before), math.prod(n for n in lengths if n != -1)
     fits = size == rest if -1 not in lengths else rest != 0 and size % rest == 0
     return None if fits else "reshaped length does not match with input length"
 
 
 def _text(shape: Shape) -> str:
     return f"({', '.join(map(str, shape))})"
-
-
-def _size(shape: Sequence[int]) -> int:
-    size = 1
-    for length in shape:
-        size *= length
-    return size
 
 
 _TESTS: dict[str, Callable[[OnnxFile, Any, Sequence[Shape]], str | None]] = {
