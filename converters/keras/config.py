@@ -77,12 +77,17 @@ def config_inside(path: str) -> Any:
         _refuse_links(file, h5py)
         text = file.attrs.get("model_config")
     if text is None or len(text) > MAX_CONFIG:
-        raise DamagedFileError(
-            "it has no configuration of a model",
-            why="it holds weights alone, or something else",
-            fix="save the whole model: model.save('policy.keras')",
-        )
+        raise no_configuration()
     return json_in(text)
+
+
+def no_configuration() -> DamagedFileError:
+    """The error of a file that does not say what it is made of."""
+    return DamagedFileError(
+        "it has no configuration of a model",
+        why="it holds weights alone, or something else",
+        fix="save the whole model: model.save('policy.keras')",
+    )
 
 
 def _refuse_links(group: Any, h5py: Any, depth: int = 0) -> None:

@@ -19,7 +19,7 @@ from converters.graph.nodes import Graph
 from converters.graph.ops.base import MISFIT
 from converters.graph.ops.table import is_fed
 from converters.keras.children import frozen_by_tensorflow, stored_in
-from converters.keras.config import config_of, refuse_code, stateful_layer
+from converters.keras.config import config_of, no_configuration, refuse_code, stateful_layer
 from converters.keras.model import model_of
 from converters.keras.network import Network, UnknownLayerError
 from converters.keras.weights import Groups, Listed, Weights
@@ -78,15 +78,8 @@ def _stored(given: Fetched) -> tuple[Any, Weights, str]:
         return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version
     stored = stored_in(path)
     if stored.config is None:
-        raise DamagedFileError(
-            "it has no configuration of a model",
-            why="it holds weights alone, or something else",
-            fix="save the whole model: model.save('policy.keras')",
-        )
-    try:
-        config = json_in(stored.config)
-    except (ValueError, RecursionError) as error:
-        raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
+        raise no_configuration()
+    config = _configuration(stored.config)
     refuse_code(config)
     entries = [(name, array) for (_, name), array in stored.arrays.items()]
     return config, Listed(entries, [layer for layer, _ in stored.arrays]), stored.version or ""
@@ -119,11 +112,14 @@ def of_web_model(files: tuple[Path, ...], topology: Mapping[str, Any], weights: 
     """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``. Raises what ``layered`` raises."""
     config = topology.get("model_config") or topology
     version = str(topology.get("keras_version") or "tfjs-layers")
+    return layered(files, _configuration(config) if isinstance(config, str) else config, weights, version)
+
+
+def _configuration(text: str) -> Any:
     try:
-        config = json_in(config) if isinstance(config, str) else config
+        return json_in(text)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
-    return layered(files, config, weights, version)
 
 
 def _beside_keras(model: SourceModel, path: Path) -> SourceModel:

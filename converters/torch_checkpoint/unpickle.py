@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import pickletools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import IO, Any
 
 from signatures.errors import DamagedFileError, NotAPolicyError
@@ -103,25 +103,19 @@ class _Machine:
 
     def run(self, name: str, argument: Any) -> None:
         """Carry out one opcode."""
-        if name in _IGNORED:
-            return
-        if name in _PUSHED:
-            self.stack.append(_PUSHED[name])
-        elif name in _ARGUMENT:
-            if isinstance(argument, int) and argument.bit_length() > _MAX_BITS:  # Python would not write it as text
-                raise _damaged(f"its pickle holds a number of {argument.bit_length()} bits")
-            self.stack.append(argument)
-        elif name in _NEW:
-            self.stack.append(_NEW[name]())
-        else:
-            method = getattr(self, f"_{name.lower()}", None)
-            if method is None:
-                raise NotAPolicyError(
-                    f"its pickle asks for what no checkpoint needs (opcode {name})",
-                    why="only plain containers and tensors are built from a checkpoint; nothing in it is run",
-                    fix=_FIX,
-                )
-            method(argument)
+        if name not in _OPCODES:
+            raise NotAPolicyError(
+                f"its pickle asks for what no checkpoint needs (opcode {name})",
+                why="only plain containers and tensors are built from a checkpoint; nothing in it is run",
+                fix=_FIX,
+            )
+        _OPCODES[name](self, argument)
+
+    def push(self, value: Any) -> None:
+        """Put a value on the stack."""
+        if isinstance(value, int) and value.bit_length() > _MAX_BITS:  # Python would not write it as text
+            raise _damaged(f"its pickle holds a number of {value.bit_length()} bits")
+        self.stack.append(value)
 
     def pop(self) -> Any:
         """The top of the stack."""
@@ -130,7 +124,11 @@ class _Machine:
             raise _damaged("its pickle takes a mark for a value")
         return value
 
-    def _items(self) -> list[Any]:
+    def last(self, count: int) -> tuple[Any, ...]:
+        """So many values from the top of the stack, in the order in which they were put there."""
+        return tuple([self.pop() for _ in range(count)][::-1])
+
+    def items(self) -> list[Any]:
         """What stands above the last mark, which goes too."""
         for at in range(len(self.stack) - 1, -1, -1):
             if self.stack[at] is _MARK:
@@ -139,127 +137,96 @@ class _Machine:
                 return found
         raise _damaged("its pickle asks for a mark that is not there")
 
-    def _top(self, kind: type) -> Any:
+    def top(self, kind: type) -> Any:
+        """The container that is being filled."""
         if not isinstance(self.stack[-1], kind):
             raise _damaged(f"its pickle fills something that is no {kind.__name__}")
         return self.stack[-1]
 
-    # ------------------------------------------------------------------ containers
+    def extend(self, values: Sequence[Any]) -> None:
+        """Put values into the list that is at the top."""
+        self.top(list).extend(values)
 
-    def _tuple(self, _: Any) -> None:
-        self.stack.append(tuple(self._items()))
-
-    def _tuple1(self, _: Any) -> None:
-        self._last(1)
-
-    def _tuple2(self, _: Any) -> None:
-        self._last(2)
-
-    def _tuple3(self, _: Any) -> None:
-        self._last(3)
-
-    def _last(self, count: int) -> None:
-        values = [self.pop() for _ in range(count)]
-        self.stack.append(tuple(reversed(values)))
-
-    def _list(self, _: Any) -> None:
-        self.stack.append(self._items())
-
-    def _append(self, _: Any) -> None:
-        value = self.pop()
-        self._top(list).append(value)
-
-    def _appends(self, _: Any) -> None:
-        values = self._items()
-        self._top(list).extend(values)
-
-    def _dict(self, _: Any) -> None:
-        items = self._items()
-        self.stack.append({})
-        self._fill(items)
-
-    def _setitem(self, _: Any) -> None:
-        value, key = self.pop(), self.pop()
-        self._fill([key, value])
-
-    def _setitems(self, _: Any) -> None:
-        self._fill(self._items())
-
-    def _fill(self, items: list[Any]) -> None:
-        target = self._top(dict)
+    def fill(self, items: Sequence[Any]) -> None:
+        """Put keys and values, by turns, into the dictionary that is at the top."""
+        target = self.top(dict)
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, _KEYS):
                 raise _damaged(f"a key in its pickle is a {type(key).__name__}")
             target[key] = value
 
-    # ------------------------------------------------------------------ memo and stack
+    def filled(self, items: Sequence[Any]) -> None:
+        """Put a new dictionary of these keys and values on the stack."""
+        self.stack.append({})
+        self.fill(items)
 
-    def _pop(self, _: Any) -> None:
-        self.stack.pop()
-
-    def _pop_mark(self, _: Any) -> None:
-        self._items()
-
-    def _dup(self, _: Any) -> None:
-        self.stack.append(self.stack[-1])
-
-    def _put(self, index: int) -> None:
-        self.memo[index] = self.stack[-1]
-
-    _binput = _long_binput = _put
-
-    def _memoize(self, _: Any) -> None:
-        self.memo[len(self.memo)] = self.stack[-1]
-
-    def _get(self, index: int) -> None:
-        self.stack.append(self.memo[index])
-
-    _binget = _long_binget = _get
-
-    # ------------------------------------------------------------------ names and calls
-
-    def _global(self, argument: str) -> None:
-        module, _, name = argument.partition(" ")
-        self.stack.append(_named(module, name))
-
-    def _stack_global(self, _: Any) -> None:
-        name, module = self.pop(), self.pop()
+    def stack_global(self) -> Any:
+        """The name that two texts on the stack are."""
+        module, name = self.last(2)
         if not isinstance(name, str) or not isinstance(module, str):
             raise _damaged("its pickle imports something that has no name")
-        self.stack.append(_named(module, name))
+        return _named(module, name)
 
-    _inst = _global
-
-    def _reduce(self, _: Any) -> None:
-        arguments, function = self.pop(), self.pop()
+    def reduce(self) -> Any:
+        """What a call gives."""
+        function, arguments = self.last(2)
         if not isinstance(function, _Function) or not isinstance(arguments, tuple):
             raise _damaged("its pickle calls something that is no function")
         self.copied += sum(len(a) for a in arguments if isinstance(a, tuple | list | dict | str | bytes))
         if self.copied > MAX_COPIED:
             raise _damaged(f"the calls of its pickle copy more than {MAX_COPIED} items")
-        self.stack.append(function.make(arguments))
+        return function.make(arguments)
 
-    def _build(self, _: Any) -> None:
+    def build(self) -> None:
         """Attributes of a container: a state dictionary's ``_metadata``, which only PyTorch's loader looks at."""
         self.pop()
-        self._top(dict)
+        self.top(dict)
 
-    def _binpersid(self, _: Any) -> None:
+    def persistent(self) -> Any:
+        """What a persistent id stands for."""
         identity = self.pop()
         if not isinstance(identity, tuple):
             raise _damaged("a persistent id in its pickle is no tuple")
-        self.stack.append(self.storage(identity))
+        return self.storage(identity)
 
 
-_IGNORED = frozenset(("PROTO", "FRAME"))
-_PUSHED = {"MARK": _MARK, "NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_NEW: dict[str, Callable[[], Any]] = {"EMPTY_LIST": list, "EMPTY_DICT": dict}
-_ARGUMENT = frozenset(
-    (
-        *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
-        *("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
-    )
+_VALUES = (
+    *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
+    *("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
 )
+#: What each opcode does with the machine and its argument.
+_OPCODES: dict[str, Callable[[_Machine, Any], object]] = {
+    **dict.fromkeys(("PROTO", "FRAME"), lambda m, _: None),
+    **dict.fromkeys(_VALUES, _Machine.push),
+    "MARK": lambda m, _: m.stack.append(_MARK),
+    "NONE": lambda m, _: m.stack.append(None),
+    "NEWTRUE": lambda m, _: m.stack.append(True),
+    "NEWFALSE": lambda m, _: m.stack.append(False),
+    "EMPTY_TUPLE": lambda m, _: m.stack.append(()),
+    "EMPTY_LIST": lambda m, _: m.stack.append([]),
+    "EMPTY_DICT": lambda m, _: m.stack.append({}),
+    "TUPLE": lambda m, _: m.stack.append(tuple(m.items())),
+    "TUPLE1": lambda m, _: m.stack.append(m.last(1)),
+    "TUPLE2": lambda m, _: m.stack.append(m.last(2)),
+    "TUPLE3": lambda m, _: m.stack.append(m.last(3)),
+    "LIST": lambda m, _: m.stack.append(m.items()),
+    "APPEND": lambda m, _: m.extend(m.last(1)),
+    "APPENDS": lambda m, _: m.extend(m.items()),
+    "DICT": lambda m, _: m.filled(m.items()),
+    "SETITEM": lambda m, _: m.fill(m.last(2)),
+    "SETITEMS": lambda m, _: m.fill(m.items()),
+    "POP": lambda m, _: m.stack.pop(),
+    "POP_MARK": lambda m, _: m.items(),
+    "DUP": lambda m, _: m.stack.append(m.stack[-1]),
+    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), lambda m, index: m.memo.update({index: m.stack[-1]})),
+    "MEMOIZE": lambda m, _: m.memo.update({len(m.memo): m.stack[-1]}),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda m, index: m.stack.append(m.memo[index])),
+    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(_named(*name.partition(" ")[::2]))),
+    "STACK_GLOBAL": lambda m, _: m.stack.append(m.stack_global()),
+    "REDUCE": lambda m, _: m.stack.append(m.reduce()),
+    "BUILD": lambda m, _: m.build(),
+    "BINPERSID": lambda m, _: m.stack.append(m.persistent()),
+}
 
 
 # ------------------------------------------------------------------ the names that are known
@@ -290,22 +257,13 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MAX_LENGTH
 
 
-def _parameter(arguments: tuple[Any, ...]) -> Any:
-    """``_rebuild_parameter(data, requires_grad, backward_hooks)``: its data."""
-    return arguments[0]
-
-
-def _size(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-    """``torch.Size((3, 4))``."""
-    return tuple(arguments[0])
-
-
 _NAMES: dict[tuple[str, str], Any] = {
     ("collections", "OrderedDict"): _Function("OrderedDict", _ordered_dict),
     ("torch._utils", "_rebuild_tensor"): _Function("_rebuild_tensor", _tensor),
     ("torch._utils", "_rebuild_tensor_v2"): _Function("_rebuild_tensor_v2", _tensor),
-    ("torch._utils", "_rebuild_parameter"): _Function("_rebuild_parameter", _parameter),
-    ("torch", "Size"): _Function("Size", _size),
+    # of its data, requires_grad, backward_hooks: the data
+    ("torch._utils", "_rebuild_parameter"): _Function("_rebuild_parameter", lambda arguments: arguments[0]),
+    ("torch", "Size"): _Function("Size", lambda arguments: tuple(arguments[0])),
     **{("torch", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
     **{("torch.cuda", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
 }

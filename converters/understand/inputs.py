@@ -77,18 +77,23 @@ def classify_inputs(
     return roles
 
 
+def _dims(node: Node) -> tuple[int | None, ...] | None:
+    """The lengths of a placeholder's axes, None if the graph does not say."""
+    shape: TensorShape | None = node.attrs.get("shape")
+    return None if shape is None else shape.dims
+
+
 def placeholder_rank(node: Node) -> int | None:
     """Number of axes of a placeholder, None if the graph does not say."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    return None if shape is None or shape.dims is None else len(shape.dims)
+    dims = _dims(node)
+    return None if dims is None else len(dims)
 
 
 def _shape_text(node: Node) -> str:
-    shape: TensorShape | None = node.attrs.get("shape")
-    dtype = node.attrs.get("dtype", "")
-    if shape is None or shape.dims is None:
+    dims, dtype = _dims(node), node.attrs.get("dtype", "")
+    if dims is None:
         return f"({dtype}, unknown shape)"
-    return f"({dtype} [{', '.join('?' if d is None else str(d) for d in shape.dims)}])"
+    return f"({dtype} [{', '.join('?' if d is None else str(d) for d in dims)}])"
 
 
 def role_by_name(base: str, node: Node) -> Role | None:
@@ -152,15 +157,13 @@ def _by_structure(
 
 def _has_time_first(node: Node) -> bool:
     """Whether a placeholder is [T, B, n]."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    dims = () if shape is None or shape.dims is None else shape.dims
+    dims = _dims(node) or ()
     return len(dims) == 3 and dims[1] is None and None not in (dims[0], dims[2])
 
 
 def _has_rows(node: Node) -> bool:
     """Whether a placeholder is [B, n] or [B, T, n]; a single number a row may be a flag that resets the memory."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    dims = () if shape is None or shape.dims is None else shape.dims
+    dims = _dims(node) or ()
     return len(dims) in (2, 3) and dims[0] is None and dims[-1] is not None and (dims[-1] > 1 or len(dims) > 2)
 
 
@@ -177,8 +180,7 @@ def _undecided(nodes: Sequence[Node]) -> SignatureError:
 
 def _is_free(node: Node) -> bool:
     """Whether the first axis of a placeholder is that of the agents, and it is [B] or [B, n]."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    dims = () if shape is None or shape.dims is None else shape.dims
+    dims = _dims(node) or ()
     return len(dims) in (1, 2) and dims[0] is None
 
 
@@ -215,18 +217,11 @@ def _feeds_one_hot(node: Node, consumers: Mapping[str, list[Node]]) -> bool:
 
 def _is_mask(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> bool:
     """A float matrix that multiplies a softmax (perhaps plus a constant) is a mask."""
-    for reader in _reached(node, consumers, _shows):
-        if reader.op == "Mul" and any(
-            "Softmax" in {graph[n].op for n in graph.ancestors([r]) if _near(graph, r, n)} for r in reader.inputs
-        ):
-            return True
-    return False
 
+    def is_softmax(reference: str) -> bool:
+        made = graph.producer(reference)
+        added = made.inputs if traits(made).name == "Add" else ()
+        return any(n.op == "Softmax" for n in (made, *map(graph.producer, added)))
 
-def _near(graph: Graph, reference: str, name: str) -> bool:
-    """Whether ``name`` is the producer of ``reference`` or one Add before it."""
-    node = graph.producer(reference)
-    names = {node.name}
-    if traits(node).name == "Add":
-        names |= {node_of(r) for r in node.inputs}
-    return name in names
+    readers = _reached(node, consumers, _shows)
+    return any(reader.op == "Mul" and any(map(is_softmax, reader.inputs)) for reader in readers)

@@ -14,7 +14,7 @@ from converters.graph.ops.einsum import einsum
 from converters.graph.types import FLOAT32, INT32, Dim
 from converters.keras.layers.activations import activated
 from converters.keras.layers.step import Step, Translate
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from signatures.errors import UnsupportedOpError
 
 
 def _same(step: Step) -> str:
@@ -69,21 +69,16 @@ def _reshape(step: Step) -> str:
     if target.count(-1) == 1:
         target[target.index(-1)] = size // max(-math.prod(target), 1)
     if math.prod(target) != size or min(target, default=1) < 0:
-        raise DamagedFileError(f"the layer {step.path!r} makes {target} of {size} numbers", fix="save the model again")
+        raise step.damaged(f"makes {target} of {size} numbers")
     return b.reshape(x, (b.shape(x)[0], *target))
 
 
 def _repeat_vector(step: Step) -> str:
-    b, x = step.net, b_x(step)
-    rows, width = b.shape(x)
-    return b.broadcast(b.reshape(x, (rows, 1, width)), (rows, int(step.get("n")), width))
-
-
-def b_x(step: Step) -> str:
-    """x, which has two axes."""
     if step.rank != 2:
-        raise DamagedFileError(f"the layer {step.path!r} takes [B, n]", fix="save the model again")
-    return step.x
+        raise step.damaged("takes [B, n]")
+    b = step.net
+    rows, width = b.shape(step.x)
+    return b.broadcast(b.reshape(step.x, (rows, 1, width)), (rows, int(step.get("n")), width))
 
 
 def _permute(step: Step) -> str:
@@ -106,7 +101,7 @@ def _framed(step: Step, key: str, sign: int) -> str:
     first = step.get("data_format") == "channels_first"
     for axis, (a, z) in enumerate(pairs, 2 if first else 1):
         if sign < 0 and -a - z >= step.net.length(step.x, axis):
-            raise DamagedFileError(f"the layer {step.path!r} leaves nothing of an axis", fix="save the model again")
+            raise step.damaged("leaves nothing of an axis")
     return step.net.pad(step.x, [(0, 0), (0, 0), *pairs] if first else [(0, 0), *pairs, (0, 0)])
 
 

@@ -132,40 +132,16 @@ _BINARY = {
     "Minimum": "Minimum",
     "Power": "Pow",
 }
-_UNARY = {
-    "Exp": "Exp",
-    "Log": "Log",
-    "Sqrt": "Sqrt",
-    "Square": "Square",
-    "Absolute": "Abs",
-    "Abs": "Abs",
-    "Sin": "Sin",
-    "Negative": "Neg",
-    "Cos": "Cos",
-    "Tanh": "Tanh",
-    "Sign": "Sign",
-    "Log1p": "Log1p",
-    "Expm1": "Expm1",
-    "Rsqrt": "Rsqrt",
-    "Reciprocal": "Reciprocal",
-}
-_ACTIVATIONS = {
-    "Relu": "relu",
-    "Relu6": "relu6",
-    "Sigmoid": "sigmoid",
-    "Selu": "selu",
-    "Softplus": "softplus",
-    "Softsign": "softsign",
-    "Silu": "silu",
-    "HardSigmoid": "hard_sigmoid",
-    "HardSilu": "hard_silu",
-    "LogSigmoid": "log_sigmoid",
-}
+#: Operations that are one op of the same name, and two that are called otherwise.
+_SAME = "Exp Log Sqrt Square Abs Sin Cos Tanh Sign Log1p Expm1 Rsqrt Reciprocal"
+_UNARY = {**{name: name for name in _SAME.split()}, "Absolute": "Abs", "Negative": "Neg"}
+#: Activations without settings; the class of ``hard_silu`` is HardSilu.
+_ACTIVATIONS = "relu relu6 sigmoid selu softplus softsign silu hard_sigmoid hard_silu log_sigmoid"
 _REDUCTIONS = {"Mean": "Mean", "Sum": "Sum", "Max": "Max", "Min": "Min", "Prod": "Prod", "Amax": "Max", "Amin": "Min"}
 OPERATIONS: Mapping[str, Translate] = {
     **{name: partial(_binary, op=op) for name, op in _BINARY.items()},
     **{name: partial(_unary, op=op) for name, op in _UNARY.items()},
-    **{name: partial(_activation, name=own) for name, own in _ACTIVATIONS.items()},
+    **{name.title().replace("_", ""): partial(_activation, name=name) for name in _ACTIVATIONS.split()},
     **{name: partial(_reduced, kind=kind) for name, kind in _REDUCTIONS.items()},
     "Elu": lambda s: elu(s.net, s.x, float(_argument(s, 1, "alpha", 1.0))),
     "Gelu": lambda s: activation_of(s, "gelu_new" if _argument(s, 1, "approximate", True) else "gelu")(s.net, s.x),

@@ -106,7 +106,7 @@ def _cells(step: Step, width: int) -> list[_Cell]:
 def _recurrent(step: Step) -> list[str]:
     b, x = step.net, step.x
     if step.rank != 3:
-        raise DamagedFileError(f"the layer {step.path!r} is given {step.rank} axes, not [B, T, n]", fix=_SAVE_AGAIN)
+        raise step.damaged(f"is given {step.rank} axes, not [B, T, n]")
     if step.kwargs.get("mask") is not None:
         raise UnsupportedOpError("it is given a mask")
     step.refuse_unless("time_major", False, None)
@@ -122,9 +122,7 @@ def _recurrent(step: Step) -> list[str]:
     elif not given:
         states = [b.add("Fill", [b.vector([rows, w]), b.const(np.zeros((), FLOAT32), "zero")]) for w in widths]
     if [b.length(s, -1) for s in states] != widths:
-        raise DamagedFileError(
-            f"the layer {step.path!r} has states of {widths} numbers, and is given others", fix=_SAVE_AGAIN
-        )
+        raise step.damaged(f"has states of {widths} numbers, and is given others")
     turns = range(steps - 1, -1, -1) if step.get("go_backwards") else range(steps)
     outputs = []
     for turn in turns:
@@ -135,9 +133,7 @@ def _recurrent(step: Step) -> list[str]:
             states[at : at + count] = cell.turn(value, states[at : at + count])
             value, at = states[at], at + count
         outputs.append(value)
-    for taken_in, given_out in zip(held, states, strict=False):
-        if b.nodes[b.position[taken_in]].op == "Placeholder":
-            b.states[taken_in] = given_out
+    _keep(step, held, states)
     result = outputs[-1]
     if step.get("return_sequences"):
         result = b.add("Pack", outputs, axis=1) if steps > 1 else b.expand_dims(result, 1)
@@ -152,10 +148,16 @@ def _one_step(step: Step) -> list[str]:
     if step.rank != 2 or tuple(b.length(s, -1) for s in given) != cell.widths:
         raise DamagedFileError(f"the cell {step.path!r} is given other tensors than its own", fix=_SAVE_AGAIN)
     states = cell.turn(step.x, given)
-    for taken_in, given_out in zip(given, states, strict=True):
+    _keep(step, given, states)
+    return [states[0], *states]
+
+
+def _keep(step: Step, held: Sequence[str], states: Sequence[str]) -> None:
+    """Note what becomes of the states that are inputs of the model; there are none in ``held`` where zeros begin."""
+    b = step.net
+    for taken_in, given_out in zip(held, states, strict=False):
         if b.nodes[b.position[taken_in]].op == "Placeholder":
             b.states[taken_in] = given_out
-    return [states[0], *states]
 
 
 def _bidirectional(step: Step) -> list[str]:

@@ -58,6 +58,10 @@ class Step:
         """Whether TensorFlow.js wrote it, whose defaults are others."""
         return self.net.version.startswith("tfjs")
 
+    def damaged(self, what: str, why: str | None = None) -> DamagedFileError:
+        """The error of a layer that cannot be what its file says."""
+        return DamagedFileError(f"the layer {self.path!r} {what}", why=why, fix="save the model again")
+
     # ------------------------------------------------------------------ tensors
 
     @property
@@ -69,7 +73,7 @@ class Step:
     def x(self) -> str:
         """The one tensor that it is given, the first of several."""
         if not self.tensors:
-            raise DamagedFileError(f"the layer {self.path!r} is given no tensor", fix="save the model again")
+            raise self.damaged("is given no tensor")
         return self.tensors[0]
 
     @property
@@ -82,7 +86,7 @@ class Step:
     def take(self, *shape: int | None) -> np.ndarray:
         """The next weight, float32. Raises DamagedFileError where there is none, or not of this shape."""
         if not self.left:
-            raise DamagedFileError(f"the layer {self.path!r} has too few weights", fix="save the model again")
+            raise self.damaged("has too few weights")
         array = self.left.pop(0)
         fits = len(shape) == array.ndim and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
         if shape and not fits:
