@@ -310,18 +310,16 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
             why="a bundle has one set of names, and these formats have different ones",
             fix="export twice, with another -o",
         )
-    if options.compile.names != "canonical":
-        raise UsageError(
-            f"--names {options.compile.names} does not go with --for {wanted.name}",
-            why="the consumer decides the names",
-            fix="leave --names out",
-        )
-    if options.opset is not None:
-        raise UsageError(
-            f"--opset {options.opset} does not go with --for {wanted.name}",
-            why=f"the consumer decides the opset: {wanted.opset}",
-            fix="leave --opset out",
-        )
+    for flag, given, left_out, decided in (
+        ("--names", options.compile.names, "canonical", "names"),
+        ("--opset", options.opset, None, f"opset: {wanted.opset}"),
+    ):
+        if given != left_out:
+            raise UsageError(
+                f"{flag} {given} does not go with --for {wanted.name}",
+                why=f"the consumer decides the {decided}",
+                fix=f"leave {flag} out",
+            )
     return [written(target) for target in targets]
 
 

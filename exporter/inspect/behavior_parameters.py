@@ -6,6 +6,7 @@ Drawn here from the verdict, in the order of Unity's fields; it is no photograph
 from __future__ import annotations
 
 import textwrap
+from pathlib import Path
 
 from converters.targets.unity.checker import UnityVerdict
 from converters.targets.unity.findings import Thrown
@@ -13,20 +14,7 @@ from exporter.reports.markup import Markup, el, svg_file
 
 _WIDTH, _LINE, _MARGIN, _VALUE = 560, 22, 16, 250
 _LETTERS = 78
-_STYLE = """
-svg { --paper: #fff; --ink: #16191d; --soft: #5a626c; --rule: #c9ced6; --box: #f6f7f9; --bad: #9a5b00;
-  --bad-wash: #fdf3e1; --good: #1b7443; --good-wash: #e7f4ec; color-scheme: light dark;
-  font: 13px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-@media (prefers-color-scheme: dark) { svg { --paper: #14171b; --ink: #e7e9ec; --soft: #a0a8b3; --rule: #414955;
-  --box: #1c2026; --bad: #f0c274; --bad-wash: #33280f; --good: #69d19a; --good-wash: #14301f; } }
-.paper { fill: var(--paper); stroke: var(--rule); }
-text { fill: var(--ink); }
-.head { font-weight: 650; }
-.soft { fill: var(--soft); }
-.field { fill: var(--box); stroke: var(--rule); }
-.message { fill: var(--bad-wash); stroke: var(--bad); }
-.fine { fill: var(--good-wash); stroke: var(--good); }
-"""
+_STYLE = Path(__file__).with_name("behavior_parameters.css")
 
 #: (indentation, label, value; None for a heading)
 Row = tuple[int, str, str | None]
@@ -53,7 +41,7 @@ def behavior_parameters(verdict: UnityVerdict) -> str:
     title = f"Behavior Parameters for {verdict.path.name}, {verdict.consumer.title}"
     return svg_file(
         el("title", title),
-        el("style", Markup(_STYLE)),
+        el("style", Markup(f"\n{_STYLE.read_text(encoding='utf-8')}")),
         el("rect", class_="paper", x=1, y=1, width=_WIDTH - 2, height=y - 2, rx=6),
         *parts,
         width=_WIDTH,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from converters.policy import Policy
@@ -18,21 +19,7 @@ _MARGIN, _HEAD = 24, 78
 _MOST_NODES, _MOST_BLOCKS = 1500, 120
 #: Width of a letter of the title and of the line under it, in pixels, on the wide side.
 _TITLE, _LINE = 11.5, 7.2
-_STYLE = """
-svg { --paper: #fff; --ink: #16191d; --soft: #5a626c; --rule: #c9ced6; --box: #f6f7f9; --accent: #2f5fb3;
-  --wash: #e9eff9; --good: #1b7443; --good-wash: #e7f4ec; color-scheme: light dark;
-  font: 12px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-@media (prefers-color-scheme: dark) { svg { --paper: #14171b; --ink: #e7e9ec; --soft: #a0a8b3; --rule: #414955;
-  --box: #1c2026; --accent: #8fb4f5; --wash: #1e2a3f; --good: #69d19a; --good-wash: #14301f; } }
-.paper { fill: var(--paper); }
-text { fill: var(--ink); }
-.name { font-size: 19px; font-weight: 650; }
-.line { fill: var(--soft); font-size: 13px; }
-.edge { fill: none; stroke: var(--soft); stroke-opacity: .55; stroke-width: 1.25; }
-.box rect { fill: var(--box); stroke: var(--rule); }
-.box.input rect { fill: var(--wash); stroke: var(--accent); }
-.box.output rect { fill: var(--good-wash); stroke: var(--good); }
-"""
+_STYLE = Path(__file__).with_name("picture.css")
 
 
 def picture(policy: Policy) -> str:
@@ -56,7 +43,7 @@ def picture(policy: Policy) -> str:
     return svg_file(
         el("title", f"{policy.name}: {line}"),
         el("desc", described),
-        el("style", Markup(_STYLE)),
+        el("style", Markup(f"\n{_STYLE.read_text(encoding='utf-8')}")),
         el("rect", class_="paper", width=width, height=height),
         el("text", policy.name, class_="name", x=_MARGIN, y=34),
         el("text", line, class_="line", x=_MARGIN, y=55),

@@ -14,6 +14,13 @@ from signatures.spec import TensorSpec
 
 #: The order in which a policy's observations are sensors where their names do not say it.
 _ORDER = (Role.ENTITIES, Role.VISUAL, Role.VECTOR)
+_MASKS = (
+    "public override void WriteDiscreteActionMask(IDiscreteActionMask actionMask)",
+    "{",
+    "    // forbid what cannot be done now: actionMask.SetActionEnabled(branch, action, false);",
+    "}",
+    "",
+)
 
 
 def agent(bundle: Bundle) -> str:
@@ -22,7 +29,7 @@ def agent(bundle: Bundle) -> str:
     vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR), None)
     methods = [] if vector is None else _observations(bundle, vector)
     if bundle.signature.branches:
-        methods += _masks(bundle)
+        methods += _MASKS
     methods += _actions(bundle, bundle.signature.labels.get("actions", []))
     return filled(
         "agent.cs",
@@ -107,21 +114,8 @@ def _observations(bundle: Bundle, spec: TensorSpec) -> list[str]:
     ]
 
 
-def _masks(bundle: Bundle) -> list[str]:
-    return [
-        "public override void WriteDiscreteActionMask(IDiscreteActionMask actionMask)",
-        "{",
-        "    // forbid what cannot be done now: actionMask.SetActionEnabled(branch, action, false);",
-        "}",
-        "",
-    ]
-
-
 def _continuous(bundle: Bundle) -> int:
-    for head in bundle.heads:
-        if head.role is Role.CONTINUOUS:
-            return head.shape[-1] or 0
-    return 0
+    return next((head.shape[-1] or 0 for head in bundle.heads if head.role is Role.CONTINUOUS), 0)
 
 
 def _actions(bundle: Bundle, labels: list[str]) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 from converters.bundle.embed import runnable
 from converters.formats import WRITTEN
 from converters.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph, Node, split_ref
+from converters.graph.nodes import Graph, Node
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.ops.table import traits
 from converters.graph.run import run_graph
@@ -52,11 +52,8 @@ class Bisector:
     ) -> None:
         self.tested, self.pool = tested, pool
         self._agrees, self._rounding = agrees, rounding
-        self._graph: Graph | None = None
-        self._looked = False
         self._opened: tuple[tuple[str, str], InnerTensors] | None = None
         self._stack = contextlib.ExitStack()
-        self._sources: dict[str, str] | None = None
         self._compared: set[Path] = set()
 
     def close(self) -> None:
@@ -68,7 +65,7 @@ class Bisector:
         self, participant: Participant, output: str, feeds: Feeds, tolerance: Tolerance, branch: int = 0
     ) -> Bisection:
         """Where ``output`` of ``participant`` begins to differ for ``feeds``; ``branch`` is the one drawn wrongly."""
-        graph = None if participant.path is None else self.graph()
+        graph = None if participant.path is None else self.graph
         if graph is None:
             return Bisection(None, reason="no graph at hand computes what the reference does")
         try:
@@ -90,7 +87,7 @@ class Bisector:
         self._compared.add(participant.path)
         if not self._differing(self._runnable, participant, feeds):
             return []
-        graph = self.graph()  # a bundle's graph is that of its .bytes, which may be what is wrong
+        graph = self.graph  # a bundle's graph is that of its .bytes, which may be what is wrong
         return [] if graph is None else self._differing(graph, participant, feeds)
 
     def _differing(self, graph: Graph, participant: Participant, feeds: Feeds) -> list[Bisection]:
@@ -116,12 +113,10 @@ class Bisector:
                 found.append(_found(graph.producer(name), name, known[name], array, difference, self._source))
         return found
 
+    @cached_property
     def graph(self) -> Graph | None:
         """The first graph that agrees with the reference: the policy's, the .bytes', the SavedModel's."""
-        if not self._looked:
-            self._looked = True
-            self._graph = next((g for g in self._graphs() if self._agrees(g)), None)
-        return self._graph
+        return next((g for g in self._graphs() if self._agrees(g)), None)
 
     def _graphs(self) -> Iterator[Graph]:
         yield self._runnable
@@ -147,14 +142,20 @@ class Bisector:
             self._opened = (key, found)
         return self._opened[1]
 
+    @cached_property
+    def _noted(self) -> dict[str, str]:
+        """Node → the source's tensor, as the artefacts note it."""
+        found: dict[str, str] = {}
+        for key, path in self.tested.artefacts.items():
+            origins = WRITTEN[key].origins
+            with contextlib.suppress(ValueError, OSError):
+                found.update({} if origins is None else origins(path))
+        return found
+
     def _source(self, node: Node) -> str | tuple[str, ...] | None:
         """The source's tensor: what the graph knows of it, else what an artefact notes."""
-        if self._sources is None:
-            self._sources = {}
-            for key, path in self.tested.artefacts.items():
-                self._sources.update(_noted(key, path))
         if node.origin is None or node.origin == f"{node.name}:0":
-            return self._sources.get(node.name, node.origin)
+            return self._noted.get(node.name, node.origin)
         return node.origin
 
 
@@ -174,7 +175,8 @@ class _Search:
     def first(self, output: str, branch: int) -> Bisection:
         upstream = self.graph.ancestors([output])
         nodes = [n for n in self.graph.nodes if n.name in upstream]
-        drawn = self._drawn(nodes)
+        samplers = [n for n in nodes if n.op in SAMPLERS]
+        drawn = self.graph.descendants(n.name for n in samplers)
         read = outputs_read([n.name for n in nodes], [output, *(r for n in nodes for r in n.inputs)])
         tensors = [t for n in nodes if n.name not in drawn for t in read[n.name]]
         expected = run_graph(self.graph, self.feeds, tensors)
@@ -185,19 +187,11 @@ class _Search:
             for tensor in chunk:
                 if tensor in got and (found := self._wrong(tensor, expected[tensor], got[tensor], seen)) is not None:
                     return found
-        samplers = [n for n in nodes if n.op in SAMPLERS]
         if samplers:  # one for each branch, in their order; a joint one for all
             sampler = samplers[min(branch, len(samplers) - 1)]
             reason = "what it draws from agrees, what it draws does not"
             return Bisection(sampler.name, sampler.op, self.source(sampler), reason=reason)
         return Bisection(None, reason="no tensor that leads to it differs by more than the tolerance")
-
-    def _drawn(self, nodes: Sequence[Node]) -> set[str]:
-        drawn: set[str] = set()
-        for node in nodes:
-            if node.op in SAMPLERS or any(split_ref(r)[0] in drawn for r in node.inputs):
-                drawn.add(node.name)
-        return drawn
 
     def _fetched(self, tensors: Sequence[str]) -> dict[str, np.ndarray]:
         """The candidate's values; one that it cannot give is left out, as one that it has not."""
@@ -271,11 +265,3 @@ def _chunks(tensors: Sequence[str], values: Mapping[str, np.ndarray]) -> Iterato
         size += values[tensor].nbytes
     if chunk:
         yield chunk
-
-
-def _noted(key: str, path: Path) -> Mapping[str, str]:
-    origins = WRITTEN[key].origins
-    try:
-        return {} if origins is None else origins(path)
-    except (ValueError, OSError):
-        return {}
