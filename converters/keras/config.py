@@ -134,12 +134,8 @@ def refuse_code(config: Any, *, built: bool = False) -> None:
 
 def _of_keras(module: str, rooms: frozenset[str]) -> bool:
     """Whether a module is one of Keras' that hold layers and their settings."""
-    for package in _PACKAGES:
-        if module == package:
-            return True
-        if module.startswith(f"{package}.") and module.removeprefix(f"{package}.").partition(".")[0] in rooms:
-            return True
-    return False
+    inside = (module.removeprefix(f"{package}.") for package in _PACKAGES if module.startswith(f"{package}."))
+    return module in _PACKAGES or any(rest.partition(".")[0] in rooms for rest in inside)
 
 
 def _objects(config: Any, *, built: bool = False) -> Iterator[dict[str, Any]]:

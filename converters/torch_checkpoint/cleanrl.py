@@ -16,7 +16,7 @@ from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32, INT32, INT64
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
-from converters.torch_checkpoint.network import Network, rnn_sizes
+from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.rsl_rl import per_action
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
@@ -231,10 +231,7 @@ def _ppo_discrete(making: _Making) -> str:
                 fix=EXPORT_ONNX,
             )
     if "lstm.weight_ih_l0" in net.state:
-        hidden, gates, layers = rnn_sizes(net.state, "lstm")
-        making.memory = ("h", "c") if gates == 4 else ("h",)
-        x, memory = net.recurrent(x, net.input("recurrent_in", len(making.memory) * layers * hidden), "lstm")
-        net.output("recurrent_out", memory)
+        x, making.memory = net.remembering(x, "lstm")
         making.outputs["recurrent_out"] = Role.MEMORY_OUT
     logits = net.linear(x, "actor") if alone else _layers(making, x, "actor", ends=True)
     net.at("action")

@@ -6,6 +6,7 @@ Source: mlagents/trainers/torch_entities/{layers,encoders,distributions}.py of 1
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -51,9 +52,7 @@ class Network(Builder):
 
     def width(self, reference: str) -> int:
         """The last axis of a tensor."""
-        shape = self.type_of(reference).shape
-        assert shape is not None and isinstance(shape[-1], int)
-        return shape[-1]
+        return self.length(reference, -1)
 
     # ------------------------------------------------------------------ layers
 
@@ -76,17 +75,12 @@ class Network(Builder):
 
     def lstm(self, x: str, memory: str, module: str) -> tuple[str, str]:
         """One step of ``nn.LSTM``. ``memory`` is [B, 1, 2H], h before c. Returns the output [B, H] and the memory."""
-        hidden = self.state.shape(f"{module}.weight_hh_l0")[-1] if f"{module}.weight_hh_l0" in self.state else 0
-        kernel = self.state.array(f"{module}.weight_ih_l0", 4 * hidden, self.width(x))
-        inner = self.state.array(f"{module}.weight_hh_l0", 4 * hidden, hidden)
-        bias = sum(self.state.array(f"{module}.bias_{k}_l0", 4 * hidden) for k in ("ih", "hh"))
+        hidden, *kind = rnn_sizes(self.state, module)
+        if kind != [4, 1]:
+            raise self.state.unknown(module, "its weights are not those of an LSTM with one layer")
         self.at(module)
-        flat = self.reshape(memory, (-1, 2 * hidden))
-        h, c = self.slice(flat, 1, 0, hidden), self.slice(flat, 1, hidden, 2 * hidden)
-        product = self.add("MatMul", [x, self.const(kernel.T, "kernel")])
-        recurrent = self.const(inner.T, "recurrent_kernel")
-        result, cell = lstm(self, product, h, c, recurrent, np.asarray(bias, FLOAT32), "ifgo")
-        return result, self.reshape(self.concat([result, cell], 1), (-1, 1, 2 * hidden))
+        x, after = self.recurrent(x, self.reshape(memory, (-1, 2 * hidden)), module)
+        return x, self.reshape(after, (-1, 1, 2 * hidden))
 
     def mlp(self, x: str, module: str, activation: Activation, *, ends: bool = False) -> str:
         """``nn.Sequential`` of linear layers with an activation after each, not after the last where it ``ends``.
@@ -134,6 +128,14 @@ class Network(Builder):
         self.at(module)
         return x, self.concat([*after["h"], *after["c"]], 1)
 
+    def remembering(self, x: str, module: str) -> tuple[str, tuple[str, ...]]:
+        """``recurrent``, its memory an input and an output of the policy. Returns the output, the memory's parts."""
+        hidden, gates, layers = rnn_sizes(self.state, module)
+        parts = ("h", "c") if gates == 4 else ("h",)
+        x, after = self.recurrent(x, self.input("recurrent_in", len(parts) * layers * hidden), module)
+        self.output("recurrent_out", after)
+        return x, parts
+
     # ------------------------------------------------------------------ images, NHWC inside
 
     def nhwc(self, image: str) -> str:
@@ -142,9 +144,7 @@ class Network(Builder):
 
     def flat(self, image: str) -> str:
         """An image [B, H, W, C] as rows, in PyTorch's order: C, H, W."""
-        shape = self.type_of(image).shape
-        assert shape is not None
-        size = int(np.prod([int(n) for n in shape[1:]]))
+        size = math.prod(self.length(image, axis) for axis in (1, 2, 3))
         return self.reshape(self.transpose(image, _TO_NCHW), (-1, size))
 
     def convolution(self, image: str, module: str, stride: int, padding: str = "VALID") -> str:

@@ -19,6 +19,7 @@ POCA (none at all in 0.20 and 0.21), tanh for SAC, which alone has a deviation t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -226,9 +227,7 @@ def _image(net: Network, x: str, module: str) -> str:
     assert encoder is not None
     net.at(module)
     if encoder.key == "fully_connected":
-        shape = net.type_of(x).shape
-        assert shape is not None
-        flat = net.reshape(x, (-1, int(np.prod([int(n) for n in shape[1:]]))))
+        flat = net.reshape(x, (-1, math.prod(net.length(x, axis) for axis in (1, 2, 3))))
     elif encoder.key == "resnet":
         flat = _resnet(net, net.nhwc(x), f"{module}.sequential")
         return net.add("Relu", [net.linear(flat, dense_name(state, module))])

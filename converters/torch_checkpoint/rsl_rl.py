@@ -16,7 +16,7 @@ from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
-from converters.torch_checkpoint.network import Network, rnn_sizes
+from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError
@@ -77,10 +77,7 @@ def to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tuple
         x = _normalised(net, x, module)
     memory: tuple[str, ...] = ()
     if recurrent:
-        hidden, gates, layers = rnn_sizes(weights, layout.memory)
-        memory = ("h", "c") if gates == 4 else ("h",)
-        x, after = net.recurrent(x, net.input("recurrent_in", len(memory) * layers * hidden), layout.memory)
-        net.output("recurrent_out", after)
+        x, memory = net.remembering(x, layout.memory)
     mean = net.mlp(x, layout.actor, activation, ends=True)
     net.output("action", mean)
     outputs = {"action": Role.ACTION, **({"recurrent_out": Role.MEMORY_OUT} if memory else {})}

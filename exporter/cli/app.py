@@ -56,15 +56,7 @@ def completion_command(shell: str) -> None:
 
 
 for _command in (
-    *(
-        completion_command,
-        demo_command,
-        export_command,
-        inspect_command,
-        verify_command,
-        compare_command,
-        runtimes_command,
-    ),
-    *(serve_command, snippets_command),
+    *(completion_command, demo_command, export_command, inspect_command, verify_command),
+    *(compare_command, runtimes_command, serve_command, snippets_command),
 ):
     app.add_command(_command)

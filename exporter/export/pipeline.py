@@ -194,17 +194,16 @@ class Exporter:
 
                 assert pool is not None, "runtimes run in processes"
                 tested = under_test(job, stage, artifacts, folder)
+                rules = replace(options.parity, rules=(), golden=None, budget={})
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     plain = replace(job, policy=job.own, profile=None)
                     under = tested_in(plain, self._formats, folder / "own")
-                    rules = replace(options.parity, rules=(), golden=None, budget={})
                     report = joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
 
                     whole = under_test(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
-                    rules = replace(options.parity, rules=(), golden=None, budget={})
                     own = verify(whole, self.runtimes, self._known, pool, rules, progress)
                     report = joined(report, own, "the policy with its weights as they were, by the numpy kernels")
                     found = decisions(whole, tested, options.weights, self.runtimes, pool, options.parity)

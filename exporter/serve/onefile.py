@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import posixpath
 import re
 from collections.abc import Mapping
 from pathlib import PurePosixPath
@@ -107,13 +108,7 @@ def _variable(name: str) -> str:
 
 def _beside(name: str, path: str) -> str:
     """What a module means by a relative path: ``views/a.mjs`` and ``../b.mjs`` are ``b.mjs``."""
-    parts = list(PurePosixPath(name).parent.parts)
-    for part in PurePosixPath(path).parts:
-        if part == "..":
-            parts.pop()
-        else:
-            parts.append(part)
-    return "/".join(parts)
+    return posixpath.normpath(posixpath.join(posixpath.dirname(name), path))
 
 
 def _without_comments(text: str) -> str:

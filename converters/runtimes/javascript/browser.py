@@ -64,11 +64,8 @@ def chromium_executable() -> str | None:
     named = os.environ.get(CHROMIUM_VARIABLE)
     if named:
         return shutil.which(str(Path(named).expanduser()))
-    for name in _ON_PATH:
-        found = shutil.which(name)
-        if found is not None:
-            return found
-    return next((place for place in _USUAL_PLACES.get(sys.platform, ()) if Path(place).is_file()), None)
+    found = next(filter(None, map(shutil.which, _ON_PATH)), None)
+    return found or next((place for place in _USUAL_PLACES.get(sys.platform, ()) if Path(place).is_file()), None)
 
 
 def _find(name: str, packages: tuple[str, ...]) -> RuntimeInfo:

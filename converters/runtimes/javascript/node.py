@@ -65,10 +65,8 @@ def node_executable() -> str | None:
     wheel = _node_wheel()
     if wheel is None:
         return None
-    for candidate in (wheel / "bin" / "node", wheel / "node.exe"):  # POSIX, Windows
-        if candidate.is_file():
-            return str(candidate)
-    return None
+    places = (wheel / "bin" / "node", wheel / "node.exe")  # POSIX, Windows
+    return next((str(place) for place in places if place.is_file()), None)
 
 
 def install_packages(progress: Progress) -> Path:

@@ -117,7 +117,7 @@ def _checked(library: ctypes.CDLL) -> Iterator[int]:
 
 
 class LegacySession:
-    """A frozen graph in a session with one thread, so that sums repeat.
+    """A frozen graph in a session with one thread, so that sums repeat. Both are freed when the object goes.
 
     Raises LegacyError on a graph that this version does not take.
     """
@@ -202,16 +202,6 @@ class LegacySession:
         shape = [library.TF_Dim(tensor, i) for i in range(library.TF_NumDims(tensor))]
         data = ctypes.string_at(library.TF_TensorData(tensor), library.TF_TensorByteSize(tensor))
         return np.frombuffer(data, _DTYPES[number]).reshape(shape).copy()
-
-    def close(self) -> None:
-        """Free the session and its graph; it also happens when the object goes."""
-        self._close()
-
-    def __enter__(self) -> LegacySession:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def _close(library: ctypes.CDLL, session: int, graph: int) -> None:

@@ -58,7 +58,7 @@ class OnnxFile:
     def inputs(self) -> tuple[DeclaredInput, ...]:
         """The inputs, in the file's order."""
         return tuple(
-            DeclaredInput(value.name, _dims(value), value.type.tensor_type.elem_type in _FLOATS)
+            DeclaredInput(value.name, _dims(value.type), value.type.tensor_type.elem_type in _FLOATS)
             for value in self.model.graph.input
             if value.name not in self.initializers
         )
@@ -154,11 +154,11 @@ def attributes(node: Any) -> Mapping[str, Any]:
     return {a.name: a for a in node.attribute}
 
 
-def _dims(value: Any) -> Dims | None:
-    kind = value.type.tensor_type
-    if not kind.HasField("shape"):
+def _dims(kind: Any) -> Dims | None:
+    """The lengths that a TypeProto says, None where it says no shape."""
+    if not kind.tensor_type.HasField("shape"):
         return None
-    return tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.shape.dim)
+    return tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.tensor_type.shape.dim)
 
 
 #: Ops that draw: what hangs on them is never a constant.
@@ -263,21 +263,8 @@ def _run(node: Any, inputs: list[np.ndarray | None], opset: int) -> list[np.ndar
 
 
 #: Operands that say a shape, axes or bounds, by operator: their values are needed too.
-_SAYING = {
-    "Reshape": (1,),
-    "Expand": (1,),
-    "Tile": (1,),
-    "ConstantOfShape": (0,),
-    "Slice": (1, 2, 3, 4),
-    "Squeeze": (1,),
-    "Unsqueeze": (1,),
-    "Split": (1,),
-    "Pad": (1,),
-    "ReduceSum": (1,),
-    "ReduceMean": (1,),
-    "OneHot": (1,),
-    "TopK": (1,),
-}
+_SECOND = "Reshape Expand Tile Squeeze Unsqueeze Split Pad ReduceSum ReduceMean OneHot TopK"
+_SAYING = {**dict.fromkeys(_SECOND.split(), (1,)), "ConstantOfShape": (0,), "Slice": (1, 2, 3, 4)}
 
 
 def inferred_shapes(file: OnnxFile) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
@@ -291,12 +278,7 @@ def inferred_shapes(file: OnnxFile) -> tuple[Mapping[str, tuple[int | None, ...]
                 negative = True
             elif name:
                 types[name] = kind
-    shapes = {
-        name: tuple(int(d.dim_value) if d.HasField("dim_value") else None for d in kind.tensor_type.shape.dim)
-        for name, kind in types.items()
-        if kind.tensor_type.HasField("shape")
-    }
-    return shapes, negative
+    return {name: dims for name, kind in types.items() if (dims := _dims(kind)) is not None}, negative
 
 
 def _given(file: OnnxFile) -> dict[str, Any]:

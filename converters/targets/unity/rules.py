@@ -132,19 +132,13 @@ def _expected(model: CheckedModel, deterministic: bool, profile: str) -> Finding
 
 
 def _deprecated_constants(model: CheckedModel, profile: str) -> Findings:
-    if model.constant(ACTION_SHAPE) is None:
-        yield _warning(
-            "The model does not contain any Action Output Shape Node.",
-            f"constant {ACTION_SHAPE}",
-            f"name the actions {CONTINUOUS} or {DISCRETE}, with the shape's constant; --for {profile} does",
-        )
-    if model.constant(IS_CONTINUOUS) is None:
-        yield _warning(
-            f'Required constant "{IS_CONTINUOUS}" was not found in the model file. '
-            "This is only required for model that uses a deprecated model format.",
-            f"constant {IS_CONTINUOUS}",
-            f"name the actions {CONTINUOUS} or {DISCRETE}, with the shape's constant; --for {profile} does",
-        )
+    said = {
+        ACTION_SHAPE: "The model does not contain any Action Output Shape Node.",
+        IS_CONTINUOUS: f'Required constant "{IS_CONTINUOUS}" was not found in the model file. '
+        "This is only required for model that uses a deprecated model format.",
+    }
+    fix = f"name the actions {CONTINUOUS} or {DISCRETE}, with the shape's constant; --for {profile} does"
+    yield from (_warning(text, f"constant {name}", fix) for name, text in said.items() if model.constant(name) is None)
 
 
 def _kind_of_action(model: CheckedModel, name: str, kind: str, end: str, deterministic: bool, profile: str) -> Findings:
