@@ -42,17 +42,22 @@ def _root() -> Path:
 
 
 @contextlib.contextmanager
-def built_beside(target: Path, is_whole: Callable[[Path], bool]) -> Iterator[Path]:
-    """An empty folder to fill; at the end of the block it is put in the place of ``target``.
+def built_beside(target: Path, is_whole: Callable[[Path], bool], what: str, fix: str) -> Iterator[Path]:
+    """An empty folder to fill; at the end of the block it is put in the place of ``target``; ``what`` is installed.
 
     So ``target`` is whole whenever it exists: a run that is killed leaves nothing that a later run would take for an
     installation. A damaged ``target`` is replaced; a whole one that another process put there meanwhile is kept.
-    Raises OSError.
+    Raises RuntimeUnavailableError where the system refuses something in the block; ``fix`` says what to do then.
     """
-    with stage(target) as building:
-        yield building
-        if not is_whole(target):
-            exchange(building, target)
+    try:
+        with stage(target) as building:
+            yield building
+            if not is_whole(target):
+                exchange(building, target)
+    except OSError as error:
+        raise RuntimeUnavailableError(
+            f"{what} cannot be installed", where=str(target), why=str(error), fix=fix
+        ) from error
 
 
 def check(folder: Path, known: Mapping[str, str], fix: str) -> None:

@@ -14,6 +14,7 @@ from exporter.reports.summary import verdict
 from exporter.verify.findings import Finding
 from exporter.verify.report import Pair
 
+_PARTS = Path(__file__).parent
 _CHIPS = {
     "passed": ("passed", "Passed"),
     "self-consistent": ("passed", "Self-consistent"),
@@ -58,15 +59,20 @@ def page(entries: Sequence[Entry]) -> str:
         el("meta", name="viewport", content="width=device-width, initial-scale=1"),
         el("meta", name="color-scheme", content="light dark"),
         el("title", title),
-        el("style", Markup((Path(__file__).parent / "page.css").read_text(encoding="utf-8"))),
+        el("style", Markup(_PARTS.joinpath("page.css").read_text(encoding="utf-8"))),
     )
     body = el(
         "body",
         el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered)),
-        el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)], sections.words()),
+        el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)], _words()),
         el("footer", f"Written by export-model {__version__}.{data}"),
     )
     return f"<!DOCTYPE html>\n{el('html', head, body, lang='en')}\n"
+
+
+def _words() -> Markup:
+    """What the words of a report mean."""
+    return Markup("".join(_PARTS.joinpath("words.html").read_text(encoding="utf-8").splitlines()))
 
 
 def _overview(entries: Sequence[Entry]) -> Markup:

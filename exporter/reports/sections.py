@@ -80,36 +80,6 @@ def again(entry: Entry) -> Markup | None:
     return el("p", "To compare again: ", el("code", line), class_="soft again")
 
 
-_WORDS = (
-    (
-        "reference",
-        "what everything is compared with: the source in its own runtime if one can read it, otherwise numpy kernels",
-    ),
-    ("|Δ|", "the absolute difference between a number and the reference's"),
-    (
-        "tolerance",
-        "how large |Δ| may be: atol + rtol·|reference|; any that is not the default is listed with its reason",
-    ),
-    (
-        "rounding",
-        "how far float32 rounding alone moves a result, measured; no runtime can be expected to do better",
-    ),
-    ("rollout", "several steps in a row: each runtime is fed its own memory back"),
-    ("draws", "actions drawn by chance are compared as distributions, with a stated rate of false alarms"),
-    (
-        "self-consistent",
-        "no other runtime can read the source, so the formats were compared with this tool's own reading of it",
-    ),
-    ("not verified", "nothing was installed to run it in except this tool's own kernels"),
-)
-
-
-def words() -> Markup:
-    """What the words of a report mean."""
-    listed = [el("div", el("dt", word), el("dd", meaning)) for word, meaning in _WORDS]
-    return el("details", el("summary", "What the words mean"), el("dl", listed, class_="words"))
-
-
 def failures(entry: Entry) -> Markup | None:
     """Every comparison that failed, by format and runtime: by how much, the first tensor that differs, what passes."""
     failed = entry.report.failures

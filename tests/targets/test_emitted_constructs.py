@@ -47,7 +47,8 @@ def wrong_readings(model: Model) -> Iterator[str]:
         if found.rule.reading is not Reading.WRONG:
             continue
         if found.importer != FIRST or (found.construct.op, found.rule.says) not in ONLY_IN_1_1:
-            yield f"{found.importer}: {found.construct.name} = {found.construct.form()}: {found.rule.says}"
+            forms = ", ".join(f"{o.source.value} {o.shape}" for o in found.construct.operands)
+            yield f"{found.importer}: {found.construct.name} = {found.construct.op}({forms}): {found.rule.says}"
 
 
 def unknown_operators(model: Model) -> set[str]:

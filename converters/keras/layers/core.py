@@ -17,10 +17,6 @@ from converters.keras.layers.step import Step, Translate
 from signatures.errors import UnsupportedOpError
 
 
-def _same(step: Step) -> str:
-    return step.x
-
-
 def _dense(step: Step) -> str:
     b, units = step.net, int(step.get("units"))
     step.refuse_unless("quantization_config", None)
@@ -79,10 +75,6 @@ def _repeat_vector(step: Step) -> str:
     b = step.net
     rows, width = b.shape(step.x)
     return b.broadcast(b.reshape(step.x, (rows, 1, width)), (rows, int(step.get("n")), width))
-
-
-def _permute(step: Step) -> str:
-    return step.net.transpose(step.x, [0, *(int(d) for d in step.get("dims"))])
 
 
 def _pairs(value: Any, axes: int) -> list[tuple[int, int]]:
@@ -200,7 +192,7 @@ _IDENTITIES = (
 )
 _MERGES = {"Add": "Add", "Multiply": "Mul", "Subtract": "Sub", "Maximum": "Maximum", "Minimum": "Minimum"}
 LAYERS: Mapping[str, Translate] = {
-    **dict.fromkeys(_IDENTITIES, _same),
+    **dict.fromkeys(_IDENTITIES, lambda s: s.x),
     **{name: partial(_merged, op=op) for name, op in _MERGES.items()},
     "Average": _average,
     "Concatenate": _concatenate,
@@ -211,7 +203,7 @@ LAYERS: Mapping[str, Translate] = {
     "Flatten": _flatten,
     "Reshape": _reshape,
     "RepeatVector": _repeat_vector,
-    "Permute": _permute,
+    "Permute": lambda s: s.net.transpose(s.x, [0, *(int(d) for d in s.get("dims"))]),
     **dict.fromkeys(("ZeroPadding1D", "ZeroPadding2D"), partial(_framed, key="padding", sign=1)),
     **dict.fromkeys(("Cropping1D", "Cropping2D"), partial(_framed, key="cropping", sign=-1)),
     **dict.fromkeys(("UpSampling1D", "UpSampling2D"), _up_sampling),

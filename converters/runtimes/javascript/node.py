@@ -85,19 +85,12 @@ def install_packages(progress: Progress) -> Path:
             why="npm is not on PATH" if npm is None else "node is not on PATH",
             fix=f"install Node.js 18 or later, or: {INSTALL_NODE}; then: {INSTALL_TFJS}",
         )
-    try:
-        with built_beside(target, _has_packages) as building:
-            for name in ("package.json", "package-lock.json"):
-                shutil.copyfile(JS_SOURCE / name, building / name)
-            progress("installing TensorFlow.js, onnxruntime-web and playwright-core with npm (110 MB, 480 MB on disk)")
-            _run_npm_ci(npm, building)
-    except OSError as error:
-        raise RuntimeUnavailableError(
-            "the npm packages cannot be installed",
-            where=str(target),
-            why=str(error),
-            fix=f"free some space or allow writing, or let {JS_VARIABLE} name a folder that holds the node_modules",
-        ) from error
+    fix = f"free some space or allow writing, or let {JS_VARIABLE} name a folder that holds the node_modules"
+    with built_beside(target, _has_packages, "the npm packages", fix) as building:
+        for name in ("package.json", "package-lock.json"):
+            shutil.copyfile(JS_SOURCE / name, building / name)
+        progress("installing TensorFlow.js, onnxruntime-web and playwright-core with npm (110 MB, 480 MB on disk)")
+        _run_npm_ci(npm, building)
     progress(f"the npm packages are in {target}")
     if js_home() != target:
         # True, and a surprise if unsaid: what was just installed is not what will run.

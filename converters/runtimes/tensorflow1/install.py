@@ -41,16 +41,9 @@ def install(release: Release, progress: Progress) -> Path:
     if reason is not None:
         raise RuntimeUnavailableError(f"TensorFlow {release.version} does not run here", why=reason)
     progress(f"fetching TensorFlow {release.version} with pip ({release.megabytes} MB)")
-    try:
-        with built_beside(target, is_whole) as folder:
-            _fill(folder, release)
-    except OSError as error:
-        raise RuntimeUnavailableError(
-            f"TensorFlow {release.version} cannot be installed",
-            where=str(target),
-            why=str(error),
-            fix="free some space, or allow writing there",
-        ) from error
+    fix = "free some space, or allow writing there"
+    with built_beside(target, is_whole, f"TensorFlow {release.version}", fix) as folder:
+        _fill(folder, release)
     progress(f"TensorFlow {release.version} is in {target}")
     return target
 

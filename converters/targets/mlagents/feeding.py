@@ -158,7 +158,8 @@ def drawn_inside(dressing: Dressing, spec: TensorSpec) -> str:
             why="draws are made inside the model, a row of a known width for each agent",
             fix="leave the noise out: --noise zero",
         )
-    like = next((r for r, k in reversed(builder.types.items()) if _fits(k.shape, width) and k.dtype == FLOAT32), None)
+    rows: tuple[object, ...] = (BATCH, width)
+    like = next((r for r, k in reversed(builder.types.items()) if k.shape == rows and k.dtype == FLOAT32), None)
     if like is None:
         source = next(r for r, k in builder.types.items() if k.shape and k.shape[0] == BATCH and len(k.shape) == 2)
         like = builder.add(
@@ -168,7 +169,3 @@ def drawn_inside(dressing: Dressing, spec: TensorSpec) -> str:
         )
     shape = builder.add("Shape", [like], f"{spec.name}/shape", out_type=INT32)
     return builder.add("RandomStandardNormal", [shape], f"{spec.name}/drawn", dtype=FLOAT32)
-
-
-def _fits(shape: object, width: int | None) -> bool:
-    return shape == (BATCH, width)

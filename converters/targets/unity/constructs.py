@@ -86,12 +86,6 @@ class Construct:
         """The nodes that read a result of this one."""
         return tuple(c for name in self.outputs for c in self.model.readers.get(name, ()))
 
-    def form(self) -> str:
-        """Operator, operands and attributes as text: what tables of constructs are made of."""
-        operands = ", ".join(_operand_form(o) for o in self.operands)
-        attributes = " ".join(f"{k}={v}" for k, v in sorted(self.attributes.items()) if np.size(v) < 9)
-        return f"{self.op}({operands}) {attributes}".strip()
-
 
 class Model:
     """The constructs of a model in its order, with the values that connect them."""
@@ -182,11 +176,3 @@ def _type_of(onnx: Any, kind: Any) -> tuple[tuple[int | None, ...] | None, np.dt
         )
     dtype = onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type) if kind.elem_type else None
     return shape, dtype
-
-
-def _operand_form(operand: Operand) -> str:
-    if operand.source is Source.ABSENT:
-        return "-"
-    if operand.value is not None and operand.value.size < 6 and operand.value.dtype.kind == "i":
-        return f"{operand.source.value} {operand.value.reshape(-1).tolist()}"
-    return f"{operand.source.value} of rank {'?' if operand.rank is None else operand.rank}"

@@ -45,43 +45,33 @@ def decisions(
 
     Where both have the same graph (a bundle that is verified again), it is the source alone that says what was.
     """
-    try:
-        return list(_decisions(whole, small, storage, runtimes, pool, options.seed))
-    except RunFailedError as error:
-        return [failure("weights", storage, error)]
-
-
-def _decisions(
-    whole: PolicyUnderTest,
-    small: PolicyUnderTest,
-    storage: Storage,
-    runtimes: Sequence[str],
-    pool: RuntimePool,
-    seed: int,
-) -> Iterator[Finding]:
     names = list(dict.fromkeys(_judged(small.signature)))
     pairs: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    with (
-        Reference(whole, runtimes, pool, seed) as before,
-        Reference(small, runtimes, pool, seed) as after,
-    ):
-        again = whole.reference == small.reference
-        if again and before.original is None:
-            return
-        ask = before.original.run if again and before.original is not None else partial(_one, before)
-        steps = draw_typical(small.signature, seed=seed, count=_CASES)
-        sides = (_acted(small.signature, steps, each) for each in (ask, partial(_one, after)))
-        for asked, given in zip(*sides, strict=True):
-            for name in names:
-                if name in asked and name in given:
-                    pairs.setdefault(name, []).append((asked[name], given[name]))
-        source = "the source" if before.original is not None else "the policy with all digits, in numpy"
-    limit = LIMITS[storage]
+    try:
+        with (
+            Reference(whole, runtimes, pool, options.seed) as before,
+            Reference(small, runtimes, pool, options.seed) as after,
+        ):
+            again = whole.reference == small.reference
+            if again and before.original is None:
+                return []
+            ask = before.original.run if again and before.original is not None else partial(_one, before)
+            steps = draw_typical(small.signature, seed=options.seed, count=_CASES)
+            sides = (_acted(small.signature, steps, each) for each in (ask, partial(_one, after)))
+            for asked, given in zip(*sides, strict=True):
+                for name in names:
+                    if name in asked and name in given:
+                        pairs.setdefault(name, []).append((asked[name], given[name]))
+            source = "the source" if before.original is not None else "the policy with all digits, in numpy"
+    except RunFailedError as error:
+        return [failure("weights", storage, error)]
+    limit, found = LIMITS[storage], list[Finding]()
     for name, answers in pairs.items():
         was, made = (np.concatenate([answer[side] for answer in answers]) for side in (0, 1))
         off, said = compared(_choices(small.signature, name, was), _choices(small.signature, name, made))
         text = f"{said} {source}; {limit:.0%} is allowed"
-        yield Decisions("weights", storage, name, off, off, Tolerance(limit, 0.0), off <= limit, None, text)
+        found.append(Decisions("weights", storage, name, off, off, Tolerance(limit, 0.0), off <= limit, None, text))
+    return found
 
 
 def _one(reference: Reference, feeds: Feeds) -> Mapping[str, np.ndarray]:
