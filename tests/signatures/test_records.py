@@ -27,6 +27,7 @@ def declared(dataclass: Callable[..., Any], slots: bool) -> tuple[Any, Any]:
         _: KW_ONLY
         hidden: int = field(default=3, repr=False, compare=False)
         made: dict[str, str] = field(init=False, default_factory=dict, compare=False)
+        later: int = field(init=False, default=7)
         given: list[int] = field(default_factory=list, compare=False)
 
         def __post_init__(self) -> None:
@@ -73,6 +74,56 @@ class Kept:
 
     number: int
     text: str = ""
+
+
+@pytest.mark.parametrize("way", [records.dataclass, dataclasses.dataclass], ids=["ours", "standard"])
+def test_records_that_change_and_records_that_are_compared_by_identity(way: Callable[..., Any]) -> None:
+    @way
+    class Changing:
+        """Not frozen."""
+
+        count: int = 0
+        names: list[str] = field(default_factory=list)
+
+    @way(frozen=True, eq=False, kw_only=True)
+    class Itself:
+        """Equal to itself alone."""
+
+        name: str
+        size: int = 1
+
+    changing = Changing(2)
+    changing.count += 1
+    assert changing == Changing(3) and Changing(3) != Changing(4)
+    assert Changing.__hash__ is None
+    one, other = Itself(name="a"), Itself(name="a")
+    assert one != other and len({one, other}) == 2
+    assert dataclasses.replace(one, size=2).size == 2
+    with pytest.raises(TypeError, match="positional"):
+        Itself("a")
+
+
+@pytest.mark.parametrize("way", [records.dataclass, dataclasses.dataclass], ids=["ours", "standard"])
+def test_what_cannot_be_a_record_is_refused_where_it_is_declared(way: Callable[..., Any]) -> None:
+    with pytest.raises(TypeError, match="non-default argument 'late' follows default argument"):
+        way(type("Order", (), {"__annotations__": {"early": "int", "late": "int"}, "early": 1}))
+    with pytest.raises(ValueError, match="mutable default"):
+        way(type("Shared", (), {"__annotations__": {"parts": "list[int]"}, "parts": []}))
+    frozen = way(frozen=True)(type("Base", (), {"__annotations__": {"a": "int"}}))
+    with pytest.raises(TypeError, match="frozen"):
+        way(type("Derived", (frozen,), {"__annotations__": {"b": "int"}}))
+
+
+def test_an_init_is_compiled_when_a_record_is_made() -> None:
+    @records.dataclass(frozen=True, slots=True)
+    class Declared:
+        """Never made."""
+
+        number: int
+
+    assert not inspect.isfunction(vars(Declared)["__init__"])
+    assert Declared(3).number == 3
+    assert inspect.isfunction(vars(Declared)["__init__"])
 
 
 def test_a_record_is_pickled() -> None:
