@@ -144,7 +144,8 @@ NOT_LOADED = (
     # the package: messages are written with converters/onnx/messages.py, and its checker is verification's
     *("onnx", "ml_dtypes", "typing_extensions"),
     # how messages are described in Python: converters/messages.py describes them in bytes
-    *("google.protobuf.descriptor_pb2", "google.protobuf.json_format"),
+    *("google.protobuf.descriptor_pb2", "google.protobuf.json_format", "google.protobuf.descriptor_pool"),
+    *("google.protobuf.message_factory", "google.protobuf.text_format"),
     *("rich", "email", "http", "ssl", "_hashlib", "socket", "asyncio", "multiprocessing", "subprocess", "tarfile"),
     *("numpy.ma", "numpy.random", "numpy.testing", "numpy.fft", "numpy.polynomial", "numpy.f2py", "numpy.ctypeslib"),
     *("converters.barracuda.writer", "converters.barracuda.reader", "converters.targets", "converters.live"),
