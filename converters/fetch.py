@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 import re
 import stat
@@ -137,5 +136,7 @@ def _neighbours(path: Path) -> str:
         names = sorted(p.name for p in path.parent.iterdir())
     except OSError:  # there is no such folder, or it may not be listed
         names = []
+    import difflib
+
     close = difflib.get_close_matches(path.name, names, n=1)
     return f"did you mean {path.parent / close[0]}?" if close else "check the path"

@@ -5,17 +5,19 @@ Imports click only.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Sequence
+import importlib
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-from click.shell_completion import CompletionItem
 
 from exporter import __version__
 from exporter.cli.terminal import say
 from signatures.errors import UsageError
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 PROGRAM = "export-model"
 #: What options and arguments take that are paths: of any kind, of a file.
@@ -75,6 +77,34 @@ def _place(name: str | None) -> int:
     return order.index(name) if name in order else len(order)
 
 
+class Rooms(MutableMapping[str, click.Command]):
+    """A command's name → the command, ``NAME_command`` in its module, which is imported when it is asked for."""
+
+    def __init__(self, modules: Mapping[str, str]) -> None:
+        self._rooms: dict[str, str | click.Command] = dict(modules)
+
+    def __getitem__(self, name: str) -> click.Command:
+        room = self._rooms[name]
+        if isinstance(room, str):
+            self._rooms[name] = room = getattr(importlib.import_module(room), f"{name}_command")
+        return room
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._rooms
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rooms)
+
+    def __len__(self) -> int:
+        return len(self._rooms)
+
+    def __setitem__(self, name: str, made: click.Command) -> None:
+        self._rooms[name] = made
+
+    def __delitem__(self, name: str) -> None:
+        del self._rooms[name]
+
+
 class SourceGroup(click.Group):
     """``export-model FILE`` is ``export-model export FILE``: anything that is not a command is a source."""
 
@@ -89,8 +119,11 @@ class SourceGroup(click.Group):
 
     def _refuse_typo(self, word: str) -> None:
         """A word that is nearly a command and no file is a command mistyped, not a source that is missing."""
-        plain = word.replace("-", "").isalpha() and not word.startswith("-")
-        close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7) if plain else []
+        if word.startswith("-") or not word.replace("-", "").isalpha():
+            return
+        import difflib
+
+        close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7)
         if close and not Path(word).exists():
             raise UsageError(f"{word!r} is neither a command nor a file", fix=f"did you mean: {PROGRAM} {close[0]}?")
 
@@ -101,6 +134,8 @@ class SourceGroup(click.Group):
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Commands, and files: the first word may be a source."""
+        from click.shell_completion import CompletionItem
+
         return [*super().shell_complete(ctx, incomplete), CompletionItem(incomplete, type="file")]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
-import html
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,6 +122,8 @@ def _linked(address: str) -> list[Path]:
         )
     system, _ = filesystem(address)
     scheme, _, rest = address.partition("://")
+    import html  # 2 ms of every start
+
     place, *parts = rest.split("/")
     tops, size = [f"{scheme}://{place}"], 0
     first = next(number for number, part in enumerate(parts) if is_pattern(part))

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import ast
 import functools
+import importlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+import exporter
+from converters.formats import ROOMS
+from exporter.cli.app import app
 from tests.commands import ROOT, python
 
 #: package → the packages of this project that it may import
@@ -153,6 +157,10 @@ NOT_LOADED = (
     *("converters.runtimes", "converters.onnx.reader", "converters.onnx.importer", "converters.tensorboard"),
     *("exporter.verify.verification", "exporter.verify.findings", "exporter.verify.report", "exporter.verify.trial"),
     *("exporter.reports", "exporter.serve", "exporter.acting", "exporter.compare", "exporter.inspect", "exporter.demo"),
+    # other commands, and what only a page of links or completion asks for
+    *("exporter.cli.compare", "exporter.cli.inspect", "exporter.cli.verify", "exporter.cli.serve", "exporter.cli.demo"),
+    *("exporter.cli.snippets", "exporter.cli.runtimes", "exporter.cli.completion"),
+    *("html", "click.shell_completion"),
     *("exporter.snippets", "exporter.fleet.fleet", "exporter.fleet.worker", "exporter.export.again"),
 )
 
@@ -188,3 +196,33 @@ def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
     code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
     assert python("-c", code).out.split() == ["False", "True"]
     assert "has no attribute 'nothing'" in python("-c", "import exporter; exporter.nothing").err
+
+
+def test_every_name_that_is_resolved_later_is_there() -> None:
+    """Commands by their modules, functions of the package, and what a format names of a module not yet imported."""
+    for name, command in app.commands.items():
+        assert command.name == name
+    rooms = {
+        p.stem for p in MODULES if p.parent == ROOT / "exporter/cli" and f"\ndef {p.stem}_command(" in p.read_text()
+    }
+    assert rooms == {*app.commands}
+    for name in exporter.__all__:
+        assert getattr(exporter, name) is not None
+    named = [ask for room in ROOMS for ask in asked_later(ROOT / "converters" / room / "__init__.py")]
+    assert len(named) > 30
+    missing = [ask for ask in named if not callable(getattr(importlib.import_module(ask[0]), ask[1], None))]
+    assert missing == []
+
+
+def asked_later(room: Path) -> Iterator[tuple[str, str]]:
+    """(module, function) of all that a room's ``__init__`` asks of what ``deferred`` gives."""
+    tree, package = tree_of(room), ".".join(room.parent.relative_to(ROOT).parts)
+    modules: dict[str, str] = {}
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Assign) and ast.unparse(found.value).startswith("deferred("):
+            assert isinstance(found.value, ast.Call) and isinstance(found.targets[0], ast.Tuple)
+            words = [ast.literal_eval(word) for word in found.value.args[1:]]
+            modules.update(zip(map(ast.unparse, found.targets[0].elts), words, strict=True))
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Attribute) and isinstance(found.value, ast.Name) and found.value.id in modules:
+            yield f"{package}.{modules[found.value.id]}", found.attr
