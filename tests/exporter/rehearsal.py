@@ -21,6 +21,7 @@ from converters.runtimes.process import RunFailedError
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export import pipeline
 from exporter.export.pipeline import ExportResult
+from exporter.verify.report import ParityReport
 
 Array = npt.NDArray[Any]
 Tensors = dict[str, Array]
@@ -156,3 +157,27 @@ def export(
     """Export ``source``, the runtimes of ``pool`` verifying."""
     monkeypatch.setattr(runtimes, "chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
     return list(pipeline.export([source], pipeline.ExportOptions(out, **options), pool=pool))  # type: ignore[arg-type]
+
+
+#: What the fixture ``exporting`` gives.
+Exporting = Callable[..., ExportResult]
+
+
+def report_of(result: ExportResult) -> ParityReport:
+    assert result.report is not None
+    return result.report
+
+
+def spoiling(kind: str, runtime: str, change: Callable[[Tensors], object]) -> Spoil:
+    """One format in one runtime answers something else where it is asked for the action."""
+
+    def spoil(a: str, b: str, answer: Tensors) -> Tensors:
+        if (a, b) == (kind, runtime) and {"action", "action:0"} & set(answer):
+            change(answer)
+        return answer
+
+    return spoil
+
+
+def failures(result: ExportResult) -> set[tuple[str, str, str, str]]:
+    return {(c.format, c.runtime, c.output, c.kind) for c in report_of(result).failures}

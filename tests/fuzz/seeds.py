@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import io
 import json
-import pickletools
-import struct
 import tempfile
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,21 +18,17 @@ from typing import Any
 import numpy as np
 
 from converters import schema
-from converters.barracuda.format import _Parser
-from converters.checkpoint.table import read_table
 from converters.formats import WRITTEN
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import FOLDER, path
-from signatures.digest import sha256_hex
 from signatures.errors import ExportModelError
 from tests.checkpoint.writing import bundle as write_checkpoint
-from tests.checkpoint.writing import literal, table
+from tests.checkpoint.writing import literal
 from tests.checkpoint.writing import policy as training_policy
-from tests.fuzz import mutation
+from tests.fuzz import changes
+from tests.fuzz.changes import Files
 from tests.handmade import constant, continuous_policy, graph_bytes, graph_def, node, sampled_policy
 from tests.hostile import test_keras_config, zoo
-
-Files = dict[str, bytes]
 
 
 @dataclass(frozen=True)
@@ -233,259 +226,8 @@ def _saved_zips() -> list[Files]:
     return [{"policy.zip": f.read_bytes()} for f in sorted((FOLDER / "sb3_zip").glob("*.zip"))]
 
 
-# ------------------------------------------------------------------ changes
-
-
-def _one(change: Callable[[bytes, Random], bytes]) -> Callable[[Files, Random], Files]:
-    """The model's own file changed, seldom another of the folder."""
-
-    def changed(files: Files, random: Random) -> Files:
-        name = max(files, key=lambda n: not n.endswith(".data"))
-        other = random.choice(sorted(files))
-        if other != name and random.random() < 0.1:
-            return {**files, other: mutation.damaged(files[other], random)}
-        return {**files, name: change(files[name], random)}
-
-    return changed
-
-
-def _message(whole: Callable[[bytes], object]) -> Callable[[bytes, Random], bytes]:
-    return lambda data, random: mutation.protobuf(data, random, whole)
-
-
-def _onnx_message(data: bytes) -> object:
-    import onnx
-
-    return onnx.ModelProto.FromString(data)
-
-
-def _nn_parts(data: bytes) -> list[tuple[str, bytes]]:
-    """A ``.nn`` cut where its fields begin, with what each is; a text and a list have their count with them."""
-
-    class Cutting(_Parser):
-        def __init__(self, given: bytes) -> None:
-            super().__init__(given)
-            self.found: list[tuple[str, bytes]] = []
-            self._inside = False
-
-        def _whole(self, kind: str, read: Callable[[], Any]) -> Any:
-            begun, outer, self._inside = self._at, self._inside, True
-            value = read()
-            self._inside = outer
-            if not outer:
-                self.found.append((kind, given[begun : self._at]))
-            return value
-
-        def _take(self, count: int) -> bytes:
-            return bytes(self._whole("bytes", lambda: super(Cutting, self)._take(count)))
-
-        def _integer(self, *form: struct.Struct) -> int:
-            kind = form[0].format if form else "<i"
-            return int(self._whole(kind, lambda: super(Cutting, self)._integer(*form)))
-
-        def _text(self) -> str:
-            return str(self._whole("text", super()._text))
-
-        def _ints(self) -> Any:
-            return self._whole("list", super()._ints)
-
-    given = data
-    cutting = Cutting(data)
-    cutting.model()
-    assert b"".join(part for _, part in cutting.found) == data
-    return cutting.found
-
-
-def _nn_field(kind: str, part: bytes, random: Random, known: list[bytes]) -> bytes:
-    if kind in ("<i", "<q"):
-        near = int.from_bytes(part, "little", signed=True)
-        return (mutation.number(random, near) & (1 << 8 * len(part)) - 1).to_bytes(len(part), "little")
-    if kind == "list":
-        numbers = list(struct.unpack(f"<{len(part) // 4 - 1}I", part[4:]))
-        at = random.randrange(len(numbers) + 1)
-        numbers[at : at + random.choice((0, 1, 1))] = [mutation.number(random) & 0xFFFFFFFF] * random.choice(
-            (0, 1, 1, 4)
-        )
-        return struct.pack(f"<{len(numbers) + 1}I", len(numbers), *numbers)
-    if kind == "text":
-        words = mutation.text(random, known)
-        return struct.pack("<i", len(words)) + words
-    return mutation.damaged(part, random)[: len(part)].ljust(len(part), b"\x7f")
-
-
-def _nn(files: Files, random: Random) -> Files:
-    (name,) = [n for n in files if n.endswith(".nn")]
-    cut = _nn_parts(files[name])
-    known = [part[4:] for kind, part in cut if kind == "text"]
-    if random.random() < 0.2:
-        return {name: mutation.parts([p for _, p in cut], random, mutation.damaged)}
-    for _ in range(random.choice((1, 1, 2, 3))):
-        at = random.randrange(len(cut))
-        cut[at] = ("bytes", _nn_field(*cut[at], random, known))
-    return {name: b"".join(part for _, part in cut)}
-
-
-def _index(data: bytes, random: Random) -> bytes:
-    """A table with its entries changed, written anew with right checksums."""
-    pairs = [list(pair) for pair in read_table(data)]
-    for _ in range(random.choice((1, 1, 2, 4))):
-        at = random.randrange(len(pairs))
-        how = random.random()
-        if how < 0.55:
-            pairs[at][1] = mutation.protobuf(pairs[at][1], random) if pairs[at][1] else b""
-        elif how < 0.7:
-            pairs[at][0] = mutation.text(random, [bytes(k) for k, _ in pairs])
-        elif how < 0.8:
-            pairs[at][1] = pairs[random.randrange(len(pairs))][1]
-        elif how < 0.9 and len(pairs) > 1:
-            del pairs[at]
-        else:
-            pairs.append([pairs[at][0] + random.choice((b"", b"x", b"/Adam")), pairs[at][1]])
-    if random.random() < 0.9:
-        pairs.sort()
-
-    def compress(content: bytes) -> bytes:
-        packed = literal(content)
-        return mutation.damaged(packed, random) if random.random() < 0.2 else packed
-
-    made = [(bytes(k), bytes(v)) for k, v in pairs]
-    size = {"per_block": random.choice((1, 2, 8)), "interval": random.choice((1, 4))}
-    return table(made, **size, compress=compress if random.random() < 0.4 else None)  # type: ignore[arg-type]
-
-
-def _checkpoint(files: Files, random: Random) -> Files:
-    chosen = random.choice(sorted(files))
-    data = files[chosen]
-    if chosen.endswith(".index"):
-        data = _index(data, random)
-    elif chosen.endswith((".pb", ".meta")):
-        kind = schema.GraphDef if chosen.endswith(".pb") else schema.MetaGraphDef
-        data = mutation.protobuf(data, random, kind.FromString)
-    else:
-        data = mutation.damaged(data, random)
-    made = {**files, chosen: data}
-    if random.random() < 0.03:
-        del made[random.choice(sorted(made))]
-    return made or files
-
-
-def _saved_model(files: Files, random: Random) -> Files:
-    if random.random() < 0.2 and len(files) > 1:
-        return _checkpoint(files, random)
-    return {**files, "saved_model.pb": mutation.protobuf(files["saved_model.pb"], random, schema.SavedModel.FromString)}
-
-
-def _opcodes(pickle: bytes) -> list[bytes]:
-    """A pickle cut into its opcodes."""
-    starts = [at for _, _, at in pickletools.genops(pickle) if at is not None]
-    return [pickle[a:b] for a, b in zip(starts, [*starts[1:], len(pickle)], strict=True)]
-
-
-_CODES = (
-    *(bytes([code]) for code in b"})](N0123RbQtldusea.\x88\x85\x86\x87\x8f\x93\x94"),
-    *(b"K\x07", b"J\xff\xff\xff\xff", b"\x8a\x09" + b"\xff" * 8 + b"\x7f", b"G\x7f\xf0\0\0\0\0\0\0", b"\x80\x05"),
-    *(b"h\x00", b"h\x01", b"q\x00", b"r\xff\xff\xff\x7f", b"X\x01\x00\x00\x00a", b"X\x02\x00\x00\x00\xff\xfe"),
-    *(b"\x96" + b"\xff" * 8, b"\x8e" + b"\xff" * 8, b"B\x02\0\0\0ab", b"ctorch\nFloatStorage\n", b"ctorch\nSize\n"),
-    *(b"ccollections\nOrderedDict\n", b"ctorch._utils\n_rebuild_tensor_v2\n", b"cos\nsystem\n"),
-)
-
-
-def _opcode(part: bytes, random: Random) -> bytes:
-    if len(part) > 1 and random.random() < 0.4:
-        return part[:1] + mutation.damaged(part[1:], random)
-    return random.choice(_CODES) + (part if random.random() < 0.5 else b"")
-
-
-def _pickled(files: Files, random: Random) -> Files:
-    data = files["policy.pt"]
-    if not data.startswith(b"PK") or random.random() < 0.05:
-        if data.startswith(b"PK"):
-            return {"policy.pt": mutation.damaged(data, random)}
-        first = data[: pickled_end(data)]
-        return {"policy.pt": mutation.parts(_opcodes_of_row(first), random, _opcode) + data[len(first) :]}
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = {e.filename: archive.read(e) for e in archive.infolist()}
-    name = next(n for n in entries if n.endswith("data.pkl"))
-    if random.random() < 0.9:
-        entries[name] = mutation.parts(_opcodes(entries[name]), random, _opcode)
-    else:
-        other = random.choice(sorted(entries))
-        content = entries.pop(other)
-        if random.random() < 0.7:
-            entries[other] = mutation.damaged(content, random)
-    return {"policy.pt": zipped(entries)}
-
-
-def pickled_end(data: bytes) -> int:
-    """Where the pickles of the old form end and the storages begin."""
-    stream = io.BytesIO(data)
-    for _ in range(5):
-        list(pickletools.genops(stream))
-    return stream.tell()
-
-
-def _opcodes_of_row(data: bytes) -> list[bytes]:
-    stream, found = io.BytesIO(data), []
-    while stream.tell() < len(data):
-        begin = stream.tell()
-        list(pickletools.genops(stream))
-        found += _opcodes(data[begin : stream.tell()])
-    return found
-
-
-def _saved_zip(files: Files, random: Random) -> Files:
-    with zipfile.ZipFile(io.BytesIO(files["policy.zip"])) as archive:
-        entries = {e.filename: archive.read(e) for e in archive.infolist()}
-    if random.random() < 0.6:
-        entries["data"] = _json(entries["data"], random)
-    else:
-        entries["policy.pth"] = _pickled({"policy.pt": entries["policy.pth"]}, random)["policy.pt"]
-    return {"policy.zip": zipped(entries)}
-
-
-def zipped(entries: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
-    """A ZIP archive, the same bytes for the same entries."""
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", method) as archive:
-        for name, data in entries.items():
-            archive.writestr(zipfile.ZipInfo(name), data, method)
-    return made.getvalue()
-
-
-def _json(data: bytes, random: Random) -> bytes:
-    if random.random() < 0.05:
-        return mutation.damaged(data, random)
-    made = json.dumps(mutation.json_tree(json.loads(data), random))
-    return made.encode("utf-8", "surrogatepass")
-
-
-def _tfjs(files: Files, random: Random) -> Files:
-    shards = [n for n in files if n.endswith(".bin")]
-    if shards and random.random() < 0.1:
-        name = random.choice(shards)
-        return {**files, name: mutation.damaged(files[name], random)}
-    return {**files, "model.json": _json(files["model.json"], random)}
-
-
-def _bundle(files: Files, random: Random) -> Files:
-    if random.random() < 0.8:
-        return {**files, "policy.json": _json(files["policy.json"], random)}
-    ways: dict[str, Callable[[bytes, Random], bytes]] = {
-        ".bytes": _message(schema.GraphDef.FromString),
-        ".onnx": _message(_onnx_message),
-        ".pb": _message(schema.SavedModel.FromString),
-        ".nn": lambda data, r: _nn({"x.nn": data}, r)["x.nn"],
-        "model.json": _json,
-    }
-    name, change = random.choice([(n, c) for end, c in ways.items() for n in sorted(files) if n.endswith(end)])
-    data = change(files[name], random)
-    content = json.loads(files["policy.json"])
-    content["files"][name] = {"sha256": sha256_hex(data), "bytes": len(data)}
-    return {**files, name: data, "policy.json": json.dumps(content).encode()}
-
-
-def _keras_config(files: Files, random: Random) -> Files:
-    return {"policy.keras": zipped({**files, "config.json": _json(files["config.json"], random)})}
+def _single_nn() -> list[Files]:
+    return [{"policy.nn": data} for files in _artefacts("", ".nn") for data in files.values()]
 
 
 def _recordings() -> list[Files]:
@@ -504,49 +246,22 @@ def _three(name: str) -> bytes:
     return made.getvalue()
 
 
-#: What the header of an array may say.
-_HEADER = tuple(b"1|-1|99999999999999999999|'<U9'|'<f8'|'<M8'|True|None|(|)|'V8'|'O'".split(b"|"))
-
-
-def _recording(files: Files, random: Random) -> Files:
-    data = files["recorded.npz"]
-    if random.random() < 0.15:
-        return {**files, "recorded.npz": mutation.damaged(data, random)}
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = {e.filename: archive.read(e) for e in archive.infolist()}
-    for _ in range(random.choice((1, 1, 2))):
-        name = random.choice(sorted(entries))
-        array = entries.pop(name)
-        how = random.random()
-        if how < 0.5 and len(array) > 10:  # it may have been damaged before
-            head, rest = array[:10], array[10:]
-            end = struct.unpack("<H", head[8:10])[0]
-            pieces = rest[:end].replace(b"(", b" ( ").replace(b",", b" , ").split(b" ")
-            text = mutation.parts([p + b" " for p in pieces], random, lambda _, r: r.choice(_HEADER)).ljust(end)[:end]
-            array = head + text + rest[end:]
-        elif how < 0.8:
-            array = mutation.damaged(array, random)
-        entries[name if how < 0.9 else random.choice(("action.npy", "../x.npy", "x", "a\\b.npy"))] = array
-    return {**files, "recorded.npz": zipped(entries, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))}
+# ------------------------------------------------------------------ seeds and what changes them
 
 
 def _tables() -> Iterator[tuple[str, Reader]]:
-    yield "frozen graph", Reader(_frozen, _one(_message(schema.GraphDef.FromString)), "policy.bytes")
-    yield "SavedModel", Reader(_saved_models, _saved_model)
-    yield "ONNX", Reader(_onnx, _one(_message(_onnx_message)), "policy.onnx")
-    yield "Barracuda .nn", Reader(lambda: _single_nn(), _nn, "policy.nn")
-    yield "checkpoint", Reader(_checkpoints, _checkpoint)
-    yield "PyTorch", Reader(_torch, _pickled, "policy.pt")
-    yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), _tfjs)
-    yield "layers model", Reader(_web_layers, _tfjs)
-    yield "Stable-Baselines3", Reader(_saved_zips, _saved_zip, "policy.zip")
-    yield "bundle", Reader(_bundles, _bundle, takes="bundle")
-    yield "Keras", Reader(_keras, _keras_config, "policy.keras", takes="configuration")
-    yield "recording", Reader(_recordings, _recording, takes="recording")
-
-
-def _single_nn() -> list[Files]:
-    return [{"policy.nn": data} for files in _artefacts("", ".nn") for data in files.values()]
+    yield "frozen graph", Reader(_frozen, changes.one(changes.message(schema.GraphDef.FromString)), "policy.bytes")
+    yield "SavedModel", Reader(_saved_models, changes.saved_model)
+    yield "ONNX", Reader(_onnx, changes.one(changes.message(changes.onnx_message)), "policy.onnx")
+    yield "Barracuda .nn", Reader(lambda: _single_nn(), changes.nn, "policy.nn")
+    yield "checkpoint", Reader(_checkpoints, changes.checkpoint)
+    yield "PyTorch", Reader(_torch, changes.pickled, "policy.pt")
+    yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), changes.tfjs)
+    yield "layers model", Reader(_web_layers, changes.tfjs)
+    yield "Stable-Baselines3", Reader(_saved_zips, changes.saved_zip, "policy.zip")
+    yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
+    yield "Keras", Reader(_keras, changes.keras_config, "policy.keras", takes="configuration")
+    yield "recording", Reader(_recordings, changes.recording, takes="recording")
 
 
 READERS: dict[str, Reader] = dict(_tables())

@@ -19,8 +19,9 @@ from converters.format import WriteOptions
 from converters.formats import WRITTEN
 from converters.frozen_graph.encode import encode
 from converters.graph.nodes import Graph, Node
+from converters.graph.run import run_graph
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import TensorType, static_shape
+from converters.graph.types import BATCH, TensorType, static_shape
 from converters.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import LoadedModel
@@ -154,3 +155,10 @@ class Bindings:
 
     def _length(self, said: int | str, length: int) -> int:
         return self.lengths.setdefault(said, length) if isinstance(said, str) else said
+
+
+def fitting(graph: Graph, name: str, feeds: Mapping[str, Array], batch: int) -> list[str]:
+    """What the type inferred for a tensor says that its value contradicts."""
+    bound = Bindings()
+    bound.lengths[BATCH] = batch
+    return list(bound.problems(name, infer_types(graph)[name], run_graph(graph, feeds, [name])[name]))

@@ -17,7 +17,7 @@ from converters.schema import field
 from converters.tfjs.artifact import vetted
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
-from tests.fuzz.seeds import zipped
+from tests.fuzz.changes import zipped
 from tests.handmade import continuous_policy, graph_bytes
 from tests.hostile.zoo import onnx_policy
 
