@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
+import os
 import re
 import stat
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
-from signatures.digest import sha256_hex, sha256_of_file
+from signatures.digest import sha256_hex, sha256_of_stream
 from signatures.errors import DamagedFileError, SourceError
 
 #: Protobuf's own limit; files of other formats that are one have the same.
 MAX_BYTES = (2 << 30) - 1
 #: Weights that lie beside a model, all together; no policy comes near it.
 MAX_WEIGHTS = 16 << 30
+#: Bytes from which on a file is asked for holes, and how many of them are looked at.
+_LARGE_HOLE, _MOST_HOLES = 1 << 24, 1 << 16
+#: What has become a pipe since it was looked at is not waited for.
+_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 #: As a path keeps an address: with one slash of the two.
 _ADDRESS = re.compile("(https?|ftps?|s3|gs|gcs|hf|memory|ssh|git)://?")
 #: Addresses of these are fetched where fsspec is installed (exporter/remote).
@@ -50,8 +57,17 @@ class Fetched:
         return other
 
     def digest(self, files: Iterable[Path]) -> str:
-        """The sha256 of a single file, or of the hashes of several in the order of their names. Raises OSError."""
-        hashes = [sha256_hex(self._read[f]) if f in self._read else sha256_of_file(f) for f in sorted(set(files))]
+        """The sha256 of a single file, or of the hashes of several in the order of their names. Raises SourceError for
+        what ``opened`` refuses, and where all together are larger than weights may be.
+        """
+        left, hashes = MAX_WEIGHTS, []
+        for each in sorted(set(files)):
+            if each in self._read:
+                hashes.append(sha256_hex(self._read[each]))
+                continue
+            with opened(each, left) as file:
+                left -= os.fstat(file.fileno()).st_size
+                hashes.append(sha256_of_stream(file))
         return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())
 
 
@@ -59,30 +75,79 @@ def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> byt
     """The file's bytes. Raises SourceError where it is missing, a folder or unreadable, DamagedFileError where it is
     empty, unless it may be; ``most`` bytes are read.
     """
+    with opened(path, most) as file:
+        try:
+            data = file.read(os.fstat(file.fileno()).st_size)
+        except OSError as error:
+            raise unreadable(path, error) from error
+    if not data and not empty:
+        raise DamagedFileError("the file is empty", where=str(path), fix="copy or download it again")
+    return data
+
+
+def opened(path: Path, most: int = MAX_BYTES) -> BinaryIO:
+    """A file that was written, open to be read: no pipe, device or folder, no circle of links, and not mostly a hole.
+
+    Raises SourceError, too where it has more than ``most`` bytes.
+    """
     try:
-        status = path.stat()
-        if stat.S_ISDIR(status.st_mode):
-            raise SourceError(
-                "is a folder", where=str(path), why="a single model file is expected", fix="give a file in it"
-            )
-        if not stat.S_ISREG(status.st_mode):
-            raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
-        if status.st_size > most:
-            raise SourceError(
-                f"has {status.st_size} bytes, and no more than {most} are read",
-                where=str(path),
-                fix="give the policy alone; it has some hundred kilobytes, settings a few",
-            )
-        data = path.read_bytes()
+        _check_kind(path, path.stat().st_mode)  # a device may do something when it is opened
+        file = os.fdopen(os.open(path, _FLAGS), "rb")
     except FileNotFoundError as error:
         raise _missing(path) from error
     except OSError as error:
         raise unreadable(path, error) from error
     except ValueError as error:  # a null character in the path
         raise SourceError("is no path", where=repr(str(path)), why=str(error), fix="check the path") from error
-    if not data and not empty:
-        raise DamagedFileError("the file is empty", where=str(path), fix="copy or download it again")
-    return data
+    try:
+        status = os.fstat(file.fileno())
+        _check_kind(path, status.st_mode)  # what is there now
+        if status.st_size > most:
+            raise SourceError(
+                f"has {status.st_size} bytes, and no more than {most} are read",
+                where=str(path),
+                fix="give the policy alone; it has some hundred kilobytes, settings a few",
+            )
+        if is_hole(file.fileno(), status.st_size):
+            raise SourceError(
+                f"is said to have {status.st_size} bytes, most of which were never written",
+                where=str(path),
+                why="it is a hole, as a copy or a download leaves one that was cut off",
+                fix="copy or download it again",
+            )
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def is_hole(descriptor: int, size: int) -> bool:
+    """Whether most of a large file was never written (where the system says so): any size costs nothing then."""
+    if size < _LARGE_HOLE or not hasattr(os, "SEEK_DATA"):
+        return False
+    at = written = 0
+    try:
+        for _ in range(_MOST_HOLES):
+            at = os.lseek(descriptor, at, os.SEEK_DATA)
+            end = os.lseek(descriptor, at, os.SEEK_HOLE)
+            written += end - at
+            at = end
+            if 2 * written >= size:
+                return False
+        return False
+    except OSError as error:  # ENXIO: no data from there on; another: the file system does not say
+        return error.errno == errno.ENXIO
+    finally:
+        os.lseek(descriptor, 0, os.SEEK_SET)
+
+
+def _check_kind(path: Path, mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise SourceError(
+            "is a folder", where=str(path), why="a single model file is expected", fix="give a file in it"
+        )
+    if not stat.S_ISREG(mode):
+        raise SourceError("is a pipe or a device", where=str(path), fix="copy it to a file first, and give that")
 
 
 def unreadable(path: Path, error: OSError) -> SourceError:

@@ -11,7 +11,7 @@ import importlib
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 #: Bytes from which on OpenSSL is loaded.
 _LARGE = 16 << 20
@@ -50,8 +50,15 @@ def sha256_hex(data: bytes) -> str:
 def sha256_of_file(path: Path) -> str:
     """As ``sha256_hex``, of a file, which is not held in memory. Raises OSError."""
     with path.open("rb") as file:
-        whole = hasher(os.fstat(file.fileno()).st_size)
-        while chunk := file.read(_CHUNK):
-            whole.update(chunk)
+        return sha256_of_stream(file)
+
+
+def sha256_of_stream(file: BinaryIO) -> str:
+    """As ``sha256_hex``, of an open file: as many bytes as it has now. Raises OSError."""
+    left = os.fstat(file.fileno()).st_size
+    whole = hasher(left)
+    while left > 0 and (chunk := file.read(min(_CHUNK, left))):
+        whole.update(chunk)
+        left -= len(chunk)
     digest: str = whole.hexdigest()
     return digest

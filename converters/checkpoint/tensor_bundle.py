@@ -12,6 +12,7 @@ Nothing is read before it is asked for, and nothing is allocated before the shar
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 from converters import schema
 from converters.checkpoint.crc32c import crc32c, masked
 from converters.checkpoint.table import read_table
-from converters.fetch import read_bytes
+from converters.fetch import MAX_WEIGHTS, opened, read_bytes
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 
 _MAX_AXES = 32
@@ -169,8 +170,15 @@ class Checkpoint:
         if not 0 <= entry.shard_id < self._header.num_shards:
             raise self._damaged(f"{name!r} lies in shard {entry.shard_id} of {self._header.num_shards}")
         shard = self._shard(entry.shard_id)
-        try:
-            held = shard.stat().st_size
+        if not shard.exists() and not shard.is_symlink():
+            raise SourceError(
+                "is missing",
+                where=shard.name,
+                why="the values of a checkpoint lie in its .data files, the .index only says where",
+                fix="put the .data file beside the .index, or take a checkpoint that has both: --step N",
+            )
+        with opened(shard, MAX_WEIGHTS) as file:
+            held = os.fstat(file.fileno()).st_size
             if entry.offset < 0 or entry.size < 0 or entry.offset + entry.size > held:
                 raise DamagedFileError(
                     f"{name!r} lies beyond the end of the file",
@@ -178,16 +186,8 @@ class Checkpoint:
                     why=f"{entry.size} bytes from {entry.offset} on are not in a file of {held}: it was cut off",
                     fix=_FIX,
                 )
-            with shard.open("rb") as file:
-                file.seek(entry.offset)
-                data = file.read(entry.size)
-        except FileNotFoundError as error:
-            raise SourceError(
-                "is missing",
-                where=shard.name,
-                why="the values of a checkpoint lie in its .data files, the .index only says where",
-                fix="put the .data file beside the .index, or take a checkpoint that has both: --step N",
-            ) from error
+            file.seek(entry.offset)
+            data = file.read(entry.size)
         if len(data) != entry.size:
             raise self._damaged_values(name, entry)
         return data

@@ -185,7 +185,11 @@ def _weights(
 def shard(folder: Path, name: str) -> Path:
     """A shard's path, which must stay inside the model's folder."""
     path = folder / name
-    if not name or "://" in name or not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        inside = bool(name) and "://" not in name and path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a circle of links (RuntimeError before Python 3.13)
+        inside = False
+    if not inside:
         raise SourceError(
             f"names the weights {name[:120]!r}",
             where=MODEL,
