@@ -12,10 +12,9 @@ from functools import cached_property
 from typing import Any
 
 from converters.varints import read_varint
+from signatures.bounded import loads
 
 _HEAD = 4096
-#: Objects and lists in a JSON file: an empty one has two bytes, and takes sixty in memory.
-_MAX_JSON = 1 << 22
 _SURROGATE = re.compile(r"[\ud800-\udfff]|\\u[dD][89a-fA-F]")
 
 
@@ -45,7 +44,7 @@ class Content:
         if self.text is None or not self.text.startswith("{"):
             return None
         try:
-            found: dict[str, Any] = _parsed(self.data.decode("utf-8-sig"))
+            found: dict[str, Any] = loads(self.data.decode("utf-8-sig"))
         except (ValueError, RecursionError):
             return None
         return found
@@ -84,16 +83,10 @@ def json_in(data: bytes | str) -> Any:
     values, and RecursionError.
     """
     text = data if isinstance(data, str) else data.decode("utf-8-sig")
-    found = _parsed(text)
+    found = loads(text)
     if _SURROGATE.search(text):  # halves of a character: nothing can be written under such a name
         json.dumps(found, ensure_ascii=False).encode()
     return found
-
-
-def _parsed(text: str) -> Any:
-    if text.count("[") + text.count("{") > _MAX_JSON:
-        raise ValueError(f"it has more than {_MAX_JSON} objects and lists")
-    return json.loads(text)
 
 
 def _is_op_name(data: bytes) -> bool:

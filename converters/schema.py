@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from converters.counting import check_size
 from converters.detached import LARGE_FILE, Detached, Fields
 from converters.messages import message_classes
 from converters.pieces import Pieces
@@ -96,12 +97,14 @@ _CONTENTS: dict[str, Fields] = {"GraphDef": _GRAPH, "MetaGraphDef": {2: _GRAPH},
 
 
 def parse(message_class: Any, data: bytes, what: str, detached: Detached | None = None) -> Any:
-    """The message in ``data``; raises DamagedFileError that calls it ``what``. Of a large one ``detached`` is given the
-    tensors' contents.
+    """The message in ``data``. Of a large one ``detached`` is given the tensors' contents.
+
+    Raises DamagedFileError that calls it ``what``, NotAPolicyError where it is made of too many parts.
     """
     fields = _CONTENTS.get(message_class.DESCRIPTOR.name)
     if detached is not None and fields is not None and len(data) >= LARGE_FILE:
         data = detached.without(data, fields)
+    check_size(message_class, data)
     message = message_class()
     try:
         message.ParseFromString(data)

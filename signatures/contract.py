@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from signatures.bounded import loads
 from signatures.fields import Field, FieldError, known
 from signatures.labels import parsed
 from signatures.memories import SourcePart
@@ -124,7 +125,7 @@ def safe_name(name: str) -> str:
 def json_of(text: str | bytes) -> Any:
     """What JSON text says. Raises FieldError."""
     try:
-        return json.loads(text, parse_constant=_no_number, parse_float=_finite)
+        return loads(text, parse_constant=_no_number, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise FieldError("the whole", f"is not JSON ({error})"[:200]) from error
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from converters.counting import check_size
 from converters.detached import LARGE, LARGE_FILE, Detached, Fields
 from converters.fetch import MAX_WEIGHTS, read_bytes
 from converters.graph.types import FLOAT32
@@ -52,10 +53,11 @@ _FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "s
 def decoded(data: bytes, detached: Detached | None = None) -> Any:
     """The ModelProto in ``data``, all of whose names are text. Of a large one ``detached`` is given the weights' bytes.
 
-    Raises DamagedFileError.
+    Raises DamagedFileError, NotAPolicyError where it has too many parts.
     """
     if detached is not None and len(data) >= LARGE_FILE:
         data = detached.without(data, _CONTENTS)
+    check_size(ModelProto, data)
     try:
         model = ModelProto.FromString(data)
         model.DiscardUnknownFields()  # what no reader knows is handed to no runtime

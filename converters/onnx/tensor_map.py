@@ -14,6 +14,7 @@ from dataclasses import field
 from typing import Any
 
 from converters.inner import View
+from signatures import bounded
 from signatures.records import dataclass
 
 TENSORS_KEY = "export_model_tensors"
@@ -40,7 +41,7 @@ class TensorMap:
 def loads(text: str) -> TensorMap:
     """The inverse. What is not understood is left out: a map is a help for reports, nothing depends on it."""
     try:
-        content = json.loads(text)
+        content = bounded.loads(text)
     except (ValueError, RecursionError):
         return TensorMap()
     values, sources = (content.get(k) if isinstance(content, dict) else None for k in ("values", "sources"))
