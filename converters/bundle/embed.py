@@ -46,8 +46,15 @@ def embedded(graph: Graph) -> str | None:
 
 
 def runnable(graph: Graph) -> Graph:
-    """The graph as the numpy kernels run it: without the contract or any other text, in one spelling."""
-    return normalise(Graph(tuple(n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S")))
+    """The graph as the numpy kernels run it: without the contract or any other text, in one spelling.
+
+    Made once for a graph: to reckon what it costs, to look inside, and to run it.
+    """
+    if runnable not in graph.made:
+        told = [n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S"]
+        graph.made[runnable] = normalise(graph if len(told) == len(graph.nodes) else Graph(tuple(told)))
+    made: Graph = graph.made[runnable]
+    return made
 
 
 def read_runnable(data: bytes) -> Graph:

@@ -91,15 +91,13 @@ def add_companions(
     added, name = dict(fetches), head.deterministic
     if meaning.role is Role.CONTINUOUS:
         if name not in fetches:
-            graph, added[name] = without_noise(graph, fetches[head.name], noise, name)
+            graph, (added[name],) = without_noise(graph, [fetches[head.name]], noise, name)
         return graph, added
     scores = list(meaning.branches)
     action = fetches[head.name]
     if name not in fetches:
-        for i, branch in enumerate(scores):
-            graph, scores[i] = without_noise(graph, branch, noise, name)
-        if not scores:
-            graph, action = without_noise(graph, action, noise, name)
+        graph, quiet = without_noise(graph, scores or [action], noise, name)
+        scores, action = (quiet, action) if scores else (scores, quiet[0])
     editor = Editor(graph)
     for node in graph.nodes:
         editor.keep(node)

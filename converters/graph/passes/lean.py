@@ -19,8 +19,13 @@ _OF_BRANCHES = (Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS, Role.PROBS)
 
 
 def lean(graph: Graph, signature: PolicySignature, fetches: Mapping[str, str]) -> Graph:
-    """The same outputs, within the rounding of a constant or two, in fewer ops."""
-    roots = fetches.values()
-    for shorter in (parts_for_slices, share, merge_constants, square_differences):
-        graph = shorter(graph, roots)
-    return join_branches(graph, roots, {fetches[s.name] for s in signature.outputs if s.role in _OF_BRANCHES})
+    """The same outputs, within the rounding of a constant or two, in fewer ops; made once for a graph."""
+    of_branches = {fetches[s.name] for s in signature.outputs if s.role in _OF_BRANCHES}
+    key = lean, tuple(fetches.values()), frozenset(of_branches)
+    if key not in graph.made:
+        made, roots = graph, fetches.values()
+        for shorter in (parts_for_slices, share, merge_constants, square_differences):
+            made = shorter(made, roots)
+        graph.made[key] = join_branches(made, roots, of_branches)
+    found: Graph = graph.made[key]
+    return found

@@ -157,17 +157,17 @@ def _turned(editor: Editor, node: Node, dims: Sequence[int | None]) -> None:
 
 
 def without_noise(
-    graph: Graph, reference: str, noise: Mapping[str, tuple[int | None, ...]], prefix: str
-) -> tuple[Graph, str]:
-    """``reference`` computed at zero noise beside the graph it stands in.
+    graph: Graph, references: Sequence[str], noise: Mapping[str, tuple[int | None, ...]], prefix: str
+) -> tuple[Graph, list[str]]:
+    """``references`` computed at zero noise beside the graph they stand in, which is walked once for all of them.
 
-    ``noise`` maps the names of noise nodes (inputs or samplers) to their shapes. Nodes between them and ``reference``
+    ``noise`` maps the names of noise nodes (inputs or samplers) to their shapes. Nodes between them and ``references``
     are copied under ``prefix``. A product with zeros is taken to be zero: true for every finite factor,
     and where a standard deviation overflows, the mean is what a policy without chance should give.
     """
-    wanted = graph.ancestors([reference]) & graph.descendants(noise)
+    wanted = graph.ancestors(references) & graph.descendants(noise)
     if not wanted:
-        return graph, reference
+        return graph, [*references]
     types = infer_types(graph)
     editor = Editor(graph)
     copies: dict[str, str] = {}
@@ -198,7 +198,7 @@ def without_noise(
         made_of = inputs if node.op == "Add" else op_of(node).moved(inputs) if traits(node).moves else ()
         if made_of and all(i in zeros or _is_zero(graph, i) for i in made_of):
             zeros.add(name)
-    return editor.graph(), _moved(reference, copies)
+    return editor.graph(), [_moved(r, copies) for r in references]
 
 
 def _is_zero(graph: Graph, reference: str) -> bool:
