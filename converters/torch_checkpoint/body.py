@@ -15,9 +15,7 @@ from converters.graph.nn.normalisation import standardised
 from converters.graph.nn.reduction import over_last_axis
 from converters.graph.types import FLOAT32
 from converters.torch_checkpoint.network import TINY, Network
-from converters.torch_checkpoint.state import LET_IT_EXPORT
 from converters.torch_checkpoint.weights import Weights
-from signatures.errors import DamagedFileError
 
 #: Of ``ResidualSelfAttention``: heads, what a forbidden score becomes, which sum of squares is no entity yet.
 HEADS, FORBIDDEN, NOTHING = 4, -1e6, 0.01
@@ -54,9 +52,7 @@ def _self_attention(net: Network, x: str, mask: str, module: str) -> str:
     x, _, _ = standardised(net, x, [2], _LAYER_NORM)
     count, size = net.length(x, 1), net.width(x)
     if size % HEADS:
-        raise DamagedFileError(
-            f"its attention has {size} numbers for {HEADS} heads", why="ML-Agents cannot run it", fix=LET_IT_EXPORT
-        )
+        raise net.state.damaged(f"its attention has {size} numbers for {HEADS} heads", "ML-Agents cannot run it")
     batch = net.shape(x)[0]
 
     def heads(name: str, order: Sequence[int]) -> str:
@@ -90,9 +86,7 @@ def body_width(state: Weights, body: str) -> int:
         if f"{first}.hypernet.0.weight" in state:
             made = state.length(f"{first}.hypernet.{_layers_of(state, first)[-1]}.weight", 0)
             return made // max(1, state.length(f"{first}.bias", 0))
-    raise DamagedFileError(
-        "its Policy has no hidden layer", why=f"{body}.seq_layers.0.weight is not in it", fix=LET_IT_EXPORT
-    )
+    raise state.damaged("its Policy has no hidden layer", f"{body}.seq_layers.0.weight is not in it")
 
 
 def goal_width(state: Weights, body: str) -> int:

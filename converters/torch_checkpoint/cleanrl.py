@@ -20,7 +20,7 @@ from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.rsl_rl import per_action
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
-from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
 from signatures.roles import Role
 
@@ -248,10 +248,8 @@ def _values(making: _Making) -> str:
         atoms = net.state.array("atoms", None)
         actions, rest = divmod(net.width(x), max(len(atoms), 1))
         if rest or not actions:
-            raise DamagedFileError(
-                f"its network has {net.width(x)} outputs for {len(atoms)} values",
-                why="each action has all",
-                fix=EXPORT_ONNX,
+            raise net.state.damaged(
+                f"its network has {net.width(x)} outputs for {len(atoms)} values", "each action has all"
             )
         net.at("q_values")
         rows = net.reshape(net.add("Softmax", [net.reshape(x, (-1, len(atoms)))]), (-1, actions, len(atoms)))

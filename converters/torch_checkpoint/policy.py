@@ -34,7 +34,7 @@ from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, 
 from converters.torch_checkpoint.state import LET_IT_EXPORT, State
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import TORCH_VERSION_3
-from signatures.errors import DamagedFileError, SourceError
+from signatures.errors import SourceError
 from signatures.records import dataclass
 
 _BODY = "network_body"
@@ -283,9 +283,7 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
             net.fact("discrete_action_output_shape", shape)
             names += ["discrete_actions", "discrete_action_output_shape"]
     if not made:
-        raise DamagedFileError(
-            "its Policy has no action", why="neither a mean nor a branch is in it", fix=LET_IT_EXPORT
-        )
+        raise net.state.damaged("its Policy has no action", "neither a mean nor a branch is in it")
     if not generation.by_sensor and len(made) == 1:  # 0.22 to 0.25 called the one action by its old name, too
         kind, value = next(iter(made.items()))
         net.output("action", value)

@@ -19,7 +19,6 @@ from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.weights import Weights
 from converters.understand.facts import SourceFacts
-from signatures.errors import DamagedFileError
 from signatures.records import dataclass
 from signatures.roles import Role
 
@@ -121,10 +120,9 @@ def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
         if module in net.state:
             per_action(net, mean, net.state.array(module, net.width(mean)), name)
             return {name: role}
-    raise DamagedFileError(
+    raise net.state.damaged(
         "its policy has no deviation of its own",
-        why="it has none, or one that depends on the observation, or is no Gaussian: which, the weights do not tell",
-        fix=EXPORT_ONNX,
+        "it has none, or one that depends on the observation, or is no Gaussian: which, the weights do not tell",
     )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 from converters.torch_checkpoint.state import LET_IT_EXPORT
 from converters.torch_checkpoint.weights import Weights
-from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
 
 #: Larger sides are not looked for.
@@ -121,10 +121,9 @@ def find_sensors(
     known = [(m, _known_width(state, m)) for m in modules if m is not None]
     rest = width - sum(n for _, n in known)
     if rest < 0:
-        raise DamagedFileError(
+        raise state.damaged(
             f"its sensors have {width - rest} columns, and its first layer takes {width}",
-            why="the checkpoint is of a network that ML-Agents did not build, or damaged",
-            fix=LET_IT_EXPORT,
+            "the checkpoint is of a network that ML-Agents did not build, or damaged",
         )
     images = [m for m, _ in known if encoder_of(state, m) is not None]
     two_lists = len(lists) > 1

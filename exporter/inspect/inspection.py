@@ -47,8 +47,6 @@ _MEANING = {
     Role.MEMORY_OUT: "memory for the next step",
     Role.OTHER: "another output",
 }
-
-
 #: More nodes than this are no chain of layers that anybody would read.
 _MOST_NODES = 600
 #: Numbers of an observation whose statistics are shown.

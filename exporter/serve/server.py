@@ -36,12 +36,8 @@ TYPES: Mapping[str, str] = {
     ".bin": "application/octet-stream",
     ".svg": "image/svg+xml",
 }
-
-
 #: Of these, what is data and nothing else: a bundle's files are served under no other name.
 DATA = (".json", ".bin")
-
-
 #: What every answer says. The page itself says the first as well (index.html), for static hosting; of a frame around
 #: it only a header can speak.
 CONTENT_POLICY = (

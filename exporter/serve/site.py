@@ -37,8 +37,6 @@ MARK = f'<meta name="generator" content="{MADE_BY}">'.encode()
 _HEAD = 2000
 
 _TFJS = "@tensorflow/tfjs"
-
-
 _ORT = "onnxruntime-web"
 
 
