@@ -14,29 +14,27 @@ from signatures.spec import TensorSpec
 
 #: The order in which a policy's observations are sensors where their names do not say it.
 _ORDER = (Role.ENTITIES, Role.VISUAL, Role.VECTOR)
-_MASKS = (
-    "public override void WriteDiscreteActionMask(IDiscreteActionMask actionMask)",
-    "{",
-    "    // forbid what cannot be done now: actionMask.SetActionEnabled(branch, action, false);",
-    "}",
-    "",
-)
 
 
 def agent(bundle: Bundle) -> str:
     """The class, and the settings as a comment above it."""
     sensors = _sensors(bundle)
     vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR), None)
-    methods = [] if vector is None else _observations(bundle, vector)
-    if bundle.signature.branches:
-        methods += _MASKS
-    methods += _actions(bundle, bundle.signature.labels.get("actions", []))
+    received, own = _actions(bundle)
     return filled(
         "agent.cs",
         type=_class(bundle.name),
         head="\n".join(_head(bundle, sensors, vector)),
-        methods="".join(f"\n    {line}".rstrip(" ") if line else "\n" for line in methods) + "\n",
+        observations="" if vector is None else _observations(bundle, vector),
+        masks=filled("agent_masks.cs") if bundle.signature.branches else "",
+        received=_inside(received),
+        own=_inside(own),
     )
+
+
+def _inside(lines: list[str]) -> str:
+    """The lines of a method."""
+    return "".join(f"        {line}\n" for line in lines)
 
 
 def _class(name: str) -> str:
@@ -99,29 +97,23 @@ def _component(bundle: Bundle, spec: TensorSpec) -> str:
     return f"{spec.name}: a sensor of {'x'.join(map(str, lengths))} numbers (rays, a grid, as it was trained)"
 
 
-def _observations(bundle: Bundle, spec: TensorSpec) -> list[str]:
+def _observations(bundle: Bundle, spec: TensorSpec) -> str:
     names = bundle.signature.labels.get("observations", {}).get(spec.name, [])
     size = spec.shape[-1] or 0
     lines = folded(f"{size} numbers, in the order of training", numbered(names))
-    return [
-        "public override void CollectObservations(VectorSensor sensor)",
-        "{",
-        *(f"    // {line}" for line in lines),
-        f"    var observations = new float[{size}];",
-        "    sensor.AddObservation(observations);",
-        "}",
-        "",
-    ]
+    return filled("agent_observations.cs", comments=_inside([f"// {line}" for line in lines]), size=str(size))
 
 
 def _continuous(bundle: Bundle) -> int:
     return next((head.shape[-1] or 0 for head in bundle.heads if head.role is Role.CONTINUOUS), 0)
 
 
-def _actions(bundle: Bundle, labels: list[str]) -> list[str]:
+def _actions(bundle: Bundle) -> tuple[list[str], list[str]]:
+    """What is done with received actions, and how a player's own are given."""
     count = _continuous(bundle)
     received, own = [], []
     if count:
+        labels = bundle.signature.labels.get("actions", [])
         received += [f"// {line}" for line in folded(f"{count} continuous actions", numbered(labels))]
         received.append("var continuous = actions.ContinuousActions;")
         own.append("var continuous = actionsOut.ContinuousActions;")
@@ -131,16 +123,4 @@ def _actions(bundle: Bundle, labels: list[str]) -> list[str]:
         received.append("var discrete = actions.DiscreteActions;")
         own.append("var discrete = actionsOut.DiscreteActions;")
         own += [f"discrete[{i}] = 0;" for i in range(len(bundle.signature.branches))]
-    return [
-        "public override void OnActionReceived(ActionBuffers actions)",
-        "{",
-        *(f"    {line}" for line in received),
-        "    // move the agent by them, as in training",
-        "}",
-        "",
-        "public override void Heuristic(in ActionBuffers actionsOut)",
-        "{",
-        "    // what a player would do, for Behavior Type: Heuristic Only",
-        *(f"    {line}" for line in own),
-        "}",
-    ]
+    return received, own
