@@ -173,12 +173,7 @@ def _check_asked(
 ) -> None:
     """Raise where a bundle in a consumer's names lacks the file, or is to be compared without its source."""
     if "onnx" not in artefacts:
-        raise BundleError(
-            "has no file that its consumer loads",
-            where=str(folder),
-            why=f"it was made for {made_for}",
-            fix="export the policy again",
-        )
+        raise _incomplete(folder, "has no file that its consumer loads", f"it was made for {made_for}")
     if runtimes != "auto" or (options is not None and (options.golden or options.rules)):
         raise UsageError(
             f"without its source, a bundle that was made for {made_for} is asked of its consumer's checkers alone",
@@ -199,13 +194,12 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
             graph = saved_graph(artefacts["saved_model"])
         missing = [name for name in names if name not in graph]
     if missing:
-        raise BundleError(
-            f"has no tensor {missing[0]!r}",
-            where=str(artefacts["bytes"]),
-            why=f"{POLICY} names it",
-            fix="export the policy again",
-        )
+        raise _incomplete(artefacts["bytes"], f"has no tensor {missing[0]!r}", f"{POLICY} names it")
     return graph
+
+
+def _incomplete(where: Path, what: str, why: str) -> BundleError:
+    return BundleError(what, where=str(where), why=why, fix="export the policy again")
 
 
 def _outline(signature: PolicySignature, *, noise_kept: bool) -> Graph:
@@ -260,12 +254,8 @@ def _check_meaning(found: Source, contract: Contract, folder: Path) -> None:
     alike = [s for s in signatures if _tensors(s) == _tensors(contract.signature)]
     wrong = [[what for what, ours, its in _meanings(contract.signature, s) if ours != its] for s in alike]
     if wrong and all(wrong):
-        raise BundleError(
-            f"says otherwise of {', '.join(wrong[0])} than its source",
-            where=str(folder / POLICY),
-            why=f"{found.path.name} was read again, and means something else",
-            fix="export the policy again",
-        )
+        what = f"says otherwise of {', '.join(wrong[0])} than its source"
+        raise _incomplete(folder / POLICY, what, f"{found.path.name} was read again, and means something else")
 
 
 def _meanings(ours: PolicySignature, its: PolicySignature) -> list[tuple[str, object, object]]:

@@ -30,6 +30,7 @@ from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_gra
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError
+from signatures.records import dataclass
 
 #: Bytes of expected values that one fetch may ask for: what a runtime holds and sends at a time.
 FETCH_BYTES = 64 << 20
@@ -159,18 +160,14 @@ class Bisector:
         return node.origin
 
 
+@dataclass(frozen=True, eq=False)
 class _Search:
-    def __init__(
-        self,
-        graph: Graph,
-        candidate: InnerTensors,
-        feeds: Feeds,
-        tolerance: Tolerance,
-        rounding: Rounding,
-        source: Callable[[Node], str | tuple[str, ...] | None],
-    ) -> None:
-        self.graph, self.candidate, self.feeds = graph, candidate, feeds
-        self.tolerance, self.rounding, self.source = tolerance, rounding, source
+    graph: Graph
+    candidate: InnerTensors
+    feeds: Feeds
+    tolerance: Tolerance
+    rounding: Rounding
+    source: Callable[[Node], str | tuple[str, ...] | None]
 
     def first(self, output: str, branch: int) -> Bisection:
         upstream = self.graph.ancestors([output])

@@ -47,22 +47,16 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
     for name, array in arrays.items():
         spec = specs.get(name) or specs.get(name.removesuffix(":0"))
         if spec is None:
-            raise UsageError(
-                f"--golden: {name!r} is no input or output of the policy",
-                where=str(path),
-                fix=f"there are {', '.join(s.name for s in (*signature.inputs, *signature.outputs))}",
-            )
+            known = ", ".join(s.name for s in (*signature.inputs, *signature.outputs))
+            raise _refused(path, f"{name!r} is no input or output of the policy", f"there are {known}")
         given[spec.name] = _fitting(path, spec, array)
     rows = _rows(path, signature, given)
     for spec in signature.inputs:
         if spec.name in given:
             continue
         if spec.role not in _DEFAULTS:
-            raise UsageError(
-                f"--golden: the input {spec.name!r} was not recorded",
-                where=str(path),
-                fix="record every observation; memory, noise and masks may be left out",
-            )
+            fix = "record every observation; memory, noise and masks may be left out"
+            raise _refused(path, f"the input {spec.name!r} was not recorded", fix)
         if spec.role is Role.NOISE:
             noiseless.add(spec.name)
         shape = tuple(rows if i == 0 else n or 1 for i, n in enumerate(spec.shape))
@@ -82,7 +76,7 @@ def recorded(path: Path) -> bytes:
     try:
         return read_bytes(path)
     except SourceError as error:
-        raise UsageError(f"--golden: {error.what}", where=str(path), why=error.why, fix=error.fix) from error
+        raise _refused(path, error.what, error.fix, error.why) from error
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
@@ -98,9 +92,11 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"its {len(data)} bytes unpack to {whole}")
             return {name.removesuffix(".npy"): read_array(entry_of(archive, name, whole)) for name in names}
     except (*ZIP_ERRORS, TypeError, RecursionError) as error:
-        raise UsageError(
-            "--golden: cannot be read as an .npz archive", where=str(path), why=str(error), fix="numpy.savez(FILE, …)"
-        ) from error
+        raise _refused(path, "cannot be read as an .npz archive", "numpy.savez(FILE, …)", str(error)) from error
+
+
+def _refused(path: Path, what: str, fix: str | None, why: str | None = None) -> UsageError:
+    return UsageError(f"--golden: {what}", where=str(path), why=why, fix=fix)
 
 
 def _by_name(specs: tuple[TensorSpec, ...]) -> dict[str, TensorSpec]:
@@ -112,11 +108,8 @@ def _by_name(specs: tuple[TensorSpec, ...]) -> dict[str, TensorSpec]:
 def _fitting(path: Path, spec: TensorSpec, array: np.ndarray) -> np.ndarray:
     if not spec.fits(array) or array.dtype.kind not in "fiub":
         wanted = "[" + ", ".join("rows" if n is None else str(n) for n in spec.shape) + "]"
-        raise UsageError(
-            f"--golden: {spec.name!r} is {array.dtype} {list(array.shape)}, and {spec.dtype} {wanted} is wanted",
-            where=str(path),
-            fix="record it as the policy takes and gives it, a row for each step",
-        )
+        what = f"{spec.name!r} is {array.dtype} {list(array.shape)}, and {spec.dtype} {wanted} is wanted"
+        raise _refused(path, what, "record it as the policy takes and gives it, a row for each step")
     return np.ascontiguousarray(array.astype(spec.dtype))
 
 
@@ -125,10 +118,6 @@ def _rows(path: Path, signature: PolicySignature, given: Mapping[str, np.ndarray
     counts = {name: len(array) for name, array in given.items() if name in free}
     if not counts or min(counts.values()) != max(counts.values()) or not min(counts.values()):
         said = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
-        raise UsageError(
-            "--golden: the arrays have not the same number of rows",
-            where=str(path),
-            why=f"rows: {said}",
-            fix="give every array a row for each recorded step",
-        )
+        fix = "give every array a row for each recorded step"
+        raise _refused(path, "the arrays have not the same number of rows", fix, f"rows: {said}")
     return min(counts.values())
