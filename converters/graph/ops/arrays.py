@@ -1,11 +1,10 @@
-"""Constants, placeholders and pass-throughs; shapes of things; joining and cutting.
+"""Constants, placeholders and pass-throughs; shapes of things, and things under other shapes.
 
 Most kernels are structural: they also work on symbolic shape vectors.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,9 +15,9 @@ from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
-    as_int64,
     by_shape,
     constant_input,
+    direct,
     inserted,
     not_constant,
     require_constant,
@@ -31,8 +30,6 @@ from converters.graph.ops.base import (
 from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
 
 T = type_attr()
-#: Outputs that a Split or Unpack may have.
-_MAX_PIECES = 1 << 16
 
 
 # ------------------------------------------------------------------ sources and pass-throughs
@@ -58,14 +55,6 @@ def _infer_placeholder(node: Node, args: Sequence[TensorType], symbols: Symbols)
     return [placeholder_type(node, symbols)]
 
 
-def _identity(node: Node, x: np.ndarray) -> np.ndarray:
-    return x
-
-
-def _lower_identity(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.value(node.inputs[0])
-
-
 # ------------------------------------------------------------------ shape of things
 
 
@@ -84,8 +73,9 @@ def _infer_shape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
     return [TensorType(node.attrs["out_type"], (len(shape),), value)]
 
 
-def _lower_shape(node: Node, builder: OnnxBuilder) -> Any:
-    value = builder.emit("Shape", [builder.value(node.inputs[0])])
+def _lower_measure(node: Node, builder: OnnxBuilder) -> Any:
+    """Shape and Size, which ONNX gives as int64."""
+    value = builder.emit(node.op, [builder.value(node.inputs[0])])
     return value if node.attrs["out_type"] != INT32 else builder.emit("Cast", [value], to=INT32)
 
 
@@ -98,27 +88,22 @@ def _infer_size(node: Node, args: Sequence[TensorType], symbols: Symbols) -> lis
     return [TensorType(dtype, (), value)]
 
 
-def _lower_size(node: Node, builder: OnnxBuilder) -> Any:
-    value = builder.emit("Size", [builder.value(node.inputs[0])])
-    return value if node.attrs["out_type"] != INT32 else builder.emit("Cast", [value], to=INT32)
-
-
 def _infer_rank(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     rank = args[0].rank
     return [TensorType(INT32, (), None if rank is None else np.array(rank, np.int32))]
 
 
-def target_dims(value: np.ndarray | None, kind: TensorType, symbols: Symbols) -> list[Dim] | None:
+def target_dims(kind: TensorType, symbols: Symbols) -> list[Dim] | None:
     """The dims that a shape operand stands for; fresh symbols where it is not known."""
-    if value is not None:
-        return [d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist()]
+    if kind.value is not None:
+        return [d if isinstance(d, str) else int(d) for d in kind.value.reshape(-1).tolist()]
     if kind.shape is not None and len(kind.shape) == 1 and isinstance(kind.shape[0], int):
         return [symbols.fresh() for _ in range(kind.shape[0])]
     return None
 
 
 def _infer_reshape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    target = target_dims(args[1].value, args[1], symbols)
+    target = target_dims(args[1], symbols)
     if target is None:
         return [TensorType(args[0].dtype, None)]
     if target.count(-1) > 1:
@@ -165,10 +150,6 @@ def _open_length(
     if not names:
         return number
     return names[0] if len(names) == 1 and number == 1 else symbols.fresh()
-
-
-def _lower_reshape(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Reshape", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
 
 
 def _squeeze_axes(node: Node, shape: Sequence[Dim]) -> tuple[int, ...]:
@@ -234,154 +215,6 @@ def _lower_transpose(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Transpose", [builder.value(node.inputs[0])], perm=permutation)
 
 
-# ------------------------------------------------------------------ joining and cutting
-
-
-def _concat(node: Node, *arrays: np.ndarray) -> np.ndarray:
-    return np.concatenate(arrays[:-1], axis=int(arrays[-1]))
-
-
-def _infer_concat(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    parts = args[:-1]
-    axis = int(require_constant(node, args, len(args) - 1, "an axis"))
-    known = [p.shape for p in parts if p.shape is not None]
-    if len(known) < len(parts):
-        if not known:
-            return [TensorType(parts[0].dtype, None)]
-        # A part of unknown rank: the others tell all but the joined axis.
-        axis %= len(known[0])
-        return [TensorType(parts[0].dtype, (*known[0][:axis], symbols.fresh(), *known[0][axis + 1 :]))]
-    rank = len(known[0])
-    if not -rank <= axis < rank or any(len(s) != rank for s in known):
-        raise shape_error(node, args, f"parts of different rank, or axis {axis} out of range")
-    axis %= rank
-    dims = list(known[0])
-    for shape in known[1:]:
-        for i, (a, b) in enumerate(zip(dims, shape, strict=True)):
-            if i != axis and a != b:
-                if isinstance(a, int) and isinstance(b, int):
-                    raise shape_error(node, args, f"axis {i} has lengths {a} and {b}")
-                dims[i] = a if isinstance(a, int) or a == BATCH else b
-    total: list[Dim] = [s[axis] for s in known]
-    dims[axis] = (
-        sum(d for d in total if isinstance(d, int)) if all(isinstance(d, int) for d in total) else symbols.fresh()
-    )
-    return [TensorType(parts[0].dtype, tuple(dims))]
-
-
-def _lower_concat(node: Node, builder: OnnxBuilder) -> Any:
-    axis = int(constant_input(node, builder, len(node.inputs) - 1, "an axis"))
-    return builder.emit("Concat", [builder.value(r) for r in node.inputs[:-1]], axis=axis)
-
-
-def _pack(node: Node, *arrays: np.ndarray) -> np.ndarray:
-    return np.stack(arrays, axis=node.attrs["axis"])
-
-
-def _infer_pack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape = next((a.shape for a in args if a.shape is not None), None)
-    if shape is None:
-        # Scalars of unknown rank (an old sequence_length) packed with known scalars never get here.
-        return [TensorType(args[0].dtype, None)]
-    dims = list(shape)
-    axis = node.attrs["axis"]
-    dims.insert(axis + len(dims) + 1 if axis < 0 else axis, len(args))
-    return [TensorType(args[0].dtype, tuple(dims))]
-
-
-def _lower_pack(node: Node, builder: OnnxBuilder) -> Any:
-    axis = node.attrs["axis"]
-    parts = [
-        unsqueezed(builder, builder.value(r), [axis], inserted(builder.type_of(r).shape, axis)) for r in node.inputs
-    ]
-    return builder.emit("Concat", parts, axis=axis)
-
-
-def _unpack(node: Node, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    axis = node.attrs["axis"]
-    return tuple(np.take(x, i, axis=axis) for i in range(x.shape[axis]))
-
-
-def _pieces(node: Node, args: Sequence[TensorType], attribute: str) -> int:
-    """How many outputs a node says it has; GraphError where no policy's node has as many."""
-    count = int(node.attrs[attribute])
-    if not 0 < count <= _MAX_PIECES:
-        raise shape_error(node, args, f"it says that it makes {count} pieces; 1 to {_MAX_PIECES} are read")
-    return count
-
-
-def _infer_unpack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    shape, axis, count = args[0].shape, node.attrs["axis"], _pieces(node, args, "num")
-    if shape is None:
-        return [TensorType(args[0].dtype, None)] * count
-    axis %= len(shape)
-    return [TensorType(args[0].dtype, shape[:axis] + shape[axis + 1 :])] * count
-
-
-def _lower_unpack(node: Node, builder: OnnxBuilder) -> Any:
-    axis, value = node.attrs["axis"], builder.value(node.inputs[0])
-    return tuple(
-        builder.emit("Gather", [value, builder.const(np.array(i, np.int64), "index")], axis=axis)
-        for i in range(node.attrs["num"])
-    )
-
-
-def _split_sizes(node: Node, length: Dim, args: Sequence[TensorType]) -> list[Dim]:
-    if node.op == "SplitV":
-        sizes: list[Dim] = [int(s) for s in require_constant(node, args, 1, "sizes").tolist()]
-        if -1 in sizes:
-            others = sum(int(s) for s in sizes if s != -1)
-            sizes[sizes.index(-1)] = length - others if isinstance(length, int) else f"{length}-{others}"
-        return sizes
-    count = _pieces(node, args, "num_split")
-    if isinstance(length, int) and length % count:
-        raise shape_error(node, args, f"a length of {length} does not split into {count}")
-    return [length // count if isinstance(length, int) else f"{length}/{count}"] * count
-
-
-def _split(node: Node, axis: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    return tuple(np.split(x, node.attrs["num_split"], axis=int(axis)))
-
-
-def _split_v(node: Node, x: np.ndarray, sizes: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, ...]:
-    lengths = sizes.tolist()
-    if -1 in lengths:
-        lengths[lengths.index(-1)] = x.shape[int(axis)] - sum(s for s in lengths if s != -1)
-    return tuple(np.split(x, np.cumsum(lengths[:-1]), axis=int(axis)))
-
-
-def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    data, axis_at = (args[1], 0) if node.op == "Split" else (args[0], 2)
-    if data.shape is None:
-        return [TensorType(data.dtype, None)] * _pieces(node, args, "num_split")
-    axis = int(require_constant(node, args, axis_at, "an axis")) % len(data.shape)
-    sizes = _split_sizes(node, data.shape[axis], args)
-    return [TensorType(data.dtype, (*data.shape[:axis], size, *data.shape[axis + 1 :])) for size in sizes]
-
-
-def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
-    """For an importer of Unity's a Slice for each piece: Barracuda reads the sizes of a Split from its attribute alone,
-    which opset 13 has not.
-    """
-    data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
-    kind = builder.type_of(node.inputs[data_at])
-    assert kind.shape is not None
-    axis = int(constant_input(node, builder, axis_at, "an axis")) % len(kind.shape)
-    sizes = _split_sizes(node, kind.shape[axis], [builder.type_of(r) for r in node.inputs])
-    if any(not isinstance(s, int) for s in sizes):
-        raise not_constant(node, "a length to split")
-    value = builder.value(node.inputs[data_at])
-    if len(sizes) == 1:
-        return (value,)
-    if builder.splits:
-        lengths = builder.const(np.array(sizes, np.int64), "sizes")
-        return builder.emit_several("Split", [value, lengths], len(sizes), axis=axis)
-    bounds = [0, *itertools.accumulate(int(s) for s in sizes)]
-    starts = [builder.const(np.array([b], np.int64), "bound") for b in bounds]
-    on = builder.const(np.array([axis], np.int64), "axis")
-    return tuple(builder.emit("Slice", [value, begin, end, on]) for begin, end in itertools.pairwise(starts))
-
-
 _SHAPE_OF = (T, Attr("out_type", "type", INT32))
 
 OPS = (
@@ -405,19 +238,19 @@ OPS = (
         OpDef(
             name,
             same_as(0),
-            _identity,
-            _lower_identity,
+            lambda node, x: x,
+            lambda node, builder: builder.value(node.inputs[0]),
             (T, Attr("message", "str", "")) if name in ("PreventGradient", "CheckNumerics") else (T,),
             moves="same",
         )
         for name in ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
     ),
-    OpDef("Shape", _infer_shape, _shape, _lower_shape, _SHAPE_OF, precision="exact", of_shape=True),
+    OpDef("Shape", _infer_shape, _shape, _lower_measure, _SHAPE_OF, precision="exact", of_shape=True),
     OpDef(
         "Size",
         _infer_size,
         lambda node, x: np.array(x.size, node.attrs["out_type"]),
-        _lower_size,
+        _lower_measure,
         _SHAPE_OF,
         precision="exact",
         of_shape=True,
@@ -429,7 +262,7 @@ OPS = (
         "Reshape",
         _infer_reshape,
         lambda node, x, shape: x.reshape([int(d) for d in shape.reshape(-1)]),
-        _lower_reshape,
+        direct("Reshape", shape_at=1),
         (T, type_attr("Tshape", "in:1")),
         moves="view",
     ),
@@ -443,51 +276,4 @@ OPS = (
         moves="view",
     ),
     OpDef("Transpose", _infer_transpose, _transpose, _lower_transpose, (T, type_attr("Tperm", "in:1")), moves="turn"),
-    OpDef(
-        "ConcatV2",
-        _infer_concat,
-        _concat,
-        _lower_concat,
-        (Attr("N", "int", derive="count:1"), T, type_attr("Tidx", "in:-1")),
-        moves="join",
-        data=(0, -1),
-    ),
-    OpDef(
-        "Pack",
-        _infer_pack,
-        _pack,
-        _lower_pack,
-        (Attr("N", "int", derive="count"), T, Attr("axis", "int", 0)),
-        moves="join",
-        data=(0, None),
-    ),
-    OpDef(
-        "Unpack",
-        _infer_unpack,
-        _unpack,
-        _lower_unpack,
-        (Attr("num", "int"), T, Attr("axis", "int", 0)),
-        outputs=-1,
-        spellings=("Unstack",),
-        moves="pick",
-    ),
-    OpDef(
-        "Split",
-        _infer_split,
-        _split,
-        _lower_split,
-        (Attr("num_split", "int"), type_attr("T", "in:1")),
-        outputs=-1,
-        moves="pick",
-        data=(1, 2),
-    ),
-    OpDef(
-        "SplitV",
-        _infer_split,
-        _split_v,
-        _lower_split,
-        (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
-        outputs=-1,
-        moves="pick",
-    ),
 )

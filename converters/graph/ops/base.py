@@ -288,7 +288,17 @@ def not_constant(node: Node, meaning: str) -> UnsupportedOpError:
     )
 
 
-# ------------------------------------------------------------------ helpers for lowerings
+# ------------------------------------------------------------------ helpers for kernels and lowerings
+
+
+def plain(function: Callable[..., np.ndarray]) -> Kernel:
+    """A kernel whose result IEEE rounds once anyway (add, multiply, divide, compare) or is an integer's."""
+
+    def kernel(node: Node, *arrays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return np.asarray(function(*arrays))
+
+    return kernel
 
 
 def as_int64(node: Node, builder: OnnxBuilder, position: int) -> str:
@@ -314,11 +324,15 @@ def constant_input(node: Node, builder: OnnxBuilder, position: int, meaning: str
     return value
 
 
-def direct(onnx_op: str, **attributes: Any) -> Lower:
-    """A lowering to one ONNX node with the same inputs."""
+def direct(onnx_op: str, *positions: int, shape_at: int | None = None, **attributes: Any) -> Lower:
+    """A lowering to one ONNX node of all inputs, or of those at ``positions``; the one at ``shape_at`` is a shape."""
 
     def lower(node: Node, builder: OnnxBuilder) -> str:
-        return builder.emit(onnx_op, [builder.value(r) for r in node.inputs], **attributes)
+        operands = [
+            as_int64(node, builder, i) if i == shape_at else builder.value(node.inputs[i])
+            for i in positions or range(len(node.inputs))
+        ]
+        return builder.emit(onnx_op, operands, **attributes)
 
     return lower
 
@@ -326,6 +340,28 @@ def direct(onnx_op: str, **attributes: Any) -> Lower:
 def scalar(builder: OnnxBuilder, node: Node, number: float) -> str:
     """A scalar constant of the dtype of the node's first input."""
     return builder.const(np.array(number, builder.type_of(node.inputs[0]).dtype), "scalar")
+
+
+def chain(*steps: tuple[str, float | None]) -> Lower:
+    """ONNX ops one after the other, the first of the node's inputs; a number is the last operand of its op."""
+
+    def lower(node: Node, builder: OnnxBuilder) -> str:
+        values = [builder.value(r) for r in node.inputs]
+        for op, number in steps:
+            operands = values if number is None else [*values, scalar(builder, node, number)]
+            values = [builder.emit(op, operands)]
+        return values[0]
+
+    return lower
+
+
+def bounded(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
+    """A float that is finite, so that its product with 0 is 0; ``kind`` is what is known of it."""
+    if kind.constant is not None:
+        return value
+    largest = np.finfo(np.float32).max
+    low, high = (builder.const(np.array(s * largest, np.float32), w) for s, w in ((-1, "lowest"), (1, "highest")))
+    return builder.emit("Clip", [value, low, high])
 
 
 def squeezed(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
@@ -356,9 +392,9 @@ def _with_axes(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[in
     return builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
 
 
-def inserted(shape: Shape, axis: int) -> tuple[Dim, ...] | None:
-    """A shape with an axis of length 1 at ``axis``, which may be counted from the end of the result."""
+def inserted(shape: Shape, axis: int, length: Dim = 1) -> tuple[Dim, ...] | None:
+    """A shape with one axis more at ``axis``, which may be counted from the end of the result."""
     if shape is None:
         return None
     at = axis + len(shape) + 1 if axis < 0 else axis
-    return (*shape[:at], 1, *shape[at:])
+    return (*shape[:at], length, *shape[at:])

@@ -21,7 +21,7 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.linear import activation, lower_activation
+from converters.graph.ops.linear import activated, lower_activated
 from converters.graph.types import INT32, Dim, Symbols, TensorType
 
 T = type_attr()
@@ -70,10 +70,7 @@ def _conv2d(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def _fused_conv2d(node: Node, x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    result = np.asarray(_conv2d(node, x, kernel) + bias)
-    for name in node.attrs["fused_ops"][1:]:
-        result = activation(name, result)
-    return result
+    return activated(node, np.asarray(_conv2d(node, x, kernel) + bias))
 
 
 def _depthwise(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
@@ -143,9 +140,7 @@ def _lower_conv2d(node: Node, builder: OnnxBuilder) -> Any:
     builder.holds(weights, node.inputs[1], _TO_OIHW)
     inputs = [weights] + [builder.value(r) for r in node.inputs[2:]]
     value = _lower_window(node, builder, "Conv", inputs, kernel_shape=list(kernel.shape[:2]))
-    for name in node.attrs.get("fused_ops", ())[1:]:
-        value = lower_activation(name, value, builder)
-    return value
+    return lower_activated(node, value, builder)
 
 
 def _lower_depthwise(node: Node, builder: OnnxBuilder) -> Any:

@@ -1,4 +1,4 @@
-"""Elementwise ops: arithmetic, activations, comparisons, casts.
+"""Elementwise ops: arithmetic, activations, casts; comparisons and choices stand in ``logic``.
 
 Kernels of transcendental functions compute in float64 and round once, so constant folding gives the same bytes on
 every processor, and the oracle is closer to the true value than any runtime it judges.
@@ -20,14 +20,16 @@ from converters.graph.ops.base import (
     Lower,
     OnnxBuilder,
     OpDef,
+    bounded,
     broadcast_of,
+    chain,
     direct,
+    plain,
     same_as,
     scalar,
     type_attr,
-    unsqueezed,
 )
-from converters.graph.ops.older import clip, leaky_relu, select_v2
+from converters.graph.ops.older import clip, leaky_relu
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64, Symbols, TensorType
 
 T = type_attr()
@@ -40,16 +42,6 @@ def _wide(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
         with np.errstate(all="ignore"):
             wide = [a.astype(np.float64) if a.dtype.kind == "f" else a for a in arrays]
             return np.asarray(function(*wide)).astype(arrays[0].dtype)
-
-    return kernel
-
-
-def _plain(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
-    """A kernel whose result IEEE rounds once anyway (add, multiply, divide, compare) or is an integer's."""
-
-    def kernel(node: Node, *arrays: np.ndarray) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            return np.asarray(function(*arrays))
 
     return kernel
 
@@ -74,7 +66,7 @@ def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower, **t
 
 def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
     lowering = _pair(lower) if isinstance(lower, str) else lower
-    return OpDef(name, broadcast_of(count=2), _plain(function), lowering, (T,), elementwise=True, **traits)
+    return OpDef(name, broadcast_of(count=2), plain(function), lowering, (T,), elementwise=True, **traits)
 
 
 def _pair(name: str) -> Lower:
@@ -101,30 +93,10 @@ def _pair(name: str) -> Lower:
     return lower
 
 
-def _comparison(name: str, function: Callable[..., np.ndarray], lower: str | Lower) -> OpDef:
-    attrs: tuple[Attr, ...] = (T,)
-    if name in ("Equal", "NotEqual"):
-        attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
-    lowering = direct(lower) if isinstance(lower, str) else lower
-    return OpDef(
-        name, broadcast_of(BOOL, count=2), _plain(function), lowering, attrs, precision="exact", elementwise=True
-    )
-
-
-def _chain(*steps: tuple[str, float | None]) -> Lower:
-    """ONNX ops one after the other; a number is the second operand of its op."""
-
-    def lower(node: Node, builder: OnnxBuilder) -> str:
-        value = builder.value(node.inputs[0])
-        for op, number in steps:
-            value = builder.emit(op, [value] if number is None else [value, scalar(builder, node, number)])
-        return value
-
-    return lower
-
-
 def _lower_square(node: Node, builder: OnnxBuilder) -> Any:
-    value = builder.value(node.inputs[0])
+    """Of the operand, or of the difference of two."""
+    values = [builder.value(r) for r in node.inputs]
+    value = values[0] if len(values) == 1 else builder.emit("Sub", values)
     return builder.emit("Mul", [value, value])
 
 
@@ -146,11 +118,6 @@ def _lower_erf(node: Node, builder: OnnxBuilder) -> Any:
     upper = with_number("Add", with_number("Mul", builder.emit("Mul", [series, bell]), -1), 1)
     sign = builder.emit("Mul", [x, builder.emit("Reciprocal", [with_number("Add", size, 1e-30)])])
     return builder.emit("Mul", [upper, sign])
-
-
-def _lower_squared_difference(node: Node, builder: OnnxBuilder) -> Any:
-    value = builder.emit("Sub", [builder.value(r) for r in node.inputs])
-    return builder.emit("Mul", [value, value])
 
 
 def _real_div(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -190,15 +157,6 @@ def _lower_floor_mod(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Where", [builder.emit("And", [left, signs]), builder.emit("Add", [rest, b]), rest])
 
 
-def _lower_not_equal(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Not", [builder.emit("Equal", [builder.value(r) for r in node.inputs])])
-
-
-def _lower_greater_equal(node: Node, builder: OnnxBuilder) -> Any:
-    """The other way round: Barracuda has no GreaterOrEqual."""
-    return builder.emit("LessOrEqual", [builder.value(r) for r in reversed(node.inputs)])
-
-
 def _leaky_relu(node: Node, x: np.ndarray) -> np.ndarray:
     return np.where(x > 0, x, x * x.dtype.type(node.attrs["alpha"]))
 
@@ -230,46 +188,6 @@ def _lower_cast(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Cast", [value], to=target)
 
 
-def _infer_select(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    return [TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)]
-
-
-def _select(node: Node, condition: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """TF 1's Select: a rank-1 condition chooses whole rows."""
-    if condition.ndim == 1 and a.ndim > 1:
-        condition = condition.reshape(condition.shape + (1,) * (a.ndim - 1))
-    return np.where(condition, a, b)
-
-
-def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
-    condition, a, b = (builder.value(r) for r in node.inputs)
-    shape, wide = builder.type_of(node.inputs[0]).shape, builder.type_of(node.inputs[1]).rank
-    if shape is not None and len(shape) == 1 and wide is not None and wide > 1:
-        condition = unsqueezed(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
-    choices = [builder.type_of(r) for r in node.inputs[1:]]
-    infinite = any(k.constant is not None and not np.isfinite(k.constant).all() for k in choices)
-    if builder.chooses or infinite or choices[0].dtype != FLOAT32:
-        return builder.emit("Where", [condition, a, b])
-    holds = builder.emit("Cast", [condition], to=FLOAT32)
-    negative = builder.emit("Mul", [holds, builder.const(np.array(-1, np.float32), "minus")])
-    other = builder.emit("Add", [negative, builder.const(np.array(1, np.float32), "one")])
-    first, second = (_bounded(builder, v, k) for v, k in zip((a, b), choices, strict=True))
-    return builder.emit("Add", [builder.emit("Mul", [first, holds]), builder.emit("Mul", [second, other])])
-
-
-def _bounded(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
-    """A float that is finite, so that its product with 0 is 0."""
-    if kind.constant is not None:
-        return value
-    largest = np.finfo(np.float32).max
-    low, high = (builder.const(np.array(s * largest, np.float32), w) for s, w in ((-1, "lowest"), (1, "highest")))
-    return builder.emit("Clip", [value, low, high])
-
-
-def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
-    return [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)]
-
-
 def _add_n(node: Node, *arrays: np.ndarray) -> np.ndarray:
     total = arrays[0]
     for array in arrays[1:]:
@@ -288,7 +206,7 @@ def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
     kind = builder.type_of(node.inputs[0])
     zero = builder.const(np.zeros((), kind.dtype), "zero")
     if not builder.chooses and kind.dtype == FLOAT32:
-        return builder.emit("Mul", [_bounded(builder, builder.value(node.inputs[0]), kind), zero])
+        return builder.emit("Mul", [bounded(builder, builder.value(node.inputs[0]), kind), zero])
     shape = builder.emit("Shape", [builder.value(node.inputs[0])])
     return builder.emit("Expand", [zero, shape])
 
@@ -316,34 +234,24 @@ def _tfjs_cast(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType
     return Node(node.name, "NotEqual", (node.inputs[0], zero), origin=node.origin)
 
 
-def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
-    """TensorFlow.js broadcasts a vector condition over the last axis, not the first: SelectV2 of a reshaped one."""
-    condition, a, b = node.inputs
-    rank, wide = types[condition].rank, types[a].rank
-    if rank == 1 and wide is not None and wide > 1:
-        shape = builder.const(np.array([-1] + [1] * (wide - 1), INT32), f"{node.name}/rows")
-        condition = builder.add("Reshape", [condition, shape], f"{node.name}/condition")
-    return Node(node.name, "SelectV2", (condition, a, b), origin=node.origin)
-
-
 UNARY = (
-    _unary("Neg", _plain(np.negative), "Neg", precision="exact"),
-    _unary("Abs", _plain(np.abs), "Abs", precision="exact"),
-    _unary("Sign", _plain(np.sign), "Sign", precision="exact"),
-    _unary("Square", _plain(np.square), _lower_square),
-    _unary("Reciprocal", _plain(np.reciprocal), "Reciprocal", spellings=("Inv",)),
-    _unary("Floor", _plain(np.floor), "Floor", precision="exact"),
-    _unary("Ceil", _plain(np.ceil), "Ceil", precision="exact"),
-    _unary("Round", _plain(np.rint), "Round", precision="exact"),
+    _unary("Neg", plain(np.negative), "Neg", precision="exact"),
+    _unary("Abs", plain(np.abs), "Abs", precision="exact"),
+    _unary("Sign", plain(np.sign), "Sign", precision="exact"),
+    _unary("Square", plain(np.square), _lower_square),
+    _unary("Reciprocal", plain(np.reciprocal), "Reciprocal", spellings=("Inv",)),
+    _unary("Floor", plain(np.floor), "Floor", precision="exact"),
+    _unary("Ceil", plain(np.ceil), "Ceil", precision="exact"),
+    _unary("Round", plain(np.rint), "Round", precision="exact"),
     _unary("Exp", _wide(np.exp), "Exp", precision="approximate"),
-    _unary("Expm1", _wide(np.expm1), _chain(("Exp", None), ("Sub", 1.0)), precision="approximate"),
+    _unary("Expm1", _wide(np.expm1), chain(("Exp", None), ("Sub", 1.0)), precision="approximate"),
     _unary("Log", _wide(np.log), "Log", precision="approximate"),
-    _unary("Log1p", _wide(np.log1p), _chain(("Add", 1.0), ("Log", None)), precision="approximate"),
+    _unary("Log1p", _wide(np.log1p), chain(("Add", 1.0), ("Log", None)), precision="approximate"),
     _unary("Sqrt", _wide(np.sqrt), "Sqrt"),
     _unary(
         "Rsqrt",
         _wide(lambda x: np.asarray(1 / np.sqrt(x))),
-        _chain(("Sqrt", None), ("Reciprocal", None)),
+        chain(("Sqrt", None), ("Reciprocal", None)),
         precision="approximate",
     ),
     _unary("Sin", _wide(np.sin), "Sin", precision="approximate"),
@@ -362,7 +270,7 @@ UNARY = (
     _unary("Tanh", _wide(np.tanh), "Tanh", precision="approximate", activation="tanh", finite="always"),
     _unary(
         "Relu",
-        _plain(lambda x: np.maximum(x, x.dtype.type(0))),
+        plain(lambda x: np.maximum(x, x.dtype.type(0))),
         "Relu",
         precision="exact",
         activation="relu",
@@ -370,8 +278,8 @@ UNARY = (
     ),
     _unary(
         "Relu6",
-        _plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))),
-        _chain(("Max", 0.0), ("Min", 6.0)),
+        plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))),
+        chain(("Max", 0.0), ("Min", 6.0)),
         precision="exact",
         activation="relu 6",
         tfjs_fuses=True,
@@ -392,14 +300,6 @@ UNARY = (
         activation="softplus",
     ),
     _unary("Softsign", _wide(lambda x: x / (1 + np.abs(x))), "Softsign", tfjs=_tfjs_softsign, activation="softsign"),
-    OpDef(
-        "LogicalNot",
-        same_as(0, count=1),
-        _plain(np.logical_not),
-        direct("Not"),
-        precision="exact",
-        elementwise=True,
-    ),
     OpDef(
         "LeakyRelu",
         same_as(0),
@@ -445,11 +345,11 @@ BINARY = (
         precision="approximate",
         elementwise=True,
     ),
-    _binary("SquaredDifference", lambda a, b: np.square(a - b), _lower_squared_difference),
+    _binary("SquaredDifference", lambda a, b: np.square(a - b), _lower_square),
     OpDef(
         "ClipByValue",
         broadcast_of(),
-        _plain(lambda x, low, high: np.maximum(np.minimum(x, high), low)),
+        plain(lambda x, low, high: np.maximum(np.minimum(x, high), low)),
         attrs=(T,),
         older=clip,
         precision="exact",
@@ -458,36 +358,4 @@ BINARY = (
     OpDef("AddN", broadcast_of(), _add_n, _lower_add_n, (Attr("N", "int", derive="count"), T), elementwise=True),
 )
 
-LOGIC = (
-    _comparison("Less", np.less, "Less"),
-    _comparison("LessEqual", np.less_equal, "LessOrEqual"),
-    _comparison("Greater", np.greater, "Greater"),
-    _comparison("GreaterEqual", np.greater_equal, _lower_greater_equal),
-    _comparison("Equal", np.equal, "Equal"),
-    _comparison("NotEqual", np.not_equal, _lower_not_equal),
-    *(
-        OpDef(name, broadcast_of(BOOL, count=2), _plain(function), direct(onnx), precision="exact", elementwise=True)
-        for name, function, onnx in (("LogicalAnd", np.logical_and, "And"), ("LogicalOr", np.logical_or, "Or"))
-    ),
-    OpDef(  # not elementwise: a condition of rank 1 chooses whole rows
-        "Select",
-        _infer_select,
-        _select,
-        _lower_select,
-        (type_attr("T", "in:1"),),
-        tfjs=_tfjs_select,
-        precision="exact",
-    ),
-    OpDef(  # of no policy's graph, but of a TensorFlow.js model's
-        "SelectV2",
-        _infer_select_v2,
-        lambda node, c, a, b: np.where(c, a, b),
-        attrs=(type_attr("T", "in:1"),),
-        older=select_v2,
-        since="1.14",
-        precision="exact",
-        elementwise=True,
-    ),
-)
-
-OPS = UNARY + BINARY + LOGIC
+OPS = UNARY + BINARY

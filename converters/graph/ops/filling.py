@@ -15,9 +15,9 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
-    as_int64,
     by_shape,
     constant_input,
+    direct,
     inserted,
     not_constant,
     require_constant,
@@ -35,12 +35,8 @@ def _fill(node: Node, dims: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 def _infer_fill(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    dims = target_dims(args[0].value, args[0], symbols)
+    dims = target_dims(args[0], symbols)
     return [TensorType(args[1].dtype, None if dims is None else tuple(dims))]
-
-
-def _lower_fill(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Expand", [builder.value(node.inputs[1]), as_int64(node, builder, 0)])
 
 
 def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
@@ -48,7 +44,7 @@ def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
 
 
 def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    dims = target_dims(args[1].value, args[1], symbols)
+    dims = target_dims(args[1], symbols)
     return [TensorType(args[0].dtype, None if dims is None else broadcast(args[0].shape, tuple(dims), symbols))]
 
 
@@ -58,12 +54,8 @@ def _tile(node: Node, x: np.ndarray, multiples: np.ndarray) -> np.ndarray:
 
 @by_shape
 def _infer_tile(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
-    multiples = target_dims(args[1].value, args[1], symbols) or [symbols.fresh()] * len(shape)
+    multiples = target_dims(args[1], symbols) or [symbols.fresh()] * len(shape)
     return [product((d, m), symbols) for d, m in zip(shape, multiples, strict=True)]
-
-
-def _lower_tile(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Tile", [builder.value(node.inputs[0]), as_int64(node, builder, 1)])
 
 
 def _range(node: Node, start: np.ndarray, limit: np.ndarray, delta: np.ndarray) -> np.ndarray:
@@ -81,10 +73,6 @@ def _infer_range(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
     return [TensorType(args[0].dtype, (max(0, math.ceil((limit - start) / delta)),))]
 
 
-def _lower_range(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Range", [builder.value(r) for r in node.inputs])
-
-
 def _one_hot(node: Node, indices: np.ndarray, depth: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
     axis = int(node.attrs["axis"])
     hot = indices[..., None] == np.arange(int(depth))
@@ -95,11 +83,8 @@ def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
     shape = args[0].shape
     if shape is None:
         return [TensorType(args[2].dtype, None)]
-    depth = int(require_constant(node, args, 1, "a depth"))
-    axis = int(node.attrs["axis"])
-    dims = list(shape)
-    dims.insert(len(dims) if axis < 0 else axis, depth)
-    return [TensorType(args[2].dtype, tuple(dims))]
+    depth, axis = int(require_constant(node, args, 1, "a depth")), int(node.attrs["axis"])
+    return [TensorType(args[2].dtype, inserted(shape, max(axis, -1), depth))]
 
 
 def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
@@ -143,8 +128,7 @@ def _tfjs_one_hot(builder: GraphBuilder, node: Node, types: Mapping[str, TensorT
         hot = builder.add(
             "Transpose", [hot, builder.const(np.array(order, INT32), f"{node.name}/perm")], f"{node.name}/moved"
         )
-    plain = on_value is not None and off_value is not None and on_value == 1 and off_value == 0
-    if plain:
+    if on_value is not None and off_value is not None and on_value == 1 and off_value == 0:
         return Node(node.name, "Cast", (hot,), {"DstT": dtype, "Truncate": False}, origin=node.origin)
     scaled = builder.add("Cast", [hot], f"{node.name}/cast", DstT=dtype)
     width = builder.add("Sub", [on, off], f"{node.name}/width")
@@ -157,7 +141,7 @@ OPS = (
         "Fill",
         _infer_fill,
         _fill,
-        _lower_fill,
+        direct("Expand", 1, 0, shape_at=0),
         (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
         precision="exact",
     ),
@@ -169,8 +153,8 @@ OPS = (
         older=broadcast_to,
         moves="repeat",
     ),
-    OpDef("Tile", _infer_tile, _tile, _lower_tile, (T, type_attr("Tmultiples", "in:1")), moves="repeat"),
-    OpDef("Range", _infer_range, _range, _lower_range, (type_attr("Tidx"),)),
+    OpDef("Tile", _infer_tile, _tile, direct("Tile", shape_at=1), (T, type_attr("Tmultiples", "in:1")), moves="repeat"),
+    OpDef("Range", _infer_range, _range, direct("Range"), (type_attr("Tidx"),)),
     OpDef(
         "OneHot",
         _infer_one_hot,

@@ -17,6 +17,8 @@ from converters.graph.ops.base import (
     Precision,
     by_shape,
     constant_input,
+    direct,
+    plain,
     require_constant,
     same_as,
     shape_error,
@@ -93,11 +95,6 @@ def _lower_matmul(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("MatMul", values)
 
 
-def _bias_add(node: Node, x: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    with np.errstate(all="ignore"):
-        return np.asarray(x + bias)
-
-
 def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     x, bias = args[0].shape, args[1].shape
     if x is not None and bias is not None:
@@ -107,30 +104,29 @@ def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) ->
     return [TensorType(args[0].dtype, x)]
 
 
-def _lower_bias_add(node: Node, builder: OnnxBuilder) -> Any:
-    return builder.emit("Add", [builder.value(r) for r in node.inputs])
+def activated(node: Node, x: np.ndarray) -> np.ndarray:
+    """A product and its bias, then the activations that the fused op carries."""
+    for name in node.attrs["fused_ops"][1:]:
+        kernel = next(op.kernel for op in elementwise.OPS if op.name == name)
+        assert kernel is not None
+        x = np.asarray(kernel(Node(name, name), x))
+    return x
 
 
-def activation(name: str, x: np.ndarray) -> np.ndarray:
-    """The activations that fused ops may carry."""
-    kernel = next(op.kernel for op in elementwise.OPS if op.name == name)
-    assert kernel is not None
-    return np.asarray(kernel(Node(name, name), x))
-
-
-def lower_activation(name: str, value: str, builder: OnnxBuilder) -> str:
-    """``activation`` in ONNX, which calls all of them as TensorFlow does but has no Relu6."""
-    if name != "Relu6":
-        return builder.emit(name, [value])
-    low, high = (builder.const(np.array(bound, np.float32), "bound") for bound in (0, 6))
-    return builder.emit("Min", [builder.emit("Max", [value, low]), high])
+def lower_activated(node: Node, value: str, builder: OnnxBuilder) -> str:
+    """``activated`` in ONNX, which calls the activations as TensorFlow does but has no Relu6."""
+    for name in node.attrs.get("fused_ops", ())[1:]:
+        if name == "Relu6":
+            low, high = (builder.const(np.array(bound, np.float32), "bound") for bound in (0, 6))
+            value = builder.emit("Min", [builder.emit("Max", [value, low]), high])
+        else:
+            value = builder.emit(name, [value])
+    return value
 
 
 def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    x = _bias_add(node, _matmul(node, a, b), bias)
-    for name in node.attrs["fused_ops"][1:]:
-        x = activation(name, x)
-    return x
+    with np.errstate(all="ignore"):
+        return activated(node, _matmul(node, a, b) + bias)
 
 
 def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
@@ -144,9 +140,7 @@ def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
             transA=int(bool(node.attrs.get("transpose_a"))),
             transB=int(bool(node.attrs.get("transpose_b"))),
         )
-    for name in node.attrs["fused_ops"][1:]:
-        value = lower_activation(name, value, builder)
-    return value
+    return lower_activated(node, value, builder)
 
 
 # ------------------------------------------------------------------ reductions
@@ -248,13 +242,6 @@ def _log_softmax(node: Node, x: np.ndarray) -> np.ndarray:
         return np.asarray(shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))).astype(x.dtype)
 
 
-def _lower_softmax(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
-    def lower(node: Node, builder: OnnxBuilder) -> Any:
-        return builder.emit(onnx_op, [builder.value(node.inputs[0])], axis=-1)
-
-    return lower
-
-
 OPS = (
     OpDef(
         "MatMul",
@@ -306,8 +293,8 @@ OPS = (
     OpDef(
         "BiasAdd",
         _infer_bias_add,
-        _bias_add,
-        _lower_bias_add,
+        plain(np.add),
+        direct("Add"),
         (T, Attr("data_format", "str", "NHWC")),
     ),
     _reduce("Sum", np.sum, "ReduceSum", "summed"),
@@ -323,7 +310,7 @@ OPS = (
         "Softmax",
         same_as(0),
         lambda node, x: softmax64(x).astype(x.dtype),
-        _lower_softmax("Softmax"),
+        direct("Softmax", axis=-1),
         (T,),
         precision="approximate",
         activation="softmax",
@@ -333,7 +320,7 @@ OPS = (
         "LogSoftmax",
         same_as(0),
         _log_softmax,
-        _lower_softmax("LogSoftmax"),
+        direct("LogSoftmax", axis=-1),
         (T,),
         precision="approximate",
         activation="softmax",

@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, constant_input, type_attr
+from converters.graph.ops.arrays import target_dims
+from converters.graph.ops.base import (
+    Attr,
+    Kernel,
+    Lower,
+    OnnxBuilder,
+    OpDef,
+    Sampler,
+    as_int64,
+    constant_input,
+    type_attr,
+)
 from converters.graph.types import INT64, Dim, Symbols, TensorType
 
 _SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
@@ -43,12 +54,8 @@ def reseed(seed: int) -> None:
 
 
 def _infer_random(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    value, dims = args[0].value, None
-    if value is not None:
-        dims = tuple(d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist())
-    elif args[0].shape is not None and len(args[0].shape) == 1 and isinstance(args[0].shape[0], int):
-        dims = tuple(symbols.fresh() for _ in range(args[0].shape[0]))
-    return [TensorType(node.attrs["dtype"], dims)]
+    dims = target_dims(args[0], symbols)
+    return [TensorType(node.attrs["dtype"], None if dims is None else tuple(dims))]
 
 
 def _normal(node: Node, shape: np.ndarray) -> np.ndarray:
@@ -99,28 +106,15 @@ def _lower_multinomial(node: Node, builder: OnnxBuilder) -> Any:
     )
 
 
-_RANDOM = (*_SEEDS, Attr("dtype", "type"), type_attr("T"))
+def _of_shape(name: str, kernel: Kernel, lowering: Lower | None, sampler: Sampler) -> OpDef:
+    attrs = (*_SEEDS, Attr("dtype", "type"), type_attr("T"))
+    return OpDef(name, _infer_random, kernel, lowering, attrs, foldable=False, sampler=sampler)
+
 
 OPS = (
-    OpDef(
-        "RandomStandardNormal",
-        _infer_random,
-        _normal,
-        _lower_random("RandomNormalLike"),
-        _RANDOM,
-        foldable=False,
-        sampler="normal",
-    ),
-    OpDef("TruncatedNormal", _infer_random, _truncated, None, _RANDOM, foldable=False, sampler="truncated normal"),
-    OpDef(
-        "RandomUniform",
-        _infer_random,
-        _uniform,
-        _lower_random("RandomUniformLike"),
-        _RANDOM,
-        foldable=False,
-        sampler="uniform",
-    ),
+    _of_shape("RandomStandardNormal", _normal, _lower_random("RandomNormalLike"), "normal"),
+    _of_shape("TruncatedNormal", _truncated, None, "truncated normal"),
+    _of_shape("RandomUniform", _uniform, _lower_random("RandomUniformLike"), "uniform"),
     OpDef(
         "Multinomial",
         _infer_multinomial,

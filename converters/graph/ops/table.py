@@ -6,7 +6,18 @@ from collections.abc import Iterable, Mapping
 from typing import Protocol
 
 from converters.graph.nodes import Node
-from converters.graph.ops import arrays, convolution, elementwise, filling, linear, older, samplers, slicing
+from converters.graph.ops import (
+    arrays,
+    convolution,
+    elementwise,
+    filling,
+    joining,
+    linear,
+    logic,
+    older,
+    samplers,
+    slicing,
+)
 from converters.graph.ops.base import OpDef, written_as_older
 from signatures.errors import UnsupportedOpError
 
@@ -72,7 +83,7 @@ CALLING = CALLS | WHILES | IFS
 
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
-    for module in (elementwise, linear, convolution, arrays, slicing, filling, samplers, older):
+    for module in (elementwise, logic, linear, convolution, arrays, joining, slicing, filling, samplers, older):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")

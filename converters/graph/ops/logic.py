@@ -1,0 +1,120 @@
+"""Comparisons, choices and truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.nodes import Node
+from converters.graph.ops.base import (
+    Attr,
+    GraphBuilder,
+    Lower,
+    OnnxBuilder,
+    OpDef,
+    bounded,
+    broadcast_of,
+    chain,
+    direct,
+    plain,
+    same_as,
+    type_attr,
+    unsqueezed,
+)
+from converters.graph.ops.older import select_v2
+from converters.graph.types import BOOL, FLOAT32, INT32, Symbols, TensorType
+
+T = type_attr()
+
+
+def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower) -> OpDef:
+    attrs: tuple[Attr, ...] = (T,)
+    if name in ("Equal", "NotEqual"):
+        attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
+    kernel = plain(function)
+    return OpDef(name, broadcast_of(BOOL, count=2), kernel, lowering, attrs, precision="exact", elementwise=True)
+
+
+def _infer_select(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    return [TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)]
+
+
+def _select(node: Node, condition: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """TF 1's Select: a rank-1 condition chooses whole rows."""
+    if condition.ndim == 1 and a.ndim > 1:
+        condition = condition.reshape(condition.shape + (1,) * (a.ndim - 1))
+    return np.where(condition, a, b)
+
+
+def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
+    condition, a, b = (builder.value(r) for r in node.inputs)
+    shape, wide = builder.type_of(node.inputs[0]).shape, builder.type_of(node.inputs[1]).rank
+    if shape is not None and len(shape) == 1 and wide is not None and wide > 1:
+        condition = unsqueezed(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
+    choices = [builder.type_of(r) for r in node.inputs[1:]]
+    infinite = any(k.constant is not None and not np.isfinite(k.constant).all() for k in choices)
+    if builder.chooses or infinite or choices[0].dtype != FLOAT32:
+        return builder.emit("Where", [condition, a, b])
+    holds = builder.emit("Cast", [condition], to=FLOAT32)
+    negative = builder.emit("Mul", [holds, builder.const(np.array(-1, np.float32), "minus")])
+    other = builder.emit("Add", [negative, builder.const(np.array(1, np.float32), "one")])
+    first, second = (bounded(builder, v, k) for v, k in zip((a, b), choices, strict=True))
+    return builder.emit("Add", [builder.emit("Mul", [first, holds]), builder.emit("Mul", [second, other])])
+
+
+def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    return [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)]
+
+
+def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
+    """TensorFlow.js broadcasts a vector condition over the last axis, not the first: SelectV2 of a reshaped one."""
+    condition, a, b = node.inputs
+    rank, wide = types[condition].rank, types[a].rank
+    if rank == 1 and wide is not None and wide > 1:
+        shape = builder.const(np.array([-1] + [1] * (wide - 1), INT32), f"{node.name}/rows")
+        condition = builder.add("Reshape", [condition, shape], f"{node.name}/condition")
+    return Node(node.name, "SelectV2", (condition, a, b), origin=node.origin)
+
+
+OPS = (
+    _comparison("Less", np.less, direct("Less")),
+    _comparison("LessEqual", np.less_equal, direct("LessOrEqual")),
+    _comparison("Greater", np.greater, direct("Greater")),
+    # The other way round: Barracuda has no GreaterOrEqual.
+    _comparison("GreaterEqual", np.greater_equal, direct("LessOrEqual", 1, 0)),
+    _comparison("Equal", np.equal, direct("Equal")),
+    _comparison("NotEqual", np.not_equal, chain(("Equal", None), ("Not", None))),
+    *(
+        OpDef(name, broadcast_of(BOOL, count=2), plain(function), direct(onnx), precision="exact", elementwise=True)
+        for name, function, onnx in (("LogicalAnd", np.logical_and, "And"), ("LogicalOr", np.logical_or, "Or"))
+    ),
+    OpDef(
+        "LogicalNot",
+        same_as(0, count=1),
+        plain(np.logical_not),
+        direct("Not"),
+        precision="exact",
+        elementwise=True,
+    ),
+    OpDef(  # not elementwise: a condition of rank 1 chooses whole rows
+        "Select",
+        _infer_select,
+        _select,
+        _lower_select,
+        (type_attr("T", "in:1"),),
+        tfjs=_tfjs_select,
+        precision="exact",
+    ),
+    OpDef(  # of no policy's graph, but of a TensorFlow.js model's
+        "SelectV2",
+        _infer_select_v2,
+        lambda node, c, a, b: np.where(c, a, b),
+        attrs=(type_attr("T", "in:1"),),
+        older=select_v2,
+        since="1.14",
+        precision="exact",
+        elementwise=True,
+    ),
+)
