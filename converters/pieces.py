@@ -40,7 +40,7 @@ class _Span:
         array = self.array
         while array.ndim > 1 and len(array) == 1:
             array = array[0]
-        if _lies_right(array) or array.ndim == 0:
+        if (array.flags.c_contiguous and array.dtype.newbyteorder("<") == array.dtype) or array.ndim == 0:
             return _bytes_of(array)[self.first : self.last].data
         row = array.nbytes // len(array)
         start, stop = self.first // row, -(-self.last // row)
@@ -96,10 +96,6 @@ class Pieces:
 def equal(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two arrays have the same bytes; neither is copied whole."""
     return a.nbytes == b.nbytes and all(x == y for x, y in zip(Pieces(a).chunks(), Pieces(b).chunks(), strict=True))
-
-
-def _lies_right(array: np.ndarray) -> bool:
-    return array.flags.c_contiguous and array.dtype.newbyteorder("<") == array.dtype
 
 
 def _bytes_of(array: np.ndarray) -> np.ndarray:

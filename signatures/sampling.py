@@ -212,17 +212,9 @@ def _alone(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -
     return made.reshape(shape)
 
 
-def _bits(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    return rng.integers(0, 2, shape).astype(np.float64)
-
-
 def _equal(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     rows = rng.uniform(-3.0, 3.0, (*shape[:1], *(1,) * (len(shape) - 1)))
     return np.asarray(np.broadcast_to(rows, shape))
-
-
-def _near_zero(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    return np.asarray(0.01 * rng.standard_normal(shape))
 
 
 def _unit(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
@@ -251,9 +243,9 @@ def _whole(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -
 #: What observations often look like though no statistics say so, each with another number of rows.
 _PATTERNS: tuple[tuple[str, int, Style], ...] = (
     ("one number alone", 3, _alone),
-    ("zeros and ones", 4, _bits),
+    ("zeros and ones", 4, lambda rng, spec, shape: rng.integers(0, 2, shape).astype(np.float64)),
     ("all numbers equal", 5, _equal),
-    ("near zero", 6, _near_zero),
+    ("near zero", 6, lambda rng, spec, shape: np.asarray(0.01 * rng.standard_normal(shape))),
     ("whole numbers", 8, _whole),
     ("from zero to one", 9, _unit),
 )

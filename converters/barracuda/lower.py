@@ -121,7 +121,7 @@ class _Lowering:
         for role, name in INPUT_NAMES.items():
             for number, spec in enumerate(s for s in self.signature.inputs if s.role is role):
                 if number == 0:
-                    given[self._feed(spec)] = self._input(name, self._lengths(spec))
+                    given[self._feed(spec)] = self._input(name, (FREE, 1, 1, self._width(spec)))
                 elif role is Role.NOISE:
                     self.b.node = Node(spec.name, "Placeholder")
                     given[self._feed(spec)] = noise(self.b, self._shape(spec))
@@ -165,9 +165,6 @@ class _Lowering:
                 spec, f"it has the shape {list(spec.shape)}", "an input has a row per agent, of a known length"
             )
         return tuple(shape)
-
-    def _lengths(self, spec: TensorSpec) -> Dims:
-        return FREE, 1, 1, self._width(spec)
 
     def _width(self, spec: TensorSpec) -> int:
         return Value(self._shape(spec)).size

@@ -95,10 +95,6 @@ def _softplus(b: NnBuilder, x: str) -> str:
     return b.two(LayerType.ADD, b.at_least(x, 0), b.activation(Activation.LOG, b.shifted(small, 1), label="log"))
 
 
-def _softsign(b: NnBuilder, x: str) -> str:
-    return b.two(LayerType.DIV, x, b.shifted(b.activation(Activation.ABS, x, label="abs"), 1))
-
-
 def _erf(b: NnBuilder, x: str) -> str:
     """Abramowitz and Stegun 7.1.26, right to 1.5e-7; Barracuda has it from 2.3 on."""
     size = b.activation(Activation.ABS, x, label="abs")
@@ -125,7 +121,7 @@ _FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
     "Expm1": lambda b, x: b.shifted(b.activation(Activation.EXP, x, label="exp"), -1),
     "Log1p": lambda b, x: b.activation(Activation.LOG, b.shifted(x, 1)),
     "Softplus": _softplus,
-    "Softsign": _softsign,
+    "Softsign": lambda b, x: b.two(LayerType.DIV, x, b.shifted(b.activation(Activation.ABS, x, label="abs"), 1)),
     "Sign": _sign,
     "Round": _round,
     "Erf": _erf,
@@ -347,15 +343,11 @@ def _combined(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape:
     if first.array is not None and second.array is not None:
         functions = {LayerType.MUL: np.multiply, LayerType.ADD: np.add}
         array = functions[kind](first.array, second.array)
-        return Value(_constant_shape(array, shape), array=array)
+        return Value(shape if array.ndim == len(shape) else tuple(array.shape), array=array)
     shape = _broadcast(first, second, shape)
     pair = _Pair(b, [first, second], shape)
     names = pair.names if pair.full(0) and pair.arrays[0] is None else pair.names[::-1]
     return pair.made(_two(b, pair, kind, names[0], names[1], "chosen"))
-
-
-def _constant_shape(array: np.ndarray, shape: tuple[Dim, ...]) -> tuple[Dim, ...]:
-    return shape if array.ndim == len(shape) else tuple(array.shape)
 
 
 def _broadcast(first: Value, second: Value, shape: tuple[Dim, ...]) -> tuple[Dim, ...]:

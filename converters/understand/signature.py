@@ -138,10 +138,6 @@ def _preprocessing(layout: str, highest: int) -> dict[str, object]:
 LIFTED = re.compile(r"the noise drawn inside the graph \(.*\) is now the input (.+); feed N\(0, 1\)")
 
 
-def _lifted(origin: object, name: str) -> str:
-    return f"the noise drawn inside the graph ({origin}) is now the input {name}; feed N(0, 1)"
-
-
 def _unknown_input(name: str) -> str:
     return f"{name} is an input whose meaning is not known; it must be fed, or fixed with --set"
 
@@ -277,7 +273,7 @@ def _inputs(compiled: Compilation, types: Types, notes: list[str]) -> tuple[dict
         distribution = compiled.facts.distributions.get(node.name) or _distribution(graph, types, node, role)
         specs.append(TensorSpec(name, role, node.attrs["dtype"].name, _known_shape(node), node.origin, distribution))
         if node.name in compiled.draws:
-            notes.append(_lifted(node.origin, name))
+            notes.append(f"the noise drawn inside the graph ({node.origin}) is now the input {name}; feed N(0, 1)")
         if role is Role.PARAMETER:
             notes.append(_unknown_input(name))
     return feeds, specs

@@ -51,10 +51,6 @@ def placeholder_type(node: Node, symbols: Symbols) -> TensorType:
     return TensorType(node.attrs["dtype"], tuple(dims))
 
 
-def _infer_placeholder(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    return [placeholder_type(node, symbols)]
-
-
 # ------------------------------------------------------------------ shape of things
 
 
@@ -179,10 +175,6 @@ def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
     return squeezed(builder, builder.value(node.inputs[0]), axes, kept)
 
 
-def _expand_dims(node: Node, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    return np.expand_dims(x, int(axis.reshape(())))
-
-
 @by_shape
 def _infer_expand_dims(
     node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols
@@ -228,7 +220,7 @@ OPS = (
     ),
     OpDef(
         "Placeholder",
-        _infer_placeholder,
+        lambda node, args, symbols: [placeholder_type(node, symbols)],
         attrs=(Attr("dtype", "type"), Attr("shape", "shape", TensorShape(None))),
         spellings=("PlaceholderV2",),
         start="fed",
@@ -270,7 +262,7 @@ OPS = (
     OpDef(
         "ExpandDims",
         _infer_expand_dims,
-        _expand_dims,
+        lambda node, x, axis: np.expand_dims(x, int(axis.reshape(()))),
         _lower_expand_dims,
         (T, type_attr("Tdim", "in:1")),
         moves="view",

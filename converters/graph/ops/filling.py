@@ -39,10 +39,6 @@ def _infer_fill(node: Node, args: Sequence[TensorType], symbols: Symbols) -> lis
     return [TensorType(args[1].dtype, None if dims is None else tuple(dims))]
 
 
-def _broadcast_to(node: Node, x: np.ndarray, dims: np.ndarray) -> np.ndarray:
-    return np.asarray(np.broadcast_to(x, [int(d) for d in dims]), order="C")
-
-
 def _infer_broadcast_to(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     dims = target_dims(args[1], symbols)
     return [TensorType(args[0].dtype, None if dims is None else broadcast(args[0].shape, tuple(dims), symbols))]
@@ -148,7 +144,7 @@ OPS = (
     OpDef(
         "BroadcastTo",
         _infer_broadcast_to,
-        _broadcast_to,
+        lambda node, x, dims: np.asarray(np.broadcast_to(x, [int(d) for d in dims]), order="C"),
         attrs=(T, type_attr("Tidx", "in:1")),
         older=broadcast_to,
         moves="repeat",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.ops.older import select_v2
-from converters.graph.types import BOOL, FLOAT32, INT32, Symbols, TensorType
+from converters.graph.types import BOOL, FLOAT32, INT32, TensorType
 
 T = type_attr()
 
@@ -35,10 +35,6 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower)
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
     kernel = plain(function)
     return OpDef(name, broadcast_of(BOOL, count=2), kernel, lowering, attrs, precision="exact", elementwise=True)
-
-
-def _infer_select(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
-    return [TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)]
 
 
 def _select(node: Node, condition: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -62,10 +58,6 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
     other = builder.emit("Add", [negative, builder.const(np.array(1, np.float32), "one")])
     first, second = (bounded(builder, v, k) for v, k in zip((a, b), choices, strict=True))
     return builder.emit("Add", [builder.emit("Mul", [first, holds]), builder.emit("Mul", [second, other])])
-
-
-def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
-    return [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)]
 
 
 def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
@@ -100,7 +92,9 @@ OPS = (
     ),
     OpDef(  # not elementwise: a condition of rank 1 chooses whole rows
         "Select",
-        _infer_select,
+        lambda node, args, symbols: [
+            TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)
+        ],
         _select,
         _lower_select,
         (type_attr("T", "in:1"),),
@@ -109,7 +103,7 @@ OPS = (
     ),
     OpDef(  # of no policy's graph, but of a TensorFlow.js model's
         "SelectV2",
-        _infer_select_v2,
+        lambda node, args, symbols: [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)],
         lambda node, c, a, b: np.where(c, a, b),
         attrs=(type_attr("T", "in:1"),),
         older=select_v2,

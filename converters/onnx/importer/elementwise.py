@@ -116,18 +116,6 @@ def _cast(op: Op, net: Importer) -> str:
     return net.cast(op.need(0), op.dtype("to", 0))
 
 
-def _cast_like(op: Op, net: Importer) -> str:
-    return net.cast(op.need(0), net.dtype(op.need(1)))
-
-
-def _where(op: Op, net: Importer) -> str:
-    return net.where(op.need(0), op.need(1), op.need(2))
-
-
-def _is_nan(op: Op, net: Importer) -> str:
-    return net.add("NotEqual", [op.need(0), op.need(0)])
-
-
 def _is_inf(op: Op, net: Importer) -> str:
     x = op.need(0)
     found = [s for s, k in ((1, "detect_positive"), (-1, "detect_negative")) if op.integer(k, 1)]
@@ -152,10 +140,6 @@ def _with(function: Callable[..., str], **defaults: float) -> Translate:
 
 def _prelu(op: Op, net: Importer) -> str:
     return nn.prelu(net, op.need(0), op.need(1))
-
-
-def _gelu(op: Op, net: Importer) -> str:
-    return nn.gelu(net, op.need(0), tanh=op.text("approximate", "none") == "tanh")
 
 
 def _shrink(op: Op, net: Importer) -> str:
@@ -190,9 +174,9 @@ OPS: Mapping[str, Translate] = {
     "Pow": _pow,
     "Clip": _clip,
     "Cast": _cast,
-    "CastLike": _cast_like,
-    "Where": _where,
-    "IsNaN": _is_nan,
+    "CastLike": lambda op, net: net.cast(op.need(0), net.dtype(op.need(1))),
+    "Where": lambda op, net: net.where(op.need(0), op.need(1), op.need(2)),
+    "IsNaN": lambda op, net: net.add("NotEqual", [op.need(0), op.need(0)]),
     "IsInf": _is_inf,
     "Elu": _with(nn.elu, alpha=1.0),
     "Celu": _with(nn.celu, alpha=1.0),
@@ -204,7 +188,7 @@ OPS: Mapping[str, Translate] = {
     "HardSwish": _plain(nn.hard_swish),
     "Swish": _with(nn.swish, alpha=1.0),
     "Mish": _plain(nn.mish),
-    "Gelu": _gelu,
+    "Gelu": lambda op, net: nn.gelu(net, op.need(0), tanh=op.text("approximate", "none") == "tanh"),
     "Shrink": _shrink,
     "Sinh": _plain(trigonometry.sinh),
     "Cosh": _plain(trigonometry.cosh),

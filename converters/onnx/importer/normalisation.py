@@ -38,10 +38,6 @@ def _rms(op: Op, net: Importer) -> str:
     return nn.rms(net, x, net.axis(x, op.integer("axis", -1)), op.need(1), _epsilon(op))
 
 
-def _instance(op: Op, net: Importer) -> str:
-    return nn.instance(net, op.need(0), op.need(1), op.need(2), _epsilon(op))
-
-
 def _group(op: Op, net: Importer) -> str:
     """Scale and bias are per group in opset 18, per channel later."""
     return nn.group(net, op.need(0), op.integer("num_groups", 1), op.need(1), op.need(2), _epsilon(op))
@@ -63,7 +59,7 @@ OPS: Mapping[str, Translate] = {
     "BatchNormalization": _batch,
     "LayerNormalization": _layer,
     "RMSNormalization": _rms,
-    "InstanceNormalization": _instance,
+    "InstanceNormalization": lambda op, net: nn.instance(net, op.need(0), op.need(1), op.need(2), _epsilon(op)),
     "GroupNormalization": _group,
     "LpNormalization": _length,
     "LRN": _local,
