@@ -8,6 +8,7 @@ event.proto). Fields that are not listed survive as unknown fields.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from google.protobuf.message import DecodeError
 
 from converters.counting import check_size
 from converters.detached import LARGE_FILE, Detached, Fields
+from converters.graph.types import DATA_TYPES
 from converters.messages import message_classes
 from converters.pieces import Pieces
 from converters.varints import varint
@@ -143,6 +145,14 @@ def check_nodes(count: int) -> None:
         )
 
 
+def node_def(name: str, op: str, inputs: Iterable[str] = (), **types: int) -> Any:
+    """A NodeDef whose attributes are DataTypes."""
+    made = NodeDef(name=name, op=op, input=inputs)
+    for key, number in types.items():
+        made.attr[key].type = number
+    return made
+
+
 def serialise(message: Any) -> bytes:
     """Bytes with map entries in a fixed order."""
     data: bytes = message.SerializeToString(deterministic=True)
@@ -161,26 +171,16 @@ def field(number: int, content: Pieces) -> Pieces:
 
 # ------------------------------------------------------------------ dtypes (types.proto)
 
-#: DataType number → numpy dtype. 20 (resource) and 21 (variant) have none.
-_DTYPES: dict[int, np.dtype] = {
-    1: np.dtype(np.float32),
-    2: np.dtype(np.float64),
-    3: np.dtype(np.int32),
-    4: np.dtype(np.uint8),
-    5: np.dtype(np.int16),
-    6: np.dtype(np.int8),
-    7: np.dtype(np.bytes_),
-    9: np.dtype(np.int64),
-    10: np.dtype(np.bool_),
-    17: np.dtype(np.uint16),
-    19: np.dtype(np.float16),
-    20: np.dtype(object),
-    21: np.dtype(object),
-    22: np.dtype(np.uint32),
-    23: np.dtype(np.uint64),
+#: DataType → numpy dtype; resources and variants have none.
+_TEXT = np.dtype(np.bytes_)
+_DTYPES: dict[int, np.dtype] = {t.tensorflow: t.dtype for t in DATA_TYPES} | {
+    7: _TEXT,
+    **dict.fromkeys((20, 21), np.dtype(object)),
 }
-_NUMBERS = {dtype: number for number, dtype in _DTYPES.items() if number not in (20, 21)}
-_NAMES = {1: "DT_FLOAT", 2: "DT_DOUBLE", 3: "DT_INT32", 4: "DT_UINT8", 7: "DT_STRING", 9: "DT_INT64", 10: "DT_BOOL"}
+_NUMBERS = {t.dtype: t.tensorflow for t in DATA_TYPES} | {_TEXT: 7}
+#: How JSON forms of a GraphDef write a DataType → its number.
+BY_NAME = {t.name: t.tensorflow for t in DATA_TYPES} | {"DT_STRING": 7, "DT_RESOURCE": 20, "DT_VARIANT": 21}
+_NAMES = {number: name for name, number in BY_NAME.items()}
 
 
 def dtype_of(number: int) -> np.dtype:
@@ -197,7 +197,7 @@ def dtype_of(number: int) -> np.dtype:
 
 def dtype_number(dtype: np.dtype) -> int:
     """The DataType of a numpy dtype. Raises DamagedFileError for those that no policy has: resources are objects."""
-    number = _NUMBERS.get(np.dtype(np.bytes_) if dtype.kind == "S" else dtype)
+    number = _NUMBERS.get(_TEXT if dtype.kind == "S" else dtype)
     if number is None:
         raise DamagedFileError(
             f"a tensor of {dtype} is given or taken",

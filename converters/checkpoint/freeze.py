@@ -16,7 +16,7 @@ from converters import schema
 from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.detached import Detached
-from converters.frozen_graph.tensors import from_array
+from converters.frozen_graph.tensors import constant
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
 from converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
 from converters.understand.brains import depends_on_input, find_brains
@@ -196,7 +196,7 @@ def with_values(graph_def: Any, values: Mapping[str, np.ndarray], detached: Deta
     dtypes = _dtypes_of(graph_def, values)
     for node in graph_def.node:
         if node.name in values:
-            frozen.node.append(_constant(node.name, values[node.name], detached))
+            frozen.node.append(constant(node.name, values[node.name], detached))
             continue
         copy = frozen.node.add()
         copy.CopyFrom(node)
@@ -212,7 +212,7 @@ def with_values(graph_def: Any, values: Mapping[str, np.ndarray], detached: Deta
             copy.attr["T"].type = dtype
         elif node.op == "ResourceGather":
             axis = scope.fresh(f"{node.name}/axis")
-            frozen.node.append(_constant(axis, np.array(0, np.int32), detached))
+            frozen.node.append(constant(axis, np.array(0, np.int32), detached))
             indices = node.attr["Tindices"].type
             _become(copy, "GatherV2", Tparams=dtype, Tindices=indices, Taxis=schema.dtype_number(np.dtype(np.int32)))
             copy.input.insert(2, axis)
@@ -235,13 +235,6 @@ def _dtypes_of(graph_def: Any, values: Mapping[str, np.ndarray]) -> dict[str, in
                 found[node.name] = found[name]
                 stack.append(node.name)
     return found
-
-
-def _constant(name: str, value: np.ndarray, detached: Detached) -> Any:
-    node = schema.NodeDef(name=name, op="Const")
-    node.attr["dtype"].type = schema.dtype_number(value.dtype)
-    node.attr["value"].tensor.CopyFrom(from_array(value, detached))
-    return node
 
 
 def _become(node: Any, op: str, **types: int) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from converters.detached import Detached
 from converters.graph.allowance import Allowance
-from converters.schema import TensorProto, dtype_number, dtype_of
+from converters.schema import TensorProto, dtype_number, dtype_of, node_def
 from signatures.errors import DamagedFileError
 
 _MAX_AXES = 32
@@ -101,3 +101,10 @@ def from_array(array: np.ndarray, detached: Detached | None = None) -> Any:
         little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
         proto.tensor_content = little.tobytes()
     return proto
+
+
+def constant(name: str, value: np.ndarray, detached: Detached | None = None) -> Any:
+    """A NodeDef of a constant."""
+    node = node_def(name, "Const", dtype=dtype_number(value.dtype))
+    node.attr["value"].tensor.CopyFrom(from_array(value, detached))
+    return node

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from converters.detached import Detached, is_readable
+from converters.graph.types import DATA_TYPES
 from converters.messages import message_classes
 from converters.pieces import Pieces
 
@@ -71,23 +72,7 @@ _CLASSES = message_classes(
 )
 ModelProto = _CLASSES["ModelProto"]
 #: numpy dtype → TensorProto.DataType
-_DATA_TYPES = {
-    np.dtype(kind): number
-    for kind, number in (
-        (np.float32, 1),
-        (np.uint8, 2),
-        (np.int8, 3),
-        (np.uint16, 4),
-        (np.int16, 5),
-        (np.int32, 6),
-        (np.int64, 7),
-        (np.bool_, 9),
-        (np.float16, 10),
-        (np.float64, 11),
-        (np.uint32, 12),
-        (np.uint64, 13),
-    )
-}
+_DATA_TYPES = {t.dtype: t.onnx for t in DATA_TYPES}
 
 
 def tensor(array: np.ndarray, name: str = "", raw: bytes | None = None) -> Any:

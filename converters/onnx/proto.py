@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 from converters.counting import check_size
 from converters.detached import LARGE, LARGE_FILE, Detached, Fields
 from converters.fetch import MAX_WEIGHTS, read_bytes
-from converters.graph.types import FLOAT32
+from converters.graph.types import DATA_TYPES, FLOAT32
 from converters.onnx.messages import ModelProto
 from converters.schema import check_nodes
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
@@ -32,20 +32,9 @@ _EXTERNAL = 1  # TensorProto.DataLocation
 _MAX_TIMES = 4
 _DOUBLE, _STRING = 11, 8
 _TEXT = 9  # FieldDescriptor.TYPE_STRING
-#: TensorProto.DataType → (dtype, field of values that are not raw bytes)
-_STORED = {
-    1: (np.float32, "float_data"),
-    2: (np.uint8, "int32_data"),
-    3: (np.int8, "int32_data"),
-    4: (np.uint16, "int32_data"),
-    5: (np.int16, "int32_data"),
-    6: (np.int32, "int32_data"),
-    7: (np.int64, "int64_data"),
-    9: (np.bool_, "int32_data"),
-    11: (np.float64, "double_data"),
-    12: (np.uint32, "uint64_data"),
-    13: (np.uint64, "uint64_data"),
-}
+#: TensorProto.DataType → (dtype, field of values that are not raw bytes); halves are widened before.
+_FIELD = {1: "float_data", 7: "int64_data", 11: "double_data", 12: "uint64_data", 13: "uint64_data"}
+_STORED = {t.onnx: (t.dtype, _FIELD.get(t.onnx, "int32_data")) for t in DATA_TYPES if t.name != "DT_HALF"}
 #: AttributeProto.AttributeType → field, for the kinds that are read
 _FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "strings"}
 
@@ -125,11 +114,11 @@ def array_of(tensor: Any, detached: Detached | None) -> np.ndarray:
         raise _damaged(name, f"its shape is {list(shape[:8])}")
     array: np.ndarray
     if tensor.HasField("raw_data"):
-        size = count * np.dtype(dtype).itemsize
+        size = count * dtype.itemsize
         data = raw_of(tensor, detached)
         if data.size != size:
             raise _damaged(name, f"it holds {data.size} bytes where its shape needs {size}")
-        array = data.view(np.dtype(dtype).newbyteorder("<")).astype(dtype, copy=False)
+        array = data.view(dtype.newbyteorder("<")).astype(dtype, copy=False)
     else:
         values = getattr(tensor, field)
         if len(values) != count:
@@ -151,7 +140,7 @@ def raw_of(tensor: Any, detached: Detached | None) -> np.ndarray:
 
 def dtype_name(kind: int) -> str | None:
     """A TensorProto.DataType by numpy's name; None for those that no policy has."""
-    return np.dtype(_STORED[kind][0]).name if kind in _STORED else None
+    return _STORED[kind][0].name if kind in _STORED else None
 
 
 def _damaged(name: str, why: str) -> DamagedFileError:

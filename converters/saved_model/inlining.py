@@ -222,38 +222,31 @@ class _Flattening:
         if len(types) != len(inputs) or not inputs:
             raise _damaged(f"the loop {node.name!r} says {len(types)} types for {len(inputs)} variables")
 
-        def part(kind: str, op: str, *sources: str, dtype: int | None = None) -> Any:
-            made = schema.NodeDef(name=self.scope.fresh(f"{base}/{kind}"), op=op)
-            made.input.extend(sources)
-            if dtype is not None:
-                made.attr["T"].type = dtype
-            return made
-
         merges = []
         for source, dtype in zip(inputs, types, strict=True):
-            enter = part("Enter", "Enter", source, dtype=dtype)
+            enter = self._part(base, "Enter", source, T=dtype)
             enter.attr["frame_name"].s = base.encode()
             enter.attr["is_constant"].b = False
             enter.attr["parallel_iterations"].i = 1
             self._add(enter)
-            merge = part("Merge", "Merge", enter.name, dtype=dtype)
+            merge = self._part(base, "Merge", enter.name, T=dtype)
             merge.attr["N"].i = 2
             merges.append(merge)
         heads = [m.name for m in merges]
         condition = self._one(node.attr["cond"].func.name, f"{base}/cond", heads, heads[0], depth)
-        decided = part("LoopCond", "LoopCond", condition)
+        decided = self._part(base, "LoopCond", condition)
         self._add(decided)
-        switches = [part("Switch", "Switch", h, decided.name, dtype=t) for h, t in zip(heads, types, strict=True)]
-        turns = [part("Identity", "Identity", ref(s.name, 1), dtype=t) for s, t in zip(switches, types, strict=True)]
+        switches = [self._part(base, "Switch", h, decided.name, T=t) for h, t in zip(heads, types, strict=True)]
+        turns = [self._part(base, "Identity", ref(s.name, 1), T=t) for s, t in zip(switches, types, strict=True)]
         for made in (*switches, *turns):
             self._add(made)
         carried = self._body(node.attr["body"].func.name, f"{base}/body", [t.name for t in turns], turns[0].name, depth)
         if len(carried) != len(inputs):
             raise _damaged(f"the body of the loop {node.name!r} gives {len(carried)} of {len(inputs)} variables")
         for index, (merge, switch, result, dtype) in enumerate(zip(merges, switches, carried, types, strict=True)):
-            following = part("NextIteration", "NextIteration", result, dtype=dtype)
+            following = self._part(base, "NextIteration", result, T=dtype)
             merge.input.append(following.name)
-            leaving = part("Exit", "Exit", switch.name, dtype=dtype)
+            leaving = self._part(base, "Exit", switch.name, T=dtype)
             for made in (following, merge, leaving):
                 self._add(made)
             self.aliases[ref(name, index)] = leaving.name
@@ -264,18 +257,14 @@ class _Flattening:
         types = [node.attr["Tcond"].type, *node.attr["Tin"].list.type]
         if len(types) != len(inputs) or types[0] != _BOOL:
             raise _damaged(f"the branch {node.name!r} takes no bool, or other inputs than it says")
-        switches = []
-        for source, dtype in zip(inputs, types, strict=True):
-            made = schema.NodeDef(name=self.scope.fresh(f"{base}/Switch"), op="Switch")
-            made.input.extend((source, inputs[0]))
-            made.attr["T"].type = dtype
-            switches.append(made)
+        switches = [self._part(base, "Switch", s, inputs[0], T=t) for s, t in zip(inputs, types, strict=True)]
+        for made in switches:
             self._add(made)
         sides = []
         for index, key in ((0, "else_branch"), (1, "then_branch")):
-            pivot = schema.NodeDef(name=self.scope.fresh(f"{base}/pivot"), op="Identity")
-            pivot.input.append(ref(switches[0].name, index))
-            pivot.attr["T"].type = _BOOL
+            pivot = schema.node_def(
+                self.scope.fresh(f"{base}/pivot"), "Identity", [ref(switches[0].name, index)], T=_BOOL
+            )
             self._add(pivot)
             given = [ref(s.name, index) for s in switches[1:]]
             sides.append(self._body(node.attr[key].func.name, f"{base}/{key}", given, pivot.name, depth))
@@ -283,12 +272,14 @@ class _Flattening:
         if not len(sides[0]) == len(sides[1]) == len(results):
             raise _damaged(f"the two sides of the branch {node.name!r} give different numbers of results")
         for index, (no, yes, dtype) in enumerate(zip(*sides, results, strict=True)):
-            made = schema.NodeDef(name=self.scope.fresh(f"{base}/Merge"), op="Merge")
-            made.input.extend((no, yes))
-            made.attr["T"].type = dtype
+            made = self._part(base, "Merge", no, yes, T=dtype)
             made.attr["N"].i = 2
             self._add(made)
             self.aliases[ref(name, index)] = made.name
+
+    def _part(self, base: str, op: str, *sources: str, **types: int) -> Any:
+        """A node of a loop or branch, called after its op."""
+        return schema.node_def(self.scope.fresh(f"{base}/{op}"), op, sources, **types)
 
     def _one(self, called: str, prefix: str, arguments: Sequence[str], pivot: str, depth: int) -> str:
         results = self._body(called, prefix, arguments, pivot, depth)

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from converters.frozen_graph.tensors import constant
 from converters.graph.nodes import node_of, normal_ref
 from converters.saved_model.signature import ModelSignature
-from converters.schema import dtype_number
+from converters.schema import dtype_number, node_def
 
 _INT32 = np.dtype(np.int32)
 
@@ -60,19 +61,11 @@ def _ends(name: str, readers: dict[str, list[Any]], given: set[str]) -> Iterator
 def _count(definition: Any, shape: Any, other: str, dtype: int) -> None:
     """A Shape of [B] becomes the first number of another tensor's."""
     kind = shape.attr["out_type"].type or dtype_number(_INT32)
-    whole = definition.node.add(name=f"{shape.name}/whole", op="Shape", input=[other])
-    whole.attr["T"].type = dtype
-    whole.attr["out_type"].type = kind
-    bounds = []
-    for name, value in (("begin", 0), ("end", 1), ("step", 1)):
-        bound = definition.node.add(name=f"{shape.name}/{name}", op="Const")
-        bound.attr["dtype"].type = bound.attr["value"].tensor.dtype = dtype_number(_INT32)
-        bound.attr["value"].tensor.tensor_shape.dim.add(size=1)
-        bound.attr["value"].tensor.int_val.append(value)
-        bounds.append(bound.name)
-    shape.op = "StridedSlice"
-    del shape.input[:]
-    shape.input.extend([whole.name, *bounds])
-    shape.attr.clear()
-    shape.attr["T"].type = kind
-    shape.attr["Index"].type = dtype_number(_INT32)
+    whole = node_def(f"{shape.name}/whole", "Shape", [other], T=dtype, out_type=kind)
+    bounds = [
+        constant(f"{shape.name}/{name}", np.array([value], np.int32))
+        for name, value in (("begin", 0), ("end", 1), ("step", 1))
+    ]
+    definition.node.extend([whole, *bounds])
+    sources = [whole.name, *(b.name for b in bounds)]
+    shape.CopyFrom(node_def(shape.name, "StridedSlice", sources, T=kind, Index=dtype_number(_INT32)))

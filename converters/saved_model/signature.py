@@ -29,7 +29,7 @@ from converters.graph.nodes import (
 )
 from converters.graph.ops.table import is_fed
 from converters.graph.options import MAX_PORTS
-from converters.graph.types import Symbols, TensorType
+from converters.graph.types import DATA_TYPES, Symbols, TensorType
 from converters.schema import dtype_number
 from converters.understand.facts import SourceFacts
 from converters.understand.inputs import role_by_name
@@ -41,12 +41,7 @@ from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 #: TensorFlow's names of dtypes that numpy knows by the same.
-_NUMBERS = frozenset(
-    (
-        *("float16", "float32", "float64", "bool"),
-        *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
-    )
-)
+_NUMBERS = frozenset(t.dtype.name for t in DATA_TYPES)
 
 
 @dataclass(frozen=True, slots=True)

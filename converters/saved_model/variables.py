@@ -12,7 +12,7 @@ import numpy as np
 
 from converters import schema
 from converters.detached import Detached, is_readable
-from converters.frozen_graph.tensors import from_array
+from converters.frozen_graph.tensors import constant
 from converters.graph.nodes import NameScope
 from converters.pieces import Pieces
 
@@ -53,8 +53,7 @@ def _variables(meta: Any, detached: Detached, unique: str) -> dict[str, np.ndarr
         handle.attr["dtype"].type = kind
         handle.attr["shape"].shape.CopyFrom(node.attr["value"].tensor.tensor_shape)
         handle.attr["shared_name"].s = f"{unique}/{name}".encode()
-        read = graph.node.add(name=node.name, op="ReadVariableOp", input=[name])
-        read.attr["dtype"].type = kind
+        graph.node.append(schema.node_def(node.name, "ReadVariableOp", [name], dtype=kind))
         dtype = schema.dtype_of(kind).newbyteorder("<")
         shape = [d.size for d in node.attr["value"].tensor.tensor_shape.dim]
         found[name] = (array if array.dtype == dtype else array.view(dtype)).reshape(shape)
@@ -67,10 +66,8 @@ def _saver(meta: Any, scope: NameScope, handles: dict[str, int]) -> None:
     graph, names = meta.graph_def, list(handles)
 
     def text(wish: str, values: np.ndarray) -> str:
-        node = graph.node.add(name=scope.fresh(wish), op="Const")
-        node.attr["dtype"].type = schema.dtype_number(values.dtype)
-        node.attr["value"].tensor.CopyFrom(from_array(values))
-        return str(node.name)
+        graph.node.append(constant(scope.fresh(wish), values))
+        return str(graph.node[-1].name)
 
     place = text("save/Const", np.array(b"model"))
     listed = text("save/RestoreV2/tensor_names", np.array([n.encode() for n in names]))
@@ -79,10 +76,9 @@ def _saver(meta: Any, scope: NameScope, handles: dict[str, int]) -> None:
     restore.attr["dtypes"].list.type.extend(handles.values())
     assigned = []
     for index, (name, kind) in enumerate(handles.items()):
-        assign = graph.node.add(name=scope.fresh("save/AssignVariableOp"), op="AssignVariableOp")
-        assign.input.extend([name, f"{restore.name}:{index}"])
-        assign.attr["dtype"].type = kind
-        assigned.append(f"^{assign.name}")
+        sources, assign = [name, f"{restore.name}:{index}"], scope.fresh("save/AssignVariableOp")
+        graph.node.append(schema.node_def(assign, "AssignVariableOp", sources, dtype=kind))
+        assigned.append(f"^{assign}")
     done = graph.node.add(name=scope.fresh("save/restore_all"), op="NoOp", input=assigned)
     meta.saver_def.filename_tensor_name = meta.saver_def.save_tensor_name = f"{place}:0"
     meta.saver_def.restore_op_name = done.name

@@ -11,7 +11,7 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +27,8 @@ from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 from signatures.records import dataclass
 
 MODEL = "model.json"
-_DTYPES = {
-    "float32": np.dtype(np.float32),
-    "int32": np.dtype(np.int32),
-    "bool": np.dtype(np.bool_),
-    "uint8": np.dtype(np.uint8),
-    "uint16": np.dtype(np.uint16),
-    "float16": np.dtype(np.float16),
-    "int64": np.dtype(np.int64),
-}
-_NUMBERS = {
-    "DT_FLOAT": 1, "DT_DOUBLE": 2, "DT_INT32": 3, "DT_UINT8": 4, "DT_INT16": 5, "DT_INT8": 6, "DT_STRING": 7,
-    "DT_INT64": 9, "DT_BOOL": 10, "DT_UINT16": 17, "DT_HALF": 19, "DT_RESOURCE": 20, "DT_VARIANT": 21,
-}  # fmt: skip
+_NAMES = ("float32", "int32", "bool", "uint8", "uint16", "float16", "int64")
+_DTYPES = {name: np.dtype(name) for name in _NAMES}
 _MAX_AXES = 32
 #: How many files of a folder are looked into, and how far, for one that is not called model.json.
 _MAX_FILES, _HEAD = 16, 1 << 16
@@ -269,23 +258,12 @@ def _attribute(value: Mapping[str, Any]) -> Any:
             return ()
         (inner, items), *_ = content.items()
         return tuple(_attribute({inner: item}) for item in items)
-    if kind == "s":
-        return base64.b64decode(content).decode("utf-8", "replace")
-    if kind == "i":
-        return int(content)
-    if kind == "f":
-        return float(content)
-    if kind == "b":
-        return bool(content)
-    if kind == "type":
-        return _dtype(content)
-    if kind == "shape":
-        return _shape(content)
-    return None
+    read = _VALUES.get(kind)
+    return None if read is None else read(content)
 
 
 def _dtype(value: Any) -> np.dtype:
-    number = value if isinstance(value, int) else _NUMBERS.get(value)
+    number = value if isinstance(value, int) else schema.BY_NAME.get(value)
     if number is None:
         raise _damaged(f"the dtype {value!r} is not known")
     return schema.dtype_of(number)
@@ -296,6 +274,16 @@ def _shape(value: Mapping[str, Any]) -> TensorShape:
         return TensorShape(None)
     sizes = [int(d.get("size", 0)) for d in value.get("dim") or ()]
     return TensorShape(tuple(None if n < 0 else n for n in sizes))
+
+
+_VALUES: Mapping[str, Callable[[Any], Any]] = {
+    "s": lambda content: base64.b64decode(content).decode("utf-8", "replace"),
+    "i": int,
+    "f": float,
+    "b": bool,
+    "type": _dtype,
+    "shape": _shape,
+}
 
 
 def _signature(value: Mapping[str, Any]) -> ModelSignature:

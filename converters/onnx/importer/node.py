@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+from converters.graph.types import DATA_TYPES, FLOAT32
 from signatures.errors import UnsupportedOpError
 from signatures.records import dataclass
 
@@ -20,18 +20,10 @@ STANDARD = ("", "ai.onnx")
 #: TensorProto.DataType → dtype, for what a policy computes in. Doubles are computed as float32: TensorFlow.js has no
 #: float64, and no trainer's weights need it (verification judges the difference).
 DTYPES: Mapping[int, np.dtype] = {
-    1: FLOAT32,
-    2: np.dtype(np.uint8),
-    3: np.dtype(np.int8),
-    4: np.dtype(np.uint16),
-    5: np.dtype(np.int16),
-    6: INT32,
-    7: INT64,
-    9: BOOL,
-    11: FLOAT32,
+    t.onnx: FLOAT32 if t.name == "DT_DOUBLE" else t.dtype
+    for t in DATA_TYPES
+    if t.name not in ("DT_HALF", "DT_UINT32", "DT_UINT64")
 }
-
-
 #: What TensorProto calls the types that are not read.
 _UNREAD = {0: "undefined", 8: "string", 12: "uint32", 13: "uint64", 14: "complex64", 15: "complex128"}
 

@@ -14,18 +14,10 @@ from typing import Any
 
 import numpy as np
 
-_DTYPES: Mapping[int, np.dtype[Any]] = {
-    1: np.dtype(np.float32),
-    2: np.dtype(np.float64),
-    3: np.dtype(np.int32),
-    4: np.dtype(np.uint8),
-    5: np.dtype(np.int16),
-    6: np.dtype(np.int8),
-    9: np.dtype(np.int64),
-    10: np.dtype(np.bool_),
-    17: np.dtype(np.uint16),
-    19: np.dtype(np.float16),
-}
+from converters.graph.types import DATA_TYPES
+
+#: What the C API had then.
+_DTYPES = {t.tensorflow: t.dtype for t in DATA_TYPES if t.tensorflow < 20}
 _NUMBERS = {dtype: number for number, dtype in _DTYPES.items()}
 
 
