@@ -26,9 +26,10 @@ import numpy as np
 from converters.barracuda.assemble import assembled
 from converters.barracuda.format import NnInput, NnMemory, NnModel
 from converters.barracuda.lower_arrays import as_row, joined, reshaped
-from converters.barracuda.lower_base import FREE, Axes, Dims, NnBuilder, Piece, Value
+from converters.barracuda.lower_base import NnBuilder
 from converters.barracuda.lower_linear import FORBIDDEN, best_score, noise
 from converters.barracuda.lower_table import lower_graph
+from converters.barracuda.lower_values import FREE, Axes, Dims, Piece, Value
 from converters.barracuda.vocabulary import Activation, C, H, LayerType, N, W
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.passes.fuse import fuse

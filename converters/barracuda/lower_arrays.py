@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.barracuda.lower_base import Axes, NnBuilder, Value, rows_first, usual_axes
+from converters.barracuda.lower_base import NnBuilder
+from converters.barracuda.lower_values import Axes, Value, rows_first, usual_axes
 from converters.barracuda.vocabulary import Activation, C, H, LayerType, N, W
 from converters.graph.nodes import ref
 from converters.graph.ops.slicing import strided_steps

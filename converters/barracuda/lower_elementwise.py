@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.barracuda.lower_base import Axes, NnBuilder, Value, usual_axes
+from converters.barracuda.lower_base import NnBuilder
+from converters.barracuda.lower_values import Axes, Value, usual_axes
 from converters.barracuda.vocabulary import COMPARISONS, ONE_OP, Activation, C, H, LayerType, W
 from converters.graph.types import Dim
 

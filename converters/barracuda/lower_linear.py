@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.barracuda.lower_base import NnBuilder, Value
+from converters.barracuda.lower_base import NnBuilder
 from converters.barracuda.lower_elementwise import applied
+from converters.barracuda.lower_values import Value
 from converters.barracuda.vocabulary import Activation, C, LayerType, N
 from converters.graph.types import BATCH
 
@@ -44,8 +45,7 @@ def matmul(b: NnBuilder, args: Sequence[Value]) -> Value:
         )
     if attrs.get("transpose_b") or attrs.get("adj_y"):
         kernel = kernel.T
-    bias = args[2].array if len(args) > 2 else np.zeros(kernel.shape[1], np.float32)
-    assert bias is not None
+    bias = _bias(args, kernel.shape[1])
     if len(x.shape) != 2 or x.shape[0] != BATCH:
         return _last_axis(b, x, kernel, bias)
     if x.flat_of is not None:
@@ -89,19 +89,26 @@ def _last_axis(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray) -> 
 
 def conv2d(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A convolution; a dilated kernel is written with its zeros."""
-    kernel = args[1].array
-    if kernel is None:
+    kernel = _kernel(b, args[1])
+    return _convolved(b, args[0], kernel, _bias(args, kernel.shape[3]), LayerType.CONV2D)
+
+
+def _kernel(b: NnBuilder, value: Value) -> np.ndarray:
+    if value.array is None:
         raise b.refused("its kernel is computed", "the kernels of a .nn are constants")
-    bias = args[2].array if len(args) > 2 else np.zeros(kernel.shape[3], np.float32)
+    return value.array
+
+
+def _bias(args: Sequence[Value], length: int) -> np.ndarray:
+    """The constant that a fused product or convolution adds, else zeros."""
+    bias = args[2].array if len(args) > 2 else np.zeros(length, np.float32)
     assert bias is not None
-    return _convolved(b, args[0], kernel, bias, LayerType.CONV2D)
+    return bias
 
 
 def depthwise(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A convolution of every channel by itself; several results per channel become a full kernel with zeros."""
-    kernel = args[1].array
-    if kernel is None:
-        raise b.refused("its kernel is computed", "the kernels of a .nn are constants")
+    kernel = _kernel(b, args[1])
     height, width, channels, many = kernel.shape
     bias = np.zeros(channels * many, np.float32)
     if many == 1:

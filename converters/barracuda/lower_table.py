@@ -11,7 +11,8 @@ import numpy as np
 from converters.barracuda import lower_arrays as arrays
 from converters.barracuda import lower_elementwise as elementwise
 from converters.barracuda import lower_linear as linear
-from converters.barracuda.lower_base import NnBuilder, Value
+from converters.barracuda.lower_base import NnBuilder
+from converters.barracuda.lower_values import Value
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
 from converters.graph.ops.base import MISFIT, misfit
 from converters.graph.ops.table import op_of

@@ -20,8 +20,8 @@ from converters.graph.types import FLOAT32, INT32, INT64
 from converters.stable_baselines3.spaces import Space, space_of
 from converters.torch_checkpoint.activations import Activation, named, told
 from converters.torch_checkpoint.archive import Archive
-from converters.torch_checkpoint.network import Network, rnn_sizes
-from converters.torch_checkpoint.weights import Weights
+from converters.torch_checkpoint.network import Network
+from converters.torch_checkpoint.weights import Weights, pytorch_alone
 from converters.understand.facts import SourceFacts
 from signatures.errors import DamagedFileError, SourceError, UsageError
 from signatures.records import dataclass
@@ -103,8 +103,7 @@ def to_graph(
         memory_layout=memory,
         outputs=made.outputs,
         notes=(
-            "no runtime but PyTorch with Stable-Baselines3 reads it: the verdict on the export is that its formats are "
-            "self-consistent",
+            pytorch_alone("Stable-Baselines3"),
             "if it was trained behind VecNormalize, its statistics are in a file of their own (vecnormalize.pkl) and "
             "not here: feed observations that are normalised as in training",
             *made.notes,
@@ -236,9 +235,7 @@ def _actor_critic(made: _Built, observed: Observed) -> None:
     x = _features(made, observed, own)
     net.state.forget("features_extractor.")  # the same, or the critic's
     if "lstm_actor.weight_ih_l0" in net.state:
-        hidden, _, layers = rnn_sizes(net.state, "lstm_actor")
-        x, memory = net.recurrent(x, net.input("recurrent_in", 2 * layers * hidden), "lstm_actor")
-        net.output("recurrent_out", memory)
+        x, _ = net.remembering(x, "lstm_actor")
         made.outputs["recurrent_out"] = Role.MEMORY_OUT
     for part in ("shared_net", "policy_net"):
         x = net.mlp(x, f"mlp_extractor.{part}", made.activation)
@@ -373,7 +370,7 @@ def _categorical(made: _Built, logits: str) -> None:
         branch = net.slice(masked, 1, start, start + step)
         if columns:
             branch = net.concat([net.add("ZerosLike", [branch]), branch], 1)
-        parts.append(net.add("Multinomial", [branch, net.ints(1, "count")], output_dtype=INT64))
+        parts.append(net.choice(branch))
         start += step
     net.output("action", net.concat(parts, 1))
     made.outputs["action"] = Role.ACTION
@@ -395,10 +392,7 @@ def _highest(made: _Built, values: str) -> None:
     net = made.net
     if made.actions.kind != "Discrete" or net.width(values) != made.actions.size:
         raise _mixed(f"its network values {net.width(values)} actions, and its space has {made.actions.size}")
-    net.output("q_values", values)
-    net.at("action")
-    best = net.add("ArgMax", [values, net.ints(1, "axis")], output_type=INT64)
-    net.output("action", net.reshape(best, (-1, 1)))
+    net.highest(values)
     made.outputs |= {"action": Role.ACTION, "q_values": Role.OTHER}
 
 

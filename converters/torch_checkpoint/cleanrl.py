@@ -13,12 +13,12 @@ from typing import Any
 
 from converters.graph.nn.normalisation import layer
 from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32, INT32, INT64
+from converters.graph.types import FLOAT32, INT32
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.rsl_rl import per_action
-from converters.torch_checkpoint.weights import Weights
+from converters.torch_checkpoint.weights import Weights, pytorch_alone
 from converters.understand.facts import SourceFacts
 from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
@@ -86,8 +86,7 @@ def to_graph(
         memory_layout=making.memory,
         outputs=making.outputs,
         notes=(
-            "no runtime but PyTorch with the script reads it: the verdict on the export is that its formats are "
-            "self-consistent",
+            pytorch_alone("the script"),
             f"by the names of its layers it is of CleanRL's {script.algorithm}: {meaning}; observations that its "
             "wrappers normalise or clip must come so",
             *making.notes,
@@ -235,7 +234,7 @@ def _ppo_discrete(making: _Making) -> str:
         making.outputs["recurrent_out"] = Role.MEMORY_OUT
     logits = net.linear(x, "actor") if alone else _layers(making, x, "actor", ends=True)
     net.at("action")
-    net.output("action", net.add("Multinomial", [logits, net.ints(1, "count")], output_dtype=INT64))
+    net.output("action", net.choice(logits))
     making.outputs["action"] = Role.ACTION
     return f"one choice of {net.width(logits)} actions"
 
@@ -254,10 +253,7 @@ def _values(making: _Making) -> str:
         net.at("q_values")
         rows = net.reshape(net.add("Softmax", [net.reshape(x, (-1, len(atoms)))]), (-1, actions, len(atoms)))
         x = net.reduce("Sum", net.add("Mul", [rows, net.const(atoms, "atoms")]), [2], keep=False)
-    net.output("q_values", x)
-    net.at("action")
-    best = net.add("ArgMax", [x, net.ints(1, "axis")], output_type=INT64)
-    net.output("action", net.reshape(best, (-1, 1)))
+    net.highest(x)
     making.outputs.update(action=Role.ACTION, q_values=Role.OTHER)
     return f"the action of the highest of {net.width(x)} values"
 

@@ -16,7 +16,7 @@ from converters.graph.nn.activations import clip
 from converters.graph.nn.linear import matmul
 from converters.graph.nn.recurrent import gru, lstm
 from converters.graph.nodes import NameScope, Node, TensorShape
-from converters.graph.types import FLOAT32, INT32
+from converters.graph.types import FLOAT32, INT32, INT64
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.weights import Weights
 
@@ -183,6 +183,17 @@ class Network(Builder):
         noise = self.add("RandomStandardNormal", [shape], origin=drawn, dtype=FLOAT32)
         spread = self.add("Mul", [noise, self.add("Exp", [log_sigma])])
         return mean, self.add("Add", [mean, spread]), conditional
+
+    def highest(self, values: str) -> None:
+        """The outputs of a network of values per action: ``q_values``, and as ``action`` the one of the highest."""
+        self.output("q_values", values)
+        self.at("action")
+        best = self.add("ArgMax", [values, self.ints(1, "axis")], output_type=INT64)
+        self.output("action", self.reshape(best, (-1, 1)))
+
+    def choice(self, logits: str) -> str:
+        """A class of each row, drawn by its logits: int64 [B, 1]."""
+        return self.add("Multinomial", [logits, self.ints(1, "count")], output_dtype=INT64)
 
     def branch(self, x: str, module: str, masks: str, start: int, *, twice: bool, preview: bool = False) -> str:
         """The probabilities of one branch of ``MultiCategoricalDistribution``, [B, actions].

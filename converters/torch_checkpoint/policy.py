@@ -26,12 +26,12 @@ import numpy as np
 
 from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
-from converters.graph.types import INT64
 from converters.torch_checkpoint.activations import LEAKY_SLOPE
 from converters.torch_checkpoint.body import attended, body_width, goal_width, hidden_layers
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
 from converters.torch_checkpoint.state import LET_IT_EXPORT, State
+from converters.torch_checkpoint.weights import pytorch_alone
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import TORCH_VERSION_3
 from signatures.errors import SourceError
@@ -161,10 +161,7 @@ def _trainer(state: State, conditional: bool | None) -> str | None:
 
 
 def _notes(generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, guessed: bool) -> list[str]:
-    notes = [
-        "no runtime but PyTorch with ML-Agents reads a checkpoint: the verdict on the export is that its formats are "
-        "self-consistent"
-    ]
+    notes = [pytorch_alone("ML-Agents", "a checkpoint")]
     if guessed:
         notes.append("its deviation depends on the observation, as SAC's alone does: tanh is taken to bound its action")
     if joined and generation.by_sensor:
@@ -302,8 +299,7 @@ def _discrete(net: Network, generation: _Generation, x: str, branches: Sequence[
         probs = net.branch(x, branch, masks, start, twice=generation.first, preview=generation.preview)
         start += size
         if generation.by_sensor:
-            logs = net.add("Log", [probs])
-            parts.append(net.add("Multinomial", [logs, net.ints(1, "count")], output_dtype=INT64))
+            parts.append(net.choice(net.add("Log", [probs])))
         else:
             parts.append(net.add("Log", [probs]) if generation.preview else net.log(probs))
     return net.concat(parts, 1), sizes

@@ -17,7 +17,7 @@ from converters.graph.types import FLOAT32
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
-from converters.torch_checkpoint.weights import Weights
+from converters.torch_checkpoint.weights import Weights, pytorch_alone
 from converters.understand.facts import SourceFacts
 from signatures.records import dataclass
 from signatures.roles import Role
@@ -87,8 +87,7 @@ def to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tuple
         memory_layout=memory,
         outputs=outputs,
         notes=(
-            "no runtime but PyTorch with rsl_rl reads it: the verdict on the export is that its formats are "
-            "self-consistent",
+            pytorch_alone("rsl_rl"),
             "the action is the mean, as rsl_rl's act_inference gives it; what the environment does with it (scales, "
             "offsets, clips) is not in the file",
         ),

@@ -90,3 +90,11 @@ class Weights:
     def unknown(self, what: str, why: str) -> SourceError:
         """The refusal of a network that is not built here."""
         return SourceError(f"its network has a part that is not read from a checkpoint: {what}", why=why, fix=self._fix)
+
+
+def pytorch_alone(maker: str, what: str = "it") -> str:
+    """The note on a file that nothing runs which a verification could ask."""
+    return (
+        f"no runtime but PyTorch with {maker} reads {what}: the verdict on the export is that its formats are "
+        "self-consistent"
+    )
