@@ -106,6 +106,18 @@ def reached(starts: Iterable[str], ahead: Callable[[str], Iterable[str]]) -> set
     return seen
 
 
+def downstream(node: Node, consumers: Mapping[str, list[Node]], through: Callable[[Node], bool]) -> Iterator[Node]:
+    """What reads ``node``, the nearest first, looked for behind those that ``through`` holds for."""
+    queue, seen = [node], {node.name}
+    for source in queue:
+        for reader in consumers[source.name]:
+            if reader.name not in seen:
+                seen.add(reader.name)
+                yield reader
+                if through(reader):
+                    queue.append(reader)
+
+
 @dataclass(frozen=True)
 class Graph:
     """Nodes in topological order (the back edges of while loops apart), looked up by name."""

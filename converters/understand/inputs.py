@@ -5,11 +5,11 @@ What is not decided is a parameter, or an error that lists the candidates.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, TensorShape, node_of
+from converters.graph.nodes import Graph, Node, TensorShape, downstream, node_of
 from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.brains import Brain, close_names
 from converters.understand.memories import looks_like_state
@@ -186,24 +186,9 @@ def _is_free(node: Node) -> bool:
 
 def _feeds_table(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> bool:
     """Whether a tensor says which rows of a constant are taken."""
-    readers = _reached(node, consumers, lambda n: _shows(n) or traits(n).elementwise)
+    readers = downstream(node, consumers, lambda n: _shows(n) or traits(n).elementwise)
     picked = [r for r in readers if traits(r).moves == "pick" and len(r.inputs) > 1]
     return any(graph.constant(r.inputs[0]) is not None for r in picked)
-
-
-def _reached(node: Node, consumers: Mapping[str, list[Node]], through: Callable[[Node], bool]) -> list[Node]:
-    """Nodes that read ``node``, looked for behind those that ``through`` holds for."""
-    stack, met = [node], []
-    seen: set[str] = set()
-    while stack:
-        for reader in consumers[stack.pop().name]:
-            if reader.name in seen:
-                continue
-            seen.add(reader.name)
-            met.append(reader)
-            if through(reader):
-                stack.append(reader)
-    return met
 
 
 def _shows(node: Node) -> bool:
@@ -212,7 +197,7 @@ def _shows(node: Node) -> bool:
 
 
 def _feeds_one_hot(node: Node, consumers: Mapping[str, list[Node]]) -> bool:
-    return any(r.op == "OneHot" for r in _reached(node, consumers, lambda n: _shows(n) or n.op == "Cast"))
+    return any(r.op == "OneHot" for r in downstream(node, consumers, lambda n: _shows(n) or n.op == "Cast"))
 
 
 def _is_mask(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> bool:
@@ -223,5 +208,5 @@ def _is_mask(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> b
         added = made.inputs if traits(made).name == "Add" else ()
         return any(n.op == "Softmax" for n in (made, *map(graph.producer, added)))
 
-    readers = _reached(node, consumers, _shows)
+    readers = downstream(node, consumers, _shows)
     return any(reader.op == "Mul" and any(map(is_softmax, reader.inputs)) for reader in readers)

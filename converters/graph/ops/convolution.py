@@ -13,6 +13,8 @@ from converters.graph.ops.base import (
     REQUIRED,
     Attr,
     GraphBuilder,
+    Kernel,
+    Lower,
     OnnxBuilder,
     OpDef,
     by_shape,
@@ -21,7 +23,7 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.linear import activated, lower_activated
+from converters.graph.ops.linear import FUSED, activated, lower_activated
 from converters.graph.types import INT32, Dim, Symbols, TensorType
 
 T = type_attr()
@@ -231,44 +233,21 @@ _EXPLICIT = Attr("explicit_paddings", "int", (), since="1.14", supported=False)
 _DILATIONS = Attr("dilations", "int", (1, 1, 1, 1), since="1.7")
 _CUDNN = Attr("use_cudnn_on_gpu", "bool", True)
 
-_CONV = (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT, _CUDNN)
+_CONV = (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT)
 _POOL = (T, Attr("ksize", "int", REQUIRED), _STRIDES, _PADDING, _FORMAT, _EXPLICIT)
 
+
+def _convolution(name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], **traits: Any) -> OpDef:
+    attrs = (*_CONV, *attrs)
+    return OpDef(
+        name, _infer_window, kernel, lower, attrs, foldable=False, precision="summed", layer="convolution", **traits
+    )
+
+
 OPS = (
-    OpDef(
-        "Conv2D",
-        _infer_window,
-        _conv2d,
-        _lower_conv2d,
-        _CONV,
-        foldable=False,
-        tfjs=_tfjs_convolution,
-        precision="summed",
-        layer="convolution",
-        fused="_FusedConv2D",
-    ),
-    OpDef(
-        "_FusedConv2D",
-        _infer_window,
-        _fused_conv2d,
-        _lower_conv2d,
-        (*_CONV, Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001)),
-        foldable=False,
-        since="1.13",
-        precision="summed",
-        layer="convolution",
-    ),
-    OpDef(
-        "DepthwiseConv2dNative",
-        _infer_window,
-        _depthwise,
-        _lower_depthwise,
-        (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT),
-        foldable=False,
-        tfjs=_tfjs_convolution,
-        precision="summed",
-        layer="convolution",
-    ),
+    _convolution("Conv2D", _conv2d, _lower_conv2d, [_CUDNN], tfjs=_tfjs_convolution, fused="_FusedConv2D"),
+    _convolution("_FusedConv2D", _fused_conv2d, _lower_conv2d, [_CUDNN, *FUSED], since="1.13"),
+    _convolution("DepthwiseConv2dNative", _depthwise, _lower_depthwise, [], tfjs=_tfjs_convolution),
     OpDef("MaxPool", _infer_window, _max_pool, _lower_pool("MaxPool"), _POOL, precision="exact", layer="pool"),
     OpDef("AvgPool", _infer_window, _avg_pool, _lower_pool("AveragePool"), _POOL[:-1], layer="pool"),
     *(

@@ -55,13 +55,26 @@ def _elu(x: np.ndarray) -> np.ndarray:
     return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
 
 
-_SELU_ALPHA, _SELU_SCALE = 1.6732632423543772, 1.0507009873554805
+def _selu(x: np.ndarray) -> np.ndarray:
+    alpha, scale = 1.6732632423543772, 1.0507009873554805
+    return np.asarray(scale * np.where(x > 0, x, alpha * np.expm1(np.minimum(x, 0))))
+
+
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
 def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
     lowering = direct(lower) if isinstance(lower, str) else lower
     return OpDef(name, same_as(0, count=1), kernel, lowering, (T,), elementwise=True, **traits)
+
+
+def _smooth(name: str, function: Callable[..., np.ndarray], lower: str | Lower = "", **traits: Any) -> OpDef:
+    """A function that each runtime approximates; ONNX calls it so unless ``lower`` says how it is written."""
+    return _unary(name, _wide(function), lower or name, precision="approximate", **traits)
+
+
+def _clamp(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
+    return _unary(name, plain(function), lower, precision="exact", tfjs_fuses=True, **traits)
 
 
 def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
@@ -243,62 +256,28 @@ UNARY = (
     _unary("Floor", plain(np.floor), "Floor", precision="exact"),
     _unary("Ceil", plain(np.ceil), "Ceil", precision="exact"),
     _unary("Round", plain(np.rint), "Round", precision="exact"),
-    _unary("Exp", _wide(np.exp), "Exp", precision="approximate"),
-    _unary("Expm1", _wide(np.expm1), chain(("Exp", None), ("Sub", 1.0)), precision="approximate"),
-    _unary("Log", _wide(np.log), "Log", precision="approximate"),
-    _unary("Log1p", _wide(np.log1p), chain(("Add", 1.0), ("Log", None)), precision="approximate"),
+    _smooth("Exp", np.exp),
+    _smooth("Expm1", np.expm1, chain(("Exp", None), ("Sub", 1.0))),
+    _smooth("Log", np.log),
+    _smooth("Log1p", np.log1p, chain(("Add", 1.0), ("Log", None))),
     _unary("Sqrt", _wide(np.sqrt), "Sqrt"),
-    _unary(
-        "Rsqrt",
-        _wide(lambda x: np.asarray(1 / np.sqrt(x))),
-        chain(("Sqrt", None), ("Reciprocal", None)),
-        precision="approximate",
-    ),
-    _unary("Sin", _wide(np.sin), "Sin", precision="approximate"),
-    _unary("Cos", _wide(np.cos), "Cos", precision="approximate"),
-    _unary("Tan", _wide(np.tan), "Tan", precision="approximate"),
-    _unary("Erf", _wide(_erf), _lower_erf, precision="approximate"),
-    _unary(
-        "Sigmoid",
-        _wide(_sigmoid),
-        "Sigmoid",
-        precision="approximate",
-        activation="sigmoid",
-        finite="always",
-        tfjs_fuses=True,
-    ),
-    _unary("Tanh", _wide(np.tanh), "Tanh", precision="approximate", activation="tanh", finite="always"),
-    _unary(
-        "Relu",
-        plain(lambda x: np.maximum(x, x.dtype.type(0))),
-        "Relu",
-        precision="exact",
-        activation="relu",
-        tfjs_fuses=True,
-    ),
-    _unary(
+    _smooth("Rsqrt", lambda x: np.asarray(1 / np.sqrt(x)), chain(("Sqrt", None), ("Reciprocal", None))),
+    _smooth("Sin", np.sin),
+    _smooth("Cos", np.cos),
+    _smooth("Tan", np.tan),
+    _smooth("Erf", _erf, _lower_erf),
+    _smooth("Sigmoid", _sigmoid, activation="sigmoid", finite="always", tfjs_fuses=True),
+    _smooth("Tanh", np.tanh, activation="tanh", finite="always"),
+    _clamp("Relu", lambda x: np.maximum(x, x.dtype.type(0)), "Relu", activation="relu"),
+    _clamp(
         "Relu6",
-        plain(lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6))),
+        lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6)),
         chain(("Max", 0.0), ("Min", 6.0)),
-        precision="exact",
         activation="relu 6",
-        tfjs_fuses=True,
     ),
-    _unary("Elu", _wide(_elu), "Elu", precision="approximate", activation="elu", tfjs_fuses=True),
-    _unary(
-        "Selu",
-        _wide(lambda x: _SELU_SCALE * np.where(x > 0, x, _SELU_ALPHA * np.expm1(np.minimum(x, 0)))),
-        "Selu",
-        precision="approximate",
-        activation="selu",
-    ),
-    _unary(
-        "Softplus",
-        _wide(lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))),
-        "Softplus",
-        precision="approximate",
-        activation="softplus",
-    ),
+    _smooth("Elu", _elu, activation="elu", tfjs_fuses=True),
+    _smooth("Selu", _selu, activation="selu"),
+    _smooth("Softplus", lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x))), activation="softplus"),
     _unary("Softsign", _wide(lambda x: x / (1 + np.abs(x))), "Softsign", tfjs=_tfjs_softsign, activation="softsign"),
     OpDef(
         "LeakyRelu",

@@ -12,6 +12,8 @@ from converters.graph.nodes import Node
 from converters.graph.ops import elementwise
 from converters.graph.ops.base import (
     Attr,
+    Kernel,
+    Lower,
     OnnxBuilder,
     OpDef,
     Precision,
@@ -102,6 +104,10 @@ def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) ->
         if len(bias) != 1 or (isinstance(last, int) and isinstance(bias[0], int) and last != bias[0]):
             raise shape_error(node, args, "a bias has one element per channel")
     return [TensorType(args[0].dtype, x)]
+
+
+#: What a fused op has beside the attributes of the plain one.
+FUSED = (Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001))
 
 
 def activated(node: Node, x: np.ndarray) -> np.ndarray:
@@ -242,54 +248,20 @@ def _log_softmax(node: Node, x: np.ndarray) -> np.ndarray:
         return np.asarray(shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))).astype(x.dtype)
 
 
+def _dense(name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], **traits: Any) -> OpDef:
+    attrs = (T, *attrs)
+    return OpDef(name, _infer_matmul, kernel, lower, attrs, foldable=False, precision="summed", layer="dense", **traits)
+
+
+_TRANSPOSED = (Attr("transpose_a", "bool", False), Attr("transpose_b", "bool", False))
+# Written by TF 2.16 and later; marks products that belong to a gradient, which changes nothing here.
+_GRADIENT = (Attr("grad_a", "bool", False, since="2.16"), Attr("grad_b", "bool", False, since="2.16"))
+_ADJOINED = (Attr("adj_x", "bool", False), Attr("adj_y", "bool", False))
+
 OPS = (
-    OpDef(
-        "MatMul",
-        _infer_matmul,
-        _matmul,
-        _lower_matmul,
-        (
-            T,
-            Attr("transpose_a", "bool", False),
-            Attr("transpose_b", "bool", False),
-            # Written by TF 2.16 and later; marks products that belong to a gradient, which changes nothing here.
-            Attr("grad_a", "bool", False, since="2.16"),
-            Attr("grad_b", "bool", False, since="2.16"),
-        ),
-        foldable=False,
-        precision="summed",
-        layer="dense",
-        fused="_FusedMatMul",
-    ),
-    OpDef(
-        "BatchMatMul",
-        _infer_matmul,
-        _matmul,
-        _lower_matmul,
-        (T, Attr("adj_x", "bool", False), Attr("adj_y", "bool", False)),
-        foldable=False,
-        spellings=("BatchMatMulV2", "BatchMatMulV3"),
-        precision="summed",
-        layer="dense",
-    ),
-    OpDef(
-        "_FusedMatMul",
-        _infer_matmul,
-        _fused_matmul,
-        _lower_fused_matmul,
-        (
-            T,
-            Attr("transpose_a", "bool", False),
-            Attr("transpose_b", "bool", False),
-            Attr("num_args", "int", 1),
-            Attr("fused_ops", "str"),
-            Attr("epsilon", "float", 0.0001),
-        ),
-        foldable=False,
-        since="1.15",
-        precision="summed",
-        layer="dense",
-    ),
+    _dense("MatMul", _matmul, _lower_matmul, (*_TRANSPOSED, *_GRADIENT), fused="_FusedMatMul"),
+    _dense("BatchMatMul", _matmul, _lower_matmul, _ADJOINED, spellings=("BatchMatMulV2", "BatchMatMulV3")),
+    _dense("_FusedMatMul", _fused_matmul, _lower_fused_matmul, (*_TRANSPOSED, *FUSED), since="1.15"),
     OpDef(
         "BiasAdd",
         _infer_bias_add,

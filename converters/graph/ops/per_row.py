@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,17 +88,13 @@ def _first(rows: Rows, node: Node) -> str:
     return rows.rowed(node.inputs[0])
 
 
-def _attrs(node: Node) -> dict[str, Any]:
-    return dict(node.attrs)
-
-
 # ------------------------------------------------------------------ each element by itself
 
 
 def _elementwise(rows: Rows, node: Node) -> str:
     operands = rows.aligned(node.inputs)
     if node.op != "AddN":
-        return rows.b.add(node.op, operands, **_attrs(node))
+        return rows.b.add(node.op, operands, **node.attrs)
     total = operands[0]
     for operand in operands[1:]:
         total = rows.b.add("Add", [total, operand])
@@ -106,7 +102,7 @@ def _elementwise(rows: Rows, node: Node) -> str:
 
 
 def _same(rows: Rows, node: Node) -> str:
-    return rows.b.add(node.op, [_first(rows, node)], **_attrs(node))
+    return rows.b.add(node.op, [_first(rows, node)], **node.attrs)
 
 
 def _select(rows: Rows, node: Node) -> str:
@@ -156,12 +152,12 @@ def _split(rows: Rows, node: Node) -> Sequence[str]:
     at = rows.b.ints(int(rows.constant(node, axis)) % rows.rank(node.inputs[value]) + 1, "axis")
     x = rows.rowed(node.inputs[value])
     operands = [at, x] if node.op == "Split" else [x, rows.common(node, 1), at]
-    return _several(rows, node, operands, _attrs(node))
+    return _several(rows, node, operands, dict(node.attrs))
 
 
 def _unpack(rows: Rows, node: Node) -> Sequence[str]:
     at = int(node.attrs["axis"]) % rows.rank(node.inputs[0])
-    return _several(rows, node, [_first(rows, node)], {**_attrs(node), "axis": at + 1})
+    return _several(rows, node, [_first(rows, node)], {**node.attrs, "axis": at + 1})
 
 
 def _several(rows: Rows, node: Node, operands: Sequence[str], attrs: dict[str, Any]) -> Sequence[str]:
@@ -230,12 +226,12 @@ def _pad(rows: Rows, node: Node) -> str:
 def _reduction(rows: Rows, node: Node) -> str:
     rank = rows.rank(node.inputs[0])
     axes = sorted({int(a) % rank for a in rows.constant(node, 1).reshape(-1)}) if rank else []
-    return rows.b.add(node.op, [_first(rows, node), rows.b.ints([a + 1 for a in axes], "axes")], **_attrs(node))
+    return rows.b.add(node.op, [_first(rows, node), rows.b.ints([a + 1 for a in axes], "axes")], **node.attrs)
 
 
 def _arg(rows: Rows, node: Node) -> str:
     axis = int(rows.constant(node, 1)) % rows.rank(node.inputs[0])
-    return rows.b.add(node.op, [_first(rows, node), rows.b.ints(axis + 1, "axis")], **_attrs(node))
+    return rows.b.add(node.op, [_first(rows, node), rows.b.ints(axis + 1, "axis")], **node.attrs)
 
 
 def _softmax(rows: Rows, node: Node) -> str:
@@ -267,7 +263,7 @@ def _windowed(rows: Rows, node: Node) -> str:
     n, *image = rows.shape(node.inputs[0])
     x = rows.b.reshape(_first(rows, node), _joined(n, image))
     kernel = [rows.common(node, i) for i in range(1, len(node.inputs))]
-    made = rows.b.add(node.op, [x, *kernel], **_attrs(node))
+    made = rows.b.add(node.op, [x, *kernel], **node.attrs)
     return rows.b.reshape(made, (BATCH, *rows.shape(node.name)))
 
 
@@ -283,43 +279,39 @@ def _draw(rows: Rows, node: Node) -> str:
     """A first axis of 1 is that of the agents: what the file draws is then what each agent's row of the draw is."""
     dims = [int(d) for d in rows.constant(node, 0)]
     own = dims[1:] if len(dims) > 1 and dims[0] == 1 else dims
-    drawn = rows.b.add(node.op, [rows.b.vector((BATCH, *own))], origin=node.origin, **_attrs(node))
+    drawn = rows.b.add(node.op, [rows.b.vector((BATCH, *own))], origin=node.origin, **node.attrs)
     return drawn if own is dims else rows.b.reshape(drawn, (BATCH, *dims))
 
 
 def _multinomial(rows: Rows, node: Node) -> str:
     count, classes = rows.shape(node.inputs[0])
     logits = rows.b.reshape(_first(rows, node), _joined(count, [classes]))
-    drawn = rows.b.add("Multinomial", [logits, rows.common(node, 1)], origin=node.origin, **_attrs(node))
+    drawn = rows.b.add("Multinomial", [logits, rows.common(node, 1)], origin=node.origin, **node.attrs)
     return rows.b.reshape(drawn, (BATCH, *rows.shape(node.name)))
 
 
-def _each(rule: Rule, names: Collection[str]) -> dict[str, Rule]:
-    return dict.fromkeys(names, rule)
-
-
 _RULES: Mapping[str, Rule] = {
-    **_each(_same, ("Identity", "CheckNumerics", "PreventGradient", "Snapshot", "StopGradient")),
+    **dict.fromkeys(("Identity", "CheckNumerics", "PreventGradient", "Snapshot", "StopGradient"), _same),
     "Select": _select,
     "BiasAdd": _bias,
-    **_each(_view, ("Reshape", "ExpandDims", "Squeeze")),
+    **dict.fromkeys(("Reshape", "ExpandDims", "Squeeze"), _view),
     "Transpose": _transpose,
     "ConcatV2": _concat,
     "Pack": _pack,
-    **_each(_split, ("Split", "SplitV")),
+    **dict.fromkeys(("Split", "SplitV"), _split),
     "Unpack": _unpack,
     "Slice": _slice,
     "StridedSlice": _strided_slice,
-    **_each(_gather, ("Gather", "GatherV2")),
+    **dict.fromkeys(("Gather", "GatherV2"), _gather),
     "Tile": _tile,
-    **_each(_pad, ("Pad", "PadV2")),
-    **_each(_reduction, ("Sum", "Mean", "Prod", "Max", "Min", "All", "Any")),
-    **_each(_arg, ("ArgMax", "ArgMin")),
-    **_each(_softmax, ("Softmax", "LogSoftmax")),
+    **dict.fromkeys(("Pad", "PadV2"), _pad),
+    **dict.fromkeys(("Sum", "Mean", "Prod", "Max", "Min", "All", "Any"), _reduction),
+    **dict.fromkeys(("ArgMax", "ArgMin"), _arg),
+    **dict.fromkeys(("Softmax", "LogSoftmax"), _softmax),
     "OneHot": _one_hot,
-    **_each(_product, ("MatMul", "BatchMatMul")),
-    **_each(_windowed, ("Conv2D", "DepthwiseConv2dNative", "MaxPool", "AvgPool")),
-    **_each(_draw, ("RandomStandardNormal", "RandomUniform", "TruncatedNormal")),
+    **dict.fromkeys(("MatMul", "BatchMatMul"), _product),
+    **dict.fromkeys(("Conv2D", "DepthwiseConv2dNative", "MaxPool", "AvgPool"), _windowed),
+    **dict.fromkeys(("RandomStandardNormal", "RandomUniform", "TruncatedNormal"), _draw),
     "Multinomial": _multinomial,
 }
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape, node_of
+from converters.graph.nodes import Graph, Node, TensorShape, downstream
 from converters.graph.ops.base import Layer
 from converters.graph.ops.convolution import window_padding
 from converters.graph.ops.table import is_fed, traits
@@ -134,16 +134,10 @@ def complete_shapes(graph: Graph, roles: Mapping[str, Role]) -> Graph:
 
 def _dense_length(graph: Graph, node: Node, consumers: Mapping[str, list[Node]]) -> int | None:
     """Rows of the nearest kernel that a placeholder is multiplied with, perhaps normalised or activated before."""
-    queue, seen = [node], {node.name}
-    for source in queue:
-        for reader in consumers[source.name]:
-            if reader.op == "MatMul" and node_of(reader.inputs[0]) == source.name:
-                kernel = graph.constant(reader.inputs[1])
-                if kernel is not None:
-                    return int(kernel.shape[1 if reader.attrs.get("transpose_b") else 0])
-            elif reader.name not in seen and (traits(reader).elementwise or traits(reader).moves == "same"):
-                seen.add(reader.name)
-                queue.append(reader)
+    for reader in downstream(node, consumers, lambda n: traits(n).elementwise or traits(n).moves == "same"):
+        kernel = graph.constant(reader.inputs[1]) if reader.op == "MatMul" else None
+        if kernel is not None:
+            return int(kernel.shape[1 if reader.attrs.get("transpose_b") else 0])
     return None
 
 
@@ -170,15 +164,7 @@ def _image_shape(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], 
 
 def _next(node: Node, consumers: Mapping[str, list[Node]], *layers: Layer) -> Node | None:
     """The first node downstream that computes one of ``layers``, nearest first."""
-    queue, seen = [node], {node.name}
-    for source in queue:
-        for reader in consumers[source.name]:
-            if traits(reader).layer in layers:
-                return reader
-            if reader.name not in seen:
-                seen.add(reader.name)
-                queue.append(reader)
-    return None
+    return next((r for r in downstream(node, consumers, lambda n: True) if traits(r).layer in layers), None)
 
 
 def _window_chain(first: Node, consumers: Mapping[str, list[Node]]) -> tuple[list[Node], Node]:
