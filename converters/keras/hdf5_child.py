@@ -12,6 +12,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -98,13 +99,9 @@ class _Weights:
 
     def _names(self, group: Any, key: str) -> list[str]:
         """A list of names; a long one lies in several attributes (``layer_names0``, …)."""
-        keys = [key] if key in group.attrs else []
-        while not keys or f"{key}{len(keys) - 1}" in group.attrs:
-            if f"{key}{len(keys)}" not in group.attrs:
-                break
-            keys.append(f"{key}{len(keys)}")
+        parts = takewhile(group.attrs.__contains__, (f"{key}{number}" for number in count()))
         found: list[str] = []
-        for name in keys:
+        for name in [key] if key in group.attrs else parts:
             self._check(group.attrs, name)
             found += [n.decode() if isinstance(n, bytes) else str(n) for n in np.ravel(group.attrs[name])]
         return found

@@ -42,7 +42,8 @@ def chosen_runtimes(
         "browser": [n for n in known if n in _FREE],
         "full": [n for n in known if known[n].supported],
     }
-    names = [n for word in _names(wanted) for n in several.get(word, (word,))]
+    words = [word for word in wanted.split(",") if word] if isinstance(wanted, str) else wanted
+    names = [name for word in words for name in several.get(word, (word,))]
     for name in names:
         if name not in known:
             raise UsageError(
@@ -51,10 +52,6 @@ def chosen_runtimes(
         if not known[name].installed:
             raise RuntimeUnavailableError(f"the runtime {name} is not installed", fix=known[name].how)
     return tuple(dict.fromkeys(["numpy", *names])), infos
-
-
-def _names(wanted: str | Sequence[str]) -> list[str]:
-    return [n for n in wanted.split(",") if n] if isinstance(wanted, str) else list(wanted)
 
 
 class RuntimePool:

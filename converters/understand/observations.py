@@ -61,17 +61,14 @@ def _readers(graph: Graph, image: Node) -> list[tuple[Node, str]]:
     while stack:
         name = stack.pop()
         for reader in consumers[name]:
-            if _passes_on(reader) and reader.inputs[0] == name:
+            shows = passes_on(reader) or reader.op == "Cast" or traits(reader).moves == "turn"
+            if shows and reader.inputs[0] == name:
                 if reader.name not in seen:
                     seen.add(reader.name)
                     stack.append(reader.name)
             elif reader.op != "Shape":
                 found.append((reader, name))
     return found
-
-
-def _passes_on(node: Node) -> bool:
-    return passes_on(node) or node.op == "Cast" or traits(node).moves == "turn"
 
 
 def _divides(graph: Graph, reader: Node, source: str) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 
 from converters.graph.compilation import Compilation
 from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, normal_ref
+from converters.graph.nodes import Graph, normal_ref
 from converters.graph.ops.table import traits
 from converters.graph.passes.noise import without_noise
 from converters.graph.passes.normalise import normalise
@@ -44,14 +44,9 @@ def derive_outputs(c: Compilation) -> Compilation:
     return replace(c, graph=graph, fetches=fetches)
 
 
-def drawn_by(graph: Graph, reference: str) -> list[Node]:
-    """The samplers that a tensor depends on."""
-    upstream = graph.ancestors([reference])
-    return [n for n in graph.nodes if n.name in upstream and traits(n).sampler]
-
-
 def _check_no_chance(graph: Graph, reference: str, name: str) -> None:
-    samplers = drawn_by(graph, reference)
+    upstream = graph.ancestors([reference])
+    samplers = [n for n in graph.nodes if n.name in upstream and traits(n).sampler]
     if samplers:
         raise SignatureError(
             f"{name} would be another one in every run: it depends on {samplers[0].name!r} ({samplers[0].op})",

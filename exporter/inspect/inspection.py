@@ -133,7 +133,8 @@ def inspect_source(
         targets = {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()}
         with naming(source.path):
             layers = _layers(policy)
-        found.append(PolicyInspection(policy, ops, targets, _parameters(policy.graph), layers))
+        parameters = sum(v.size for v in policy.graph.values() if v.ndim and v.dtype.kind == "f")
+        found.append(PolicyInspection(policy, ops, targets, parameters, layers))
     return Inspection(
         source.path,
         source.format.label,
@@ -144,11 +145,6 @@ def inspect_source(
         [(safe_name(source.stem(m)), m.graph) for m in source.models],
         "; ".join(dict.fromkeys(m.producer for m in source.models if m.producer)),
     )
-
-
-def _parameters(graph: Graph) -> int:
-    values = [n.value for n in graph.nodes if n.value is not None]
-    return sum(v.size for v in values if v.ndim and v.dtype.kind == "f")
 
 
 def _layers(policy: Policy) -> dict[str, str]:

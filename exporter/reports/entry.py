@@ -56,7 +56,9 @@ def of_result(result: ExportResult, steps: int, words: Sequence[str] = ()) -> En
     if result.report is None:
         return None
     policy = result.policy
-    return Entry(result.report, policy.signature, policy.graph, result.agreed, steps, (*_verify(result.folder), *words))
+    return Entry(
+        result.report, policy.signature, policy.graph, result.agreed, steps, ("verify", shown(result.folder), *words)
+    )
 
 
 def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int, words: Sequence[str] = ()) -> Entry:
@@ -68,8 +70,4 @@ def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int
         graph = found.graph()
     except (OSError, ExportModelError):  # a report without a picture is better than none where it has gone since
         graph = None
-    return Entry(report, found.signature, graph, found.contract, steps, (*_verify(place or folder), *words))
-
-
-def _verify(place: Path) -> tuple[str, ...]:
-    return "verify", shown(place)
+    return Entry(report, found.signature, graph, found.contract, steps, ("verify", shown(place or folder), *words))

@@ -20,7 +20,9 @@ def markdown_text(entries: Sequence[Entry]) -> str:
     ordered = sorted(entries, key=lambda e: (e.report.passed is not False, e.report.passed is not None))
     lines = ["## export-model", ""]
     if len(entries) > 1:
-        rows = [[_mark(e), code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered]
+        rows = [
+            [_MARKS[e.report.verdict], code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered
+        ]
         lines += [*_table(("", "policy", "verdict", "disagreements"), rows), ""]
     for entry in ordered:
         lines += _policy(entry)
@@ -29,7 +31,7 @@ def markdown_text(entries: Sequence[Entry]) -> str:
 
 def _policy(entry: Entry) -> list[str]:
     report = entry.report
-    lines = [f"### {_mark(entry)} {code(report.policy)}", "", text(verdict(report)), ""]
+    lines = [f"### {_MARKS[report.verdict]} {code(report.policy)}", "", text(verdict(report)), ""]
     for c in report.failures:
         first, *rest = c.explanation()
         lines += [f"- ❌ {text(first)}", *(f"  - {text(line)}" for line in rest)]
@@ -57,10 +59,6 @@ def _policy(entry: Entry) -> list[str]:
     ]
     lines += _folded("Runtimes that did not run", missing)
     return lines + _folded("Notes", [f"- {text(note)}" for note in report.notes])
-
-
-def _mark(entry: Entry) -> str:
-    return _MARKS[entry.report.verdict]
 
 
 def _folded(title: str, lines: Sequence[str]) -> list[str]:

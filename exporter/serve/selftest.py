@@ -46,7 +46,7 @@ def golden(signature: PolicySignature, graph: Graph) -> tuple[dict[str, Any], by
         c for c in draw_cases(signature, seed=SEED, samples=1) if c.name not in _TOO_LARGE and c.batch <= _MOST_ROWS
     ]
     for number, case in enumerate(kept):
-        if number >= 3 and book.size + sum(a.nbytes for a in case.feeds.values()) > _MOST_BYTES:
+        if number >= 3 and len(book.data) + sum(a.nbytes for a in case.feeds.values()) > _MOST_BYTES:
             continue
         book.add(case, run_graph(graph, case.feeds, names))
     if signature.recurrence is not None:
@@ -68,10 +68,6 @@ class _Book:
         self.signature = signature
         self.cases: list[dict[str, Any]] = []
         self.data = bytearray()
-
-    @property
-    def size(self) -> int:
-        return len(self.data)
 
     def add(self, case: Case, answers: Mapping[str, np.ndarray], *, continues: bool = False) -> None:
         scored = (s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS))

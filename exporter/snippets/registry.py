@@ -83,7 +83,9 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
     chosen = [t for t in TARGETS if name in (None, t.name)] or [t for t in TARGETS if t.name.startswith(f"{name}-")]
     if not chosen:
         raise UsageError(f"--for {name}: there is no such target", fix=f"one of: {', '.join(t.name for t in TARGETS)}")
-    lacking = {t.name: " or ".join(t.needs).replace("+", " and ") for t in chosen if not _has(bundle, t)}
+    has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
+    able = {t.name for t in chosen if any(has.issuperset(need.split("+")) for need in t.needs)}
+    lacking = {t.name: " or ".join(t.needs).replace("+", " and ") for t in chosen if t.name not in able}
     if len(lacking) == len(chosen):
         needed = next(iter(lacking.values()))
         raise BundleError(
@@ -114,8 +116,3 @@ def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
             fix=f"export-model SOURCE --for {wanted.name}",
         )
     return "internal-brain" if "bytes" in wanted.formats else "agent"
-
-
-def _has(bundle: Bundle, target: Target) -> bool:
-    has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
-    return any(has.issuperset(need.split("+")) for need in target.needs)

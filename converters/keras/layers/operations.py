@@ -65,10 +65,6 @@ def _clip(step: Step) -> str:
     return clip(step.net, step.x, *(v if isinstance(v, str) or v is None else float(v) for v in (low, high)))
 
 
-def _concatenate(step: Step) -> str:
-    return step.net.concat(step.tensors, step.net.axis(step.x, int(step.get("axis", -1) or 0)))
-
-
 def _stack(step: Step) -> str:
     axis = int(step.get("axis", 0))
     return step.net.add("Pack", step.tensors, axis=axis % (step.rank + 1))
@@ -148,7 +144,7 @@ OPERATIONS: Mapping[str, Translate] = {
     "Softmax": partial(_softmax, op="Softmax"),
     "LogSoftmax": partial(_softmax, op="LogSoftmax"),
     "Clip": _clip,
-    "Concatenate": _concatenate,
+    "Concatenate": lambda s: s.net.concat(s.tensors, s.net.axis(s.x, int(s.get("axis", -1) or 0))),
     "Stack": _stack,
     "Reshape": _reshape,
     "GetItem": _item,
