@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 
 from converters.format import Format
 from converters.runtimes.process import RuntimeProcess
@@ -54,7 +55,7 @@ def chosen_runtimes(
     return tuple(dict.fromkeys(["numpy", *names])), infos
 
 
-class RuntimePool:
+class RuntimePool(AbstractContextManager["RuntimePool"]):
     """Hands out a process per runtime; ``commands`` starts them, by name (the registry's where it is not given)."""
 
     def __init__(self, commands: Mapping[str, Callable[[], list[str]]] = _COMMANDS) -> None:
@@ -87,9 +88,6 @@ class RuntimePool:
     def versions(self) -> dict[str, str]:
         """Versions of the runtimes that ran, by name."""
         return {n: p.version for n, p in self._processes.items() if p.version is not None}
-
-    def __enter__(self) -> RuntimePool:
-        return self
 
     def __exit__(self, *error: object) -> None:
         for process in self._processes.values():

@@ -9,6 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
@@ -41,7 +42,7 @@ class RunFailedError(ExportModelError):
     exit_status = 1
 
 
-class RuntimeProcess:
+class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
     """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
 
     def __init__(
@@ -259,9 +260,6 @@ class RuntimeProcess:
             self._scratch = None
         self._memory = None
 
-    def __enter__(self) -> RuntimeProcess:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
@@ -290,7 +288,7 @@ def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
         return process.wait()
 
 
-class LoadedModel:
+class LoadedModel(AbstractContextManager["LoadedModel"]):
     """A model in a runtime's process."""
 
     def __init__(self, process: RuntimeProcess, identity: str, size: int, path: str, *, answered: bool) -> None:
@@ -362,9 +360,6 @@ class LoadedModel:
         """Free it; a runtime that has died has freed it already."""
         with contextlib.suppress(RunFailedError):
             self._process.unload(self._identity, self._size)
-
-    def __enter__(self) -> LoadedModel:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.unload()

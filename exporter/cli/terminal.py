@@ -14,6 +14,7 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from typing import Any
 
 import click
@@ -59,7 +60,7 @@ def say_json(content: Mapping[str, Any]) -> None:
     click.echo(json.dumps(content, indent=1).replace("\x7f", "\\u007f").replace("##", "#\\u0023"))
 
 
-class Progress:
+class Progress(AbstractContextManager["Progress"]):
     """Which step is being done: one line that is overwritten, on a terminal; a line each with ``--verbose``."""
 
     def __init__(self, *, quiet: bool, verbose: bool) -> None:
@@ -79,9 +80,6 @@ class Progress:
         """Make room for a result."""
         if self._shown:
             click.echo(_ERASE, nl=False, err=True, color=True)
-
-    def __enter__(self) -> Progress:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.clear()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -109,7 +109,7 @@ class _Worker:
 
 
 @dataclass
-class _Crew:
+class _Crew(AbstractContextManager["_Crew"]):
     options: ExportOptions
     wanted: Wanted
     turns: Turns[_Worker]
@@ -193,9 +193,6 @@ class _Crew:
             worker.pipe.send(message)
         except OSError:  # it has ended, which the next wait tells
             return
-
-    def __enter__(self) -> _Crew:
-        return self
 
     def __exit__(self, *error: object) -> None:
         for worker in self.workers:

@@ -209,14 +209,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def do_GET(self) -> None:
-        """A file of the site."""
-        self._answer(with_body=True)
-
-    def do_HEAD(self) -> None:
-        """Its headers."""
-        self._answer(with_body=False)
-
-    def _answer(self, *, with_body: bool) -> None:
+        """A file of the site; of HEAD its headers alone."""
         name = unquote(urlsplit(self.path).path).removeprefix("/") or INDEX
         body = self.server.site.get(name)
         if body is None:
@@ -226,8 +219,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", TYPES[PurePosixPath(name).suffix])
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        if with_body:
+        if self.command != "HEAD":
             self.wfile.write(body)
+
+    do_HEAD = do_GET  # noqa: N815  http.server asks for it by this name
 
     def log_message(self, format: str, *args: object) -> None:
         """Nothing: the terminal shows the address, and stays as it is."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 
 import numpy as np
 
@@ -20,7 +20,7 @@ Arrays = Mapping[str, np.ndarray]
 Answers = list[dict[str, np.ndarray]]
 
 
-class Reference:
+class Reference(AbstractContextManager["Reference"]):
     """What all others are held against; to leave the context frees it. Raises RunFailedError where numpy fails."""
 
     def __init__(self, tested: PolicyUnderTest, runtimes: Sequence[str], pool: RuntimePool, seed: int) -> None:
@@ -71,7 +71,7 @@ class Reference:
 
     def remember(self, inputs: Sequence[Arrays]) -> None:
         """Have the kernels answer for inputs that are asked about several times."""
-        with contextlib.suppress(RunFailedError):  # who asks again is told
+        with suppress(RunFailedError):  # who asks again is told
             found = self.model.run_all(inputs, self.asked)
             self._known.update({id(i): (i, answer) for i, answer in zip(inputs, found, strict=True)})
 
@@ -81,9 +81,6 @@ class Reference:
         if len(known) < len(inputs) or any(name not in self.asked for name in fetch):
             return self.model.run_all(inputs, fetch)
         return [{name: answer[name] for name in fetch} for answer in known]
-
-    def __enter__(self) -> Reference:
-        return self
 
     def __exit__(self, *error: object) -> None:
         for model in self._loaded:
