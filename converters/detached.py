@@ -69,10 +69,10 @@ class Detached:
             return None
         return self._arrays[int.from_bytes(content[len(_SECRET) :], "little")]
 
-    def without(self, data: bytes, fields: Fields) -> bytes:
+    def without(self, data: bytes | memoryview, fields: Fields) -> bytes:
         """A serialised message with marks for the large contents of ``fields``. What is no message stays as it is."""
         parts = self._without(memoryview(data), fields)
-        return data if parts is None else b"".join(parts)
+        return bytes(data) if parts is None else b"".join(parts)
 
     def _without(self, view: memoryview, fields: Fields) -> list[bytes | memoryview] | None:
         parts: list[bytes | memoryview] = []

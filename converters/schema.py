@@ -98,18 +98,20 @@ _GRAPH: Fields = {1: _NODE, 2: {1: {3: _NODE}}}
 _CONTENTS: dict[str, Fields] = {"GraphDef": _GRAPH, "MetaGraphDef": {2: _GRAPH}, "SavedModel": {2: {2: _GRAPH}}}
 
 
-def parse(message_class: Any, data: bytes, what: str, detached: Detached | None = None) -> Any:
+def parse(message_class: Any, data: bytes | memoryview, what: str, detached: Detached | None = None) -> Any:
     """The message in ``data``. Of a large one ``detached`` is given the tensors' contents.
 
     Raises DamagedFileError that calls it ``what``, NotAPolicyError where it is made of too many parts.
     """
     fields = _CONTENTS.get(message_class.DESCRIPTOR.name)
     if detached is not None and fields is not None and len(data) >= LARGE_FILE:
-        data = detached.without(data, fields)
-    check_size(message_class, data)
+        content = detached.without(data, fields)
+    else:
+        content = bytes(data)
+    check_size(message_class, content)
     message = message_class()
     try:
-        message.ParseFromString(data)
+        message.ParseFromString(content)
     except DecodeError as error:
         raise DamagedFileError(
             f"this is not a whole {what}",

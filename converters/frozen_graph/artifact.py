@@ -21,6 +21,7 @@ from converters.frozen_graph.subgraph import subgraph
 from converters.graph.nodes import Node, node_of
 from converters.graph.ops.table import is_fed
 from converters.inner import Feeds, InnerTensors, Loaded, own_names
+from converters.mapped import Mapped
 
 
 def ports(path: Path) -> Ports:
@@ -38,7 +39,7 @@ def _dims(node: Node) -> Dims | None:
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     """Those of a ``.bytes``."""
-    graph = schema.parse(schema.GraphDef, loaded.path.read_bytes(), "GraphDef", Detached())  # for its names alone
+    graph = schema.parse(schema.GraphDef, Mapped().read(loaded.path), "GraphDef", Detached())  # for its names
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         """TensorFlow 1.x refuses to fetch what it is fed, by the same name: it is what was fed."""

@@ -17,6 +17,7 @@ from converters.fetch import read_bytes
 from converters.folders import scratch_folder
 from converters.format import Port, Ports
 from converters.inner import Feeds, InnerTensors, Loaded, View
+from converters.mapped import Mapped
 from converters.onnx.messages import CONTRACT_KEY, files_of
 from converters.onnx.proto import array_of, decoded, dtype_name, load_external
 from converters.onnx.tensor_map import TENSORS_KEY, loads
@@ -46,9 +47,9 @@ def held(path: Path) -> str | None:
 @contextmanager
 def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     """Those of a model, in the same runtime; its values are found by the map that the writer left in it."""
-    detached = Detached()
-    model = decoded(read_bytes(loaded.path), detached)
-    load_external([model.graph], loaded.path.parent, detached)
+    detached, files = Detached(), Mapped()
+    model = decoded(files.read(loaded.path), detached)
+    load_external([model.graph], loaded.path.parent, detached, files.read)
     graph = model.graph
     names = loads({p.key: p.value for p in model.metadata_props}.get(TENSORS_KEY, ""))
     constants = {t.name for t in graph.initializer}
@@ -60,6 +61,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         return found if found is not None and found.name in made | constants | fed else None
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        files.let_go()  # what was fetched before, tensor for tensor
         values = {t.name: array_of(t, detached) for t in graph.initializer if t.name in fetch}
         values.update({name: feeds[name] for name in fetch if name in fed})
         wanted = [name for name in fetch if name in made]

@@ -7,7 +7,7 @@ data is read from the model's own folder only.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,16 +39,15 @@ _STORED = {t.onnx: (t.dtype, _FIELD.get(t.onnx, "int32_data")) for t in DATA_TYP
 _FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "strings"}
 
 
-def decoded(data: bytes, detached: Detached | None = None) -> Any:
+def decoded(data: bytes | memoryview, detached: Detached | None = None) -> Any:
     """The ModelProto in ``data``, all of whose names are text. Of a large one ``detached`` is given the weights' bytes.
 
     Raises DamagedFileError, NotAPolicyError where it has too many parts.
     """
-    if detached is not None and len(data) >= LARGE_FILE:
-        data = detached.without(data, _CONTENTS)
-    check_size(ModelProto, data)
+    content = bytes(data) if detached is None or len(data) < LARGE_FILE else detached.without(data, _CONTENTS)
+    check_size(ModelProto, content)
     try:
-        model = ModelProto.FromString(data)
+        model = ModelProto.FromString(content)
         model.DiscardUnknownFields()  # what no reader knows is handed to no runtime
     except DecodeError as error:
         raise DamagedFileError(
@@ -203,17 +202,22 @@ def tensors(part: Any) -> Iterator[Any]:
     return inside(part, "TensorProto")
 
 
-def load_external(parts: Iterable[Any], folder: Path, detached: Detached | None = None) -> list[Path]:
+def load_external(
+    parts: Iterable[Any],
+    folder: Path,
+    detached: Detached | None = None,
+    read: Callable[..., bytes | memoryview] = read_bytes,
+) -> list[Path]:
     """Bring data that lies in files beside the model into the tensors of its graph and functions (large ones are
-    ``detached``); returns the files.
+    ``detached``); returns the files. ``read`` opens one, as ``read_bytes`` does.
 
     Raises DamagedFileError where a file is missing, too short, or outside of ``folder``, or all are too large.
     """
-    files: dict[Path, bytes] = {}
+    files: dict[Path, bytes | memoryview] = {}
     total = 0
     for tensor in (t for part in parts for t in tensors(part)):
         if tensor.data_location == _EXTERNAL:
-            total += _bring(tensor, folder, files, detached)
+            total += _bring(tensor, folder, files, detached, read)
             if total > MAX_WEIGHTS:
                 raise _damaged(tensor.name, f"the model's weights together are larger than {MAX_WEIGHTS >> 30} GiB")
             if total > _MAX_TIMES * sum(map(len, files.values())):
@@ -221,14 +225,20 @@ def load_external(parts: Iterable[Any], folder: Path, detached: Detached | None 
     return sorted(files)
 
 
-def _bring(tensor: Any, folder: Path, files: dict[Path, bytes], detached: Detached | None) -> int:
+def _bring(
+    tensor: Any,
+    folder: Path,
+    files: dict[Path, bytes | memoryview],
+    detached: Detached | None,
+    read: Callable[..., bytes | memoryview],
+) -> int:
     entries = {e.key: e.value for e in tensor.external_data}
     path = _inside(folder, entries.get("location", ""), tensor.name)
     if path not in files:
         left = MAX_WEIGHTS - sum(map(len, files.values()))
         if path.stat().st_size >= left:
             raise _damaged(tensor.name, f"the files beside the model are {MAX_WEIGHTS >> 30} GiB or more together")
-        files[path] = read_bytes(path, most=left)
+        files[path] = read(path, most=left)
     data = files[path]
     try:
         offset = int(entries.get("offset") or 0)
@@ -238,7 +248,7 @@ def _bring(tensor: Any, folder: Path, files: dict[Path, bytes], detached: Detach
     if offset < 0 or length < 0 or offset + length > len(data):
         raise _damaged(tensor.name, f"{path.name} has {len(data)} bytes, it wants {length} from {offset} on")
     if detached is None or length < LARGE:
-        tensor.raw_data = data[offset : offset + length]
+        tensor.raw_data = bytes(data[offset : offset + length])
     else:
         tensor.raw_data = detached.mark(np.frombuffer(data, np.uint8, length, offset))
     del tensor.external_data[:]
