@@ -43,21 +43,8 @@ _WITHOUT_ERF = (*FIRST_IMPORTERS, "barracuda-1.4")
 #: What works element by element, so that a Transpose may as well come behind it.
 _ELEMENTWISE = frozenset(
     (
-        "Abs",
-        "Add",
-        "Div",
-        "Elu",
-        "Exp",
-        "LeakyRelu",
-        "Max",
-        "Min",
-        "Mul",
-        "Neg",
-        "Relu",
-        "Selu",
-        "Sigmoid",
-        "Sub",
-        "Tanh",
+        *("Abs", "Add", "Div", "Elu", "Exp", "LeakyRelu", "Max", "Min"),
+        *("Mul", "Neg", "Relu", "Selu", "Sigmoid", "Sub", "Tanh"),
     )
 )
 PRODUCER = "export-model"

@@ -106,16 +106,12 @@ def _softmax(op: Op, net: Importer) -> str:
     dims = net.shape(x)
     whole = op.opset < 13
     axis = net.axis(x, op.integer("axis", 1 if whole else -1)) if dims else 0
-    last = len(dims) - 1
-    if whole and axis < last:
+    if whole and axis < len(dims) - 1:
         size = product(dims[axis:], net.symbols)
         if not isinstance(size, int):
             raise op.refused("it is taken over axes whose lengths are not known")
         return net.reshape(net.add(op.kind, [net.reshape(x, (-1, size))]), dims)
-    order = [i for i in range(len(dims)) if i != axis] + [axis]
-    turned = net.transpose(x, order)
-    value = reduction.over_last_axis(net, op.kind, turned)
-    return net.transpose(value, [order.index(i) for i in range(len(dims))]) if axis != last else value
+    return moved_back(net, reduction.over_last_axis(net, op.kind, last(net, x, axis)), axis)
 
 
 def _hardmax(op: Op, net: Importer) -> str:

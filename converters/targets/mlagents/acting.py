@@ -33,14 +33,9 @@ def heads(dressing: Dressing) -> Heads:
     signature = dressing.policy.signature
     own = [s for s in signature.outputs if s.name in _HEADS or s.name.rpartition("/")[2] in _HEADS]
     return Heads(
-        next((s for s in own if s.role is Role.CONTINUOUS or _is_continuous(dressing, s)), None),
-        next((s for s in own if s.role in _DISCRETE and not _is_continuous(dressing, s)), None),
+        next((s for s in own if s.is_continuous), None),
+        next((s for s in own if s.role in _DISCRETE and not s.is_continuous), None),
     )
-
-
-def _is_continuous(dressing: Dressing, spec: TensorSpec) -> bool:
-    """``--deterministic`` makes a continuous action one without chance."""
-    return spec.role is Role.CONTINUOUS or (spec.role is Role.DETERMINISTIC and spec.dtype.startswith("float"))
 
 
 def continuous_rows(dressing: Dressing, spec: TensorSpec) -> tuple[str, str, int]:
@@ -84,7 +79,8 @@ def branches(dressing: Dressing, spec: TensorSpec, masks: str | None, *, masked:
     samples = best = None
     if masks is None and masked:
         masks = supply_masks(dressing, sum(sizes))
-        scores = tuple(_masked(dressing, score, masks, at, size) for score, at, size in _cuts(scores, sizes))
+        own = zip(scores, _starts(sizes), sizes, strict=True)
+        scores = tuple(_masked(dressing, score, masks, at, size) for score, at, size in own)
     else:
         known = {s.name for s in signature.outputs}
         samples = dressing.own(spec.name) if spec.role in (Role.SAMPLED, Role.DETERMINISTIC) else None
@@ -145,9 +141,8 @@ def _columns(dressing: Dressing, tensor: str, count: int) -> str:
     return dressing.builder.cast(row(dressing.builder, tensor, count), INT64)
 
 
-def _cuts(scores: Sequence[str], sizes: Sequence[int]) -> list[tuple[str, int, int]]:
-    starts = [sum(sizes[:i]) for i in range(len(sizes))]
-    return list(zip(scores, starts, sizes, strict=True))
+def _starts(sizes: Sequence[int]) -> list[int]:
+    return [sum(sizes[:i]) for i in range(len(sizes))]
 
 
 def _masked(dressing: Dressing, score: str, masks: str, at: int, size: int) -> str:
@@ -189,8 +184,7 @@ def _scores(dressing: Dressing, spec: TensorSpec) -> tuple[tuple[str, ...], tupl
     lengths = [w for w in widths if isinstance(w, int)]
     found = tuple(_as_rows(dressing, spec, b, n) for b, n in zip(found, lengths, strict=True))
     if len(found) == 1 and sizes and len(sizes) > 1 and sum(sizes) <= lengths[0]:
-        starts = [sum(sizes[:i]) for i in range(len(sizes))]
-        found = tuple(builder.slice(found[0], 1, at, at + n) for at, n in zip(starts, sizes, strict=True))
+        found = tuple(builder.slice(found[0], 1, at, at + n) for at, n in zip(_starts(sizes), sizes, strict=True))
         lengths = list(sizes)
     if spec.role is Role.PROBS:
         found = tuple(builder.add("Log", [b], "log_probabilities") for b in found)

@@ -83,13 +83,12 @@ def _acted(
 ) -> Iterator[Mapping[str, np.ndarray]]:
     """The answers to each step; a memory is empty before the first, and is fed back from then on."""
     memory = signature.memory
-    fed = "" if memory is None or memory.input is None else memory.input
-    kept = "" if memory is None or memory.output is None else memory.output
+    fed, kept = (None, None) if memory is None else (memory.input, memory.output)
     carried: dict[str, np.ndarray] = {fed: np.zeros_like(steps[0].feeds[fed])} if fed else {}
     for step in steps:
         answers = ask({**step.feeds, **carried})
         yield answers
-        if fed and kept in answers:
+        if fed and kept is not None and kept in answers:
             carried = {fed: answers[kept]}
 
 
