@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -239,26 +240,28 @@ def swish(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 def subtract(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A − b; −b + a where a is a constant or is repeated."""
-    pair = _pair(b, args)
-    first, second = pair.names
-    if pair.full(0) and pair.arrays[0] is None:
-        return pair.made(b.two(LayerType.SUB, first, second))
-    negative = b.scaled(second, -1, "negative")
-    ordered = (negative, first) if pair.full(1) else (first, negative)
-    return pair.made(_two(b, pair, LayerType.ADD, *ordered))
+    return _undone(b, args, LayerType.SUB, LayerType.ADD, lambda x: b.scaled(x, -1, "negative"))
 
 
 def divide(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A / b; the reciprocal of b times a where a is a constant or is repeated."""
     if b.type_of(b.node.inputs[0]).dtype.kind != "f":
         raise b.refused("it divides integers", "a .nn knows floats alone")
+    reciprocal = partial(b.activation, Activation.RECIPROCAL, label="reciprocal")
+    return _undone(b, args, LayerType.DIV, LayerType.MUL, reciprocal)
+
+
+def _undone(
+    b: NnBuilder, args: Sequence[Value], kind: LayerType, other: LayerType, turned: Callable[[str], str]
+) -> Value:
+    """``kind`` of two operands, or ``other`` of the first and the second ``turned``, which may change places."""
     pair = _pair(b, args)
     first, second = pair.names
     if pair.full(0) and pair.arrays[0] is None:
-        return pair.made(b.two(LayerType.DIV, first, second))
-    inverse = b.activation(Activation.RECIPROCAL, second, label="reciprocal")
-    ordered = (inverse, first) if pair.full(1) else (first, inverse)
-    return pair.made(_two(b, pair, LayerType.MUL, *ordered))
+        return pair.made(b.two(kind, first, second))
+    second = turned(second)
+    ordered = (second, first) if pair.full(1) else (first, second)
+    return pair.made(_two(b, pair, other, *ordered))
 
 
 def power(b: NnBuilder, args: Sequence[Value]) -> Value:

@@ -156,6 +156,12 @@ class Graph:
             node = self.producer(node.inputs[0])
         return node.value if node.op == "Const" else None
 
+    def is_full_of(self, reference: str, number: float) -> bool:
+        """Whether a tensor is known to hold nothing but ``number``, of however many rows."""
+        node = self.get(node_of(reference))
+        value = None if node is None else self.constant(node.inputs[1] if node.op == "Fill" else reference)
+        return value is not None and bool((value == number).all())
+
     def values(self) -> list[np.ndarray]:
         """Its constants."""
         return [node.value for node in self.nodes if node.value is not None]

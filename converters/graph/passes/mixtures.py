@@ -101,18 +101,12 @@ def _behind(graph: Graph, reference: str) -> Node:
         node = graph.producer(reference)
         if passes_on(node) or node.op == "Cast" or clips_nothing(graph, node, _width):
             reference = node.inputs[0]
-        elif node.op == "Mul" and (shown := [r for r in node.inputs if not _is_ones(graph, r)]) and len(shown) == 1:
+        elif node.op == "Mul" and (shown := [r for r in node.inputs if not graph.is_full_of(r, 1)]) and len(shown) == 1:
             (reference,) = shown
-        elif node.op == "Add" and _is_zero(graph, node.inputs[1]):
+        elif node.op == "Add" and graph.is_full_of(node.inputs[1], 0):
             reference = node.inputs[0]
         else:
             return node
-
-
-def _is_ones(graph: Graph, reference: str) -> bool:
-    node = graph.producer(reference)
-    value = graph.constant(node.inputs[1] if node.op == "Fill" else reference)
-    return value is not None and bool((value == 1).all())
 
 
 def _width(graph: Graph, reference: str) -> int | None:
@@ -160,11 +154,6 @@ def _equally_likely(graph: Graph, node: Node) -> _Choice | None:
     count = int(found[0])
     row = np.full((1, count), 1 / count, FLOAT32)
     return _Choice(count, lambda e: e.const(row, f"{_NAME}/equal"), frozenset((found[1],)))
-
-
-def _is_zero(graph: Graph, reference: str) -> bool:
-    value = graph.constant(reference)
-    return value is not None and not value.any()
 
 
 def _scaled_uniform(graph: Graph, reference: str) -> tuple[float, str] | None:

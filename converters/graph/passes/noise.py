@@ -196,16 +196,9 @@ def without_noise(
         editor.nodes.append(Node(name, node.op, tuple(inputs), node.attrs, node.value))
         copies[node.name] = name
         made_of = inputs if node.op == "Add" else op_of(node).moved(inputs) if traits(node).moves else ()
-        if made_of and all(i in zeros or _is_zero(graph, i) for i in made_of):
+        if made_of and all(i in zeros or graph.is_full_of(i, 0) for i in made_of):
             zeros.add(name)
     return editor.graph(), [_moved(r, copies) for r in references]
-
-
-def _is_zero(graph: Graph, reference: str) -> bool:
-    """Whether a tensor is zeros, of however many rows."""
-    node = graph.get(reference)
-    value = None if node is None else graph.constant(node.inputs[1] if node.op == "Fill" else reference)
-    return value is not None and not value.any()
 
 
 def _moved(reference: str, copies: Mapping[str, str]) -> str:
