@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
-
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.types import FLOAT32
@@ -24,7 +22,7 @@ def clipped(graph: Graph, roots: Iterable[str]) -> Graph:
             editor.keep(node)
         elif above[1] <= below[1]:
             left_out.add(inner.name)
-            bounds = [editor.const(np.array(b, FLOAT32), f"{node.name}/bound") for b in (above[1], below[1])]
+            bounds = [editor.floats(b, f"{node.name}/bound") for b in (above[1], below[1])]
             editor.keep(Node(node.name, "ClipByValue", (below[0], *bounds), origin=node.origin))
         else:
             editor.keep(node)

@@ -110,7 +110,7 @@ def add_companions(
 def _joined(editor: Editor, parts: Sequence[str], name: str) -> str:
     if len(parts) == 1:
         return parts[0]
-    axis = editor.const(np.array(1, INT32), f"{name}/axis")
+    axis = editor.ints(1, f"{name}/axis")
     return editor.add("ConcatV2", [*parts, axis], f"{name}/concat")
 
 
@@ -122,7 +122,7 @@ def _argmax(editor: Editor, graph: Graph, branches: Sequence[str], name: str) ->
         if len(shape) > 2 and isinstance(shape[-1], int):  # [B, 1, n]
             row = editor.const(np.array([-1, shape[-1]], INT32), f"{prefix}/row_shape")
             branch = editor.add("Reshape", [branch, row], f"{prefix}/row")
-        axis = editor.const(np.array(1, INT32), f"{prefix}/axis")
+        axis = editor.ints(1, f"{prefix}/axis")
         best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
         columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))
     return _joined(editor, columns, name)
@@ -140,7 +140,7 @@ def _as_columns(editor: Editor, graph: Graph, action: str, name: str) -> str:
 
 
 def _column_shape(editor: Editor, prefix: str) -> str:
-    return editor.const(np.array([-1, 1], np.int32), f"{prefix}/column_shape")
+    return editor.ints([-1, 1], f"{prefix}/column_shape")
 
 
 def leave_out_without_rows(c: Compilation) -> Compilation:

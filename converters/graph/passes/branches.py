@@ -18,7 +18,7 @@ from converters.graph.ops.slicing import strided_steps
 from converters.graph.ops.table import op_of
 from converters.graph.passes.columns import slice_of_columns
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import FLOAT32, INT32
+from converters.graph.types import FLOAT32
 
 #: Columns of all parts together, for sums of parts: they are a product with as many rows.
 _MOST_SUMMED = 64
@@ -148,8 +148,8 @@ class _Joining:
         alone = any(op_of(reader).elementwise and len(reader.inputs) == 1 for reader in readers)
         widths = [self._width(r) or 0 for r in group]
         if not alone:
-            sizes = self.editor.const(np.array(widths, INT32), f"{value}/sizes")
-            axis = self.editor.const(np.array(1, INT32), f"{value}/axis")
+            sizes = self.editor.ints(widths, f"{value}/sizes")
+            axis = self.editor.ints(1, f"{value}/axis")
             pieces = self.editor.add("SplitV", [value, sizes, axis], f"{value}/parts", num_split=len(group))
         first = 0
         for index, (part, width) in enumerate(zip(group, widths, strict=True)):
@@ -157,7 +157,7 @@ class _Joining:
             first += width
 
     def _columns(self, value: str, first: int, last: int) -> str:
-        bounds = [self.editor.const(np.array(b, INT32), f"{value}/bound") for b in ((0, first), (0, last), (1, 1))]
+        bounds = [self.editor.ints(b, f"{value}/bound") for b in ((0, first), (0, last), (1, 1))]
         return self.editor.add("StridedSlice", [value, *bounds], f"{value}/part", begin_mask=1, end_mask=1)
 
     def _width(self, reference: str) -> int | None:
@@ -172,7 +172,7 @@ class _Joining:
         if whole is not None:
             return whole, True
         if parts not in self.made_of:
-            axis = self.editor.const(np.array(1, INT32), f"{node_of(parts[0])}/axis")
+            axis = self.editor.ints(1, f"{node_of(parts[0])}/axis")
             self.made_of[parts] = self.editor.add("ConcatV2", [*parts, axis], f"{node_of(parts[0])}/joined")
         return self.made_of[parts], False
 
@@ -330,8 +330,8 @@ class _Joining:
         if max(classes, default=0) > np.iinfo(self.types[source].dtype).max:
             return None
         editor, name = self.editor, nodes[0].name
-        axis = editor.const(np.array(1, INT32), f"{name}/axis")
-        indices = editor.const(np.array(columns, INT32), f"{name}/columns")
+        axis = editor.ints(1, f"{name}/axis")
+        indices = editor.ints(columns, f"{name}/columns")
         taken = editor.add("GatherV2", [source, indices, axis], f"{name}/taken")
         numbers = editor.const(np.array(classes, self.types[source].dtype), f"{name}/classes")
         equal = editor.add("Equal", [taken, numbers], f"{name}/equal")

@@ -100,7 +100,7 @@ def _batch_size(editor: Editor, graph: Graph, node: Node, observation: str) -> s
     """Shape(observation)[0]: a scalar, or a vector of one where the graph uses it as one."""
     wants_vector = batch_size_rank(graph, node) == 1
     shape = editor.add("Shape", [observation], f"{node.name}/shape", out_type=INT32)
-    bounds = [editor.const(np.array([v], np.int32), f"{node.name}/{k}") for k, v in (("b", 0), ("e", 1), ("s", 1))]
+    bounds = [editor.ints([v], f"{node.name}/{k}") for k, v in (("b", 0), ("e", 1), ("s", 1))]
     return editor.add(
         "StridedSlice", [shape, *bounds], f"{node.name}/derived", shrink_axis_mask=0 if wants_vector else 1
     )

@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 
-import numpy as np
-
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, split_ref
 from converters.graph.options import CompileOptions
@@ -149,7 +147,7 @@ def _rewritten(graph: Graph, memories: Sequence[SeparateMemory], origins: Mappin
     if len(columns) == 1:
         given = editor.add("Identity", columns, name, origin)
     else:
-        axis = editor.const(np.array(1, np.int32), f"{name}/axis")
+        axis = editor.ints(1, f"{name}/axis")
         given = editor.add("ConcatV2", [*columns, axis], name, origin)
     return editor.graph(), taken, given
 
@@ -159,17 +157,17 @@ def _split(editor: Editor, taken: str, memory: SeparateMemory, bounds: tuple[int
     part, name, shape = taken, memory.input, memory.taken
     if count > 1:
         numbers = {"begin": [0, bounds[0]], "end": [0, bounds[1]], "steps": [1, 1]}
-        operands = [editor.const(np.array(v, np.int32), f"{name}/{k}") for k, v in numbers.items()]
+        operands = [editor.ints(v, f"{name}/{k}") for k, v in numbers.items()]
         part = editor.add("StridedSlice", [taken, *operands], f"{name}/columns", begin_mask=1, end_mask=1)
     axis = shape.index(None)
     rest = [d for d in shape if d is not None]
     before = math.prod(rest[:axis])
     if len(shape) > 2:
         dims = [-1 if d is None else d for d in shape] if before == 1 else [-1, *rest]
-        part = editor.add("Reshape", [part, editor.const(np.array(dims, np.int32), f"{name}/shape")], f"{name}/rows")
+        part = editor.add("Reshape", [part, editor.ints(dims, f"{name}/shape")], f"{name}/rows")
     if before != 1:
         order = [*range(1, axis + 1), 0, *range(axis + 1, len(shape))]
-        part = editor.add("Transpose", [part, editor.const(np.array(order, np.int32), f"{name}/order")], f"{name}/part")
+        part = editor.add("Transpose", [part, editor.ints(order, f"{name}/order")], f"{name}/part")
     return editor.add("Identity", [part], f"{name}/given", origin)
 
 
@@ -180,10 +178,10 @@ def _columns(editor: Editor, memory: SeparateMemory) -> str:
     rest = [d for d in shape if d is not None]
     if math.prod(rest[:axis]) != 1:
         order = [axis, *(i for i in range(len(shape)) if i != axis)]
-        part = editor.add("Transpose", [part, editor.const(np.array(order, np.int32), f"{name}/order")], f"{name}/rows")
+        part = editor.add("Transpose", [part, editor.ints(order, f"{name}/order")], f"{name}/rows")
     if shape[1:] == (_size(shape),):
         return part
-    dims = editor.const(np.array([-1, _size(shape)], np.int32), f"{name}/shape")
+    dims = editor.ints([-1, _size(shape)], f"{name}/shape")
     return editor.add("Reshape", [part, dims], f"{name}/columns")
 
 

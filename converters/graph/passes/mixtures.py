@@ -47,9 +47,9 @@ def settle_mixtures(c: Compilation) -> Compilation:
         editor = Editor(c.graph)
         for node in c.graph.nodes:
             editor.keep(node)
-        tiny = editor.const(np.array(_NEVER, FLOAT32), f"{_NAME}/never")
+        tiny = editor.floats(_NEVER, f"{_NAME}/never")
         likely = editor.add("Maximum", [choice.write(editor), tiny], f"{_NAME}/likely")
-        one = editor.const(np.array(1, np.int32), f"{_NAME}/count")
+        one = editor.ints(1, f"{_NAME}/count")
         drawn = editor.add(
             "Multinomial",
             [editor.add("Log", [likely], f"{_NAME}/log"), one],
@@ -61,9 +61,7 @@ def settle_mixtures(c: Compilation) -> Compilation:
         if kind.dtype != INT64:
             drawn = editor.add("Cast", [drawn], f"{_NAME}/cast", DstT=kind.dtype)
         if kind.rank == 1:
-            drawn = editor.add(
-                "Reshape", [drawn, editor.const(np.array([-1], np.int32), f"{_NAME}/row")], f"{_NAME}/row"
-            )
+            drawn = editor.add("Reshape", [drawn, editor.ints([-1], f"{_NAME}/row")], f"{_NAME}/row")
         note = (
             f"{head.name} is by chance one of two, which the source draws one after the other (epsilon-greedy): it is "
             "drawn at once here, from the same probabilities, which the source has no tensor of to compare with"
@@ -88,7 +86,7 @@ def _mixture(graph: Graph, reference: str) -> _Choice | None:
     def write(editor: Editor) -> str:
         parts = []
         for choice, factor in ((first, rate), (second, 1 - rate)):
-            weight = editor.const(np.array(factor, FLOAT32), f"{_NAME}/share")
+            weight = editor.floats(factor, f"{_NAME}/share")
             parts.append(editor.add("Mul", [choice.write(editor), weight], f"{_NAME}/part"))
         return editor.add("Add", parts, f"{_NAME}/odds")
 

@@ -73,9 +73,9 @@ def settle_single_draws(c: Compilation) -> Compilation:
         if node.name not in single:
             editor.keep(node)
             continue
-        axis = editor.const(np.array(1, np.int32), f"{node.name}/axis")
+        axis = editor.ints(1, f"{node.name}/axis")
         best = editor.add("ArgMax", [node.inputs[0], axis], f"{node.name}/only", output_type=node.attrs["output_dtype"])
-        shape = editor.const(np.array([-1, 1], np.int32), f"{node.name}/column_shape")
+        shape = editor.ints([-1, 1], f"{node.name}/column_shape")
         editor.redirect(node.name, editor.add("Reshape", [best, shape], f"{node.name}/column", node.origin))
     fetches = {out: editor.resolve(reference) for out, reference in c.fetches.items()}
     return replace(c, graph=editor.graph(), fetches=fetches)
@@ -150,7 +150,7 @@ def _turned(editor: Editor, node: Node, dims: Sequence[int | None]) -> None:
     rows = editor.add_name(f"{node.name}/rows")
     editor.nodes.append(Node(rows, "Placeholder", attrs=attrs, origin=node.origin))
     if len(others) > 1:
-        shape = editor.const(np.array([-1, *others], INT32), f"{node.name}/shape")
+        shape = editor.ints([-1, *others], f"{node.name}/shape")
         rows = editor.add("Reshape", [rows, shape], f"{node.name}/split")
     order = editor.const(np.array([*range(1, axis + 1), 0, *range(axis + 1, len(dims))], INT32), f"{node.name}/order")
     editor.nodes.append(Node(node.name, "Transpose", (rows, order), attrs={}))

@@ -17,7 +17,6 @@ from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, split_ref
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import INT32
 
 #: (a tensor, the order in which its axes are read)
 _Turned = tuple[str, tuple[int, ...]]
@@ -60,7 +59,7 @@ class _Sinking:
             if list(order) == sorted(order):
                 self.made[name] = base
             else:
-                operand = self.editor.const(np.array(order, INT32), f"{name}/order")
+                operand = self.editor.ints(order, f"{name}/order")
                 origin = self.graph[name].origin
                 self.editor.nodes.append(Node(name, "Transpose", (base, operand), origin=origin))
                 self.made[name] = name

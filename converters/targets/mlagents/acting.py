@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.types import FLOAT32, INT32, INT64
+from converters.graph.types import FLOAT32, INT64
 from converters.targets.mlagents.dressing import Dressing, row
 from converters.targets.mlagents.feeding import supply_masks
 from converters.understand.action import action_meaning
@@ -134,7 +134,7 @@ def _settled(dressing: Dressing, score: str) -> str:
 def _best(dressing: Dressing, score: str) -> str:
     builder = dressing.builder
     found = builder.add("ArgMax", [score, builder.ints(1, "axis")], "best", output_type=INT64)
-    return builder.add("Reshape", [found, builder.const(np.array([-1, 1], INT32), "column")], "best_column")
+    return builder.add("Reshape", [found, builder.ints([-1, 1], "column")], "best_column")
 
 
 def _columns(dressing: Dressing, tensor: str, count: int) -> str:
@@ -165,7 +165,7 @@ def _as_rows(dressing: Dressing, spec: TensorSpec, scores: str, width: int) -> s
             why="a branch has one row of scores for each agent",
             fix="export the model with the logits or log-probabilities as its output: --output NAME=log_probs",
         )
-    return builder.add("Reshape", [scores, builder.const(np.array([-1, width], INT32), "rows")], "scores")
+    return builder.add("Reshape", [scores, builder.ints([-1, width], "rows")], "scores")
 
 
 def _scores(dressing: Dressing, spec: TensorSpec) -> tuple[tuple[str, ...], tuple[int, ...]]:

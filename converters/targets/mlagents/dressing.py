@@ -18,7 +18,7 @@ from converters.graph.passes.fold import fold
 from converters.graph.passes.naming import name_tensors
 from converters.graph.passes.simplify import collapse_views, drop_identities
 from converters.graph.passes.transposes import cancel_transposes
-from converters.graph.types import FLOAT32, INT32, static_shape
+from converters.graph.types import FLOAT32, static_shape
 from converters.policy import Policy
 from converters.targets.profile import refused
 from converters.understand.signature import LIFTED
@@ -165,4 +165,4 @@ def row(builder: Builder, tensor: str, width: int) -> str:
     """A tensor as [B, width]."""
     if builder.shape(tensor)[1:] == (width,):
         return tensor
-    return builder.add("Reshape", [tensor, builder.const(np.array([-1, width], INT32), "row")])
+    return builder.add("Reshape", [tensor, builder.ints([-1, width], "row")])
