@@ -17,7 +17,7 @@ from converters.checkpoint.tensor_bundle import Extents, several
 from converters.checkpoint.training_graph import Saved, TrainingGraph
 from converters.detached import Detached
 from converters.frozen_graph.tensors import constant
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, topological
+from converters.graph.nodes import Graph, NameScope, Node, node_of, topological
 from converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
 from converters.understand.brains import depends_on_input, find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
@@ -126,8 +126,7 @@ def _place(node: Node, training: TrainingGraph, checkpoint: Values | None) -> Sa
 
 def _checked(node: Node, value: np.ndarray, checkpoint: Values) -> np.ndarray:
     """The value, if it has the variable's dtype and shape."""
-    dtype, shape = node.attrs.get("dtype"), node.attrs.get("shape")
-    dims = shape.dims if isinstance(shape, TensorShape) else None
+    dtype, dims = node.attrs.get("dtype"), node.dims
     fits = dims is None or (
         len(dims) == value.ndim and all(d is None or d == n for d, n in zip(dims, value.shape, strict=True))
     )

@@ -15,10 +15,10 @@ import numpy as np
 from converters import schema
 from converters.detached import Detached
 from converters.fetch import read_bytes
-from converters.format import Dims, Port, Ports
+from converters.format import Port, Ports
 from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.frozen_graph.subgraph import subgraph
-from converters.graph.nodes import Node, node_of
+from converters.graph.nodes import node_of
 from converters.graph.ops.table import is_fed
 from converters.inner import Feeds, InnerTensors, Loaded, own_names
 from converters.mapped import Mapped
@@ -28,13 +28,8 @@ def ports(path: Path) -> Ports:
     """The ports of a file. Raises SourceError, DamagedFileError, GraphError."""
     graph = read_graph(read_bytes(path))
     places = [n for n in graph.nodes if is_fed(n)]
-    inputs = tuple(Port(n.name, n.attrs["dtype"].name if "dtype" in n.attrs else None, _dims(n)) for n in places)
+    inputs = tuple(Port(n.name, n.attrs["dtype"].name if "dtype" in n.attrs else None, n.dims) for n in places)
     return Ports(path, inputs, tuple(Port(n.name) for n in graph.nodes), {"kind": "graph"}, open=True)
-
-
-def _dims(node: Node) -> Dims | None:
-    shape = node.attrs.get("shape")
-    return None if shape is None or shape.dims is None else tuple(shape.dims)
 
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:

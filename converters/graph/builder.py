@@ -19,7 +19,7 @@ from converters.graph.allowance import MAX_MADE, Allowance
 from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE, op_of
-from converters.graph.shapes import Types, add_types
+from converters.graph.shapes import Types, add_types, outputs_of
 from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
 
@@ -144,10 +144,7 @@ class Builder:
 
     def outputs(self, name: str) -> int:
         """How many outputs a node has."""
-        count = 1
-        while ref(name, count) in self.types:
-            count += 1
-        return count
+        return outputs_of(self.types, name)
 
     def type_of(self, reference: str) -> TensorType:
         """dtype, shape and value as far as they are known."""

@@ -49,6 +49,12 @@ class Node:
         init=False, repr=False, compare=False, default=None
     )
 
+    @property
+    def dims(self) -> tuple[int | None, ...] | None:
+        """The lengths of a placeholder's or a variable's axes, None if the graph does not say."""
+        shape = self.attrs.get("shape")
+        return shape.dims if isinstance(shape, TensorShape) else None
+
     def with_inputs(self, inputs: Iterable[str]) -> Node:
         """The same node fed from other tensors."""
         return self.moved(self.name, inputs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from functools import cache
+from itertools import count
 from math import inf
 
 import numpy as np
@@ -56,6 +57,11 @@ def _inferred(graph: Graph, partial: bool) -> Types:
         else:
             add_types(types, node, symbols, allowance)
     return types
+
+
+def outputs_of(types: Mapping[str, TensorType], name: str) -> int:
+    """How many outputs a node has."""
+    return next(i for i in count(1) if ref(name, i) not in types)
 
 
 def add_types(types: Types, node: Node, symbols: Symbols, allowance: Allowance) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, TensorShape, downstream, node_of
+from converters.graph.nodes import Graph, Node, downstream, node_of
 from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.understand.brains import Brain, close_names
 from converters.understand.memories import looks_like_state
@@ -77,20 +77,13 @@ def classify_inputs(
     return roles
 
 
-def _dims(node: Node) -> tuple[int | None, ...] | None:
-    """The lengths of a placeholder's axes, None if the graph does not say."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    return None if shape is None else shape.dims
-
-
 def placeholder_rank(node: Node) -> int | None:
     """Number of axes of a placeholder, None if the graph does not say."""
-    dims = _dims(node)
-    return None if dims is None else len(dims)
+    return None if node.dims is None else len(node.dims)
 
 
 def _shape_text(node: Node) -> str:
-    dims, dtype = _dims(node), node.attrs.get("dtype", "")
+    dims, dtype = node.dims, node.attrs.get("dtype", "")
     if dims is None:
         return f"({dtype}, unknown shape)"
     return f"({dtype} [{', '.join('?' if d is None else str(d) for d in dims)}])"
@@ -157,13 +150,13 @@ def _by_structure(
 
 def _has_time_first(node: Node) -> bool:
     """Whether a placeholder is [T, B, n]."""
-    dims = _dims(node) or ()
+    dims = node.dims or ()
     return len(dims) == 3 and dims[1] is None and None not in (dims[0], dims[2])
 
 
 def _has_rows(node: Node) -> bool:
     """Whether a placeholder is [B, n] or [B, T, n]; a single number a row may be a flag that resets the memory."""
-    dims = _dims(node) or ()
+    dims = node.dims or ()
     return len(dims) in (2, 3) and dims[0] is None and dims[-1] is not None and (dims[-1] > 1 or len(dims) > 2)
 
 
@@ -180,7 +173,7 @@ def _undecided(nodes: Sequence[Node]) -> SignatureError:
 
 def _is_free(node: Node) -> bool:
     """Whether the first axis of a placeholder is that of the agents, and it is [B] or [B, n]."""
-    dims = _dims(node) or ()
+    dims = node.dims or ()
     return len(dims) in (1, 2) and dims[0] is None
 
 

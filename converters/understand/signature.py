@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from converters.graph.compilation import Compilation
-from converters.graph.nodes import Graph, Node, TensorShape, node_of, split_ref
+from converters.graph.nodes import Graph, Node, node_of, split_ref
 from converters.graph.passes.inputs import batch_size_rank, constant_value
 from converters.graph.passes.noise import tensor_of
 from converters.graph.shapes import Types, infer_types
@@ -280,14 +280,13 @@ def _inputs(compiled: Compilation, types: Types, notes: list[str]) -> tuple[dict
 
 
 def _known_shape(node: Node) -> tuple[int | None, ...]:
-    shape: TensorShape = node.attrs["shape"]
-    if shape.dims is None:
+    if node.dims is None:
         raise SignatureError(
             f"the shape of input {node.name!r} is not known",
             why="the file does not say it, and nothing that reads it tells",
             fix=f"if it has one value for all runs, give it: --set {node.name}=VALUE",
         )
-    return shape.dims
+    return node.dims
 
 
 def _trailing_number(name: str) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from converters.graph.nodes import Graph, Node, TensorShape, topological
+from converters.graph.nodes import Graph, TensorShape, topological
 from converters.graph.ops.table import is_fed
 from converters.graph.passes.normalise import normalise
 from converters.graph.passes.row_trial import check_rows, too_large
@@ -23,7 +23,7 @@ Dims = tuple[int, ...]
 
 def without_agents(graph: Graph) -> bool:
     """Whether all inputs have lengths, and none is free."""
-    fed = [_dims(n) for n in graph.nodes if is_fed(n)]
+    fed = [n.dims for n in graph.nodes if is_fed(n)]
     return any(fed) and all(dims is not None and None not in dims for dims in fed)
 
 
@@ -33,7 +33,7 @@ def for_any_number(graph: Graph, outputs: Sequence[str]) -> tuple[Graph, int] | 
     ``outputs`` are nodes, and keep their names; of what they do not need constants are left.
     """
     upstream = graph.pruned(outputs)
-    fed = {n.name: _dims(n) for n in upstream.nodes if is_fed(n)}
+    fed = {n.name: n.dims for n in upstream.nodes if is_fed(n)}
     if not fed or any(not dims or None in dims for dims in fed.values()):
         return None
     inputs = {name: tuple(d for d in dims or () if d is not None) for name, dims in fed.items()}
@@ -49,11 +49,6 @@ def for_any_number(graph: Graph, outputs: Sequence[str]) -> tuple[Graph, int] | 
     # constants beside the outputs say what a trainer knew of the policy
     constants = (n for n in graph.nodes if not n.inputs and n.name not in upstream and n.name not in made)
     return Graph(topological([*made.nodes, *constants])), rows
-
-
-def _dims(node: Node) -> tuple[int | None, ...] | None:
-    shape = node.attrs.get("shape")
-    return shape.dims if isinstance(shape, TensorShape) else None
 
 
 def _freed(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) -> tuple[Graph, int] | None:

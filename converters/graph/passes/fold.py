@@ -12,8 +12,8 @@ import numpy as np
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, ref
 from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types
-from converters.graph.types import INT32, TensorType
+from converters.graph.shapes import infer_types, outputs_of
+from converters.graph.types import INT32
 
 
 def fold(graph: Graph) -> Graph:
@@ -24,8 +24,7 @@ def fold(graph: Graph) -> Graph:
         if op_of(node).start:
             editor.keep(node)
             continue
-        count = op_of(node).outputs if op_of(node).outputs > 0 else _outputs(types, node.name)
-        constants = [types[ref(node.name, i)].constant for i in range(count)]
+        constants = [types[ref(node.name, i)].constant for i in range(outputs_of(types, node.name))]
         if all(c is not None for c in constants):
             for i, constant in enumerate(constants):
                 assert constant is not None
@@ -45,10 +44,3 @@ def fold(graph: Graph) -> Graph:
         else:
             editor.keep(node)
     return editor.graph()
-
-
-def _outputs(types: dict[str, TensorType], name: str) -> int:
-    count = 1
-    while ref(name, count) in types:
-        count += 1
-    return count

@@ -42,8 +42,7 @@ def set_values(graph: Graph, values: Mapping[str, float]) -> Graph:
 
 def constant_value(node: Node, value: float) -> np.ndarray:
     """The array that a placeholder with one fixed value stands for (free axes: length 1)."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    dims = () if shape is None or shape.dims is None else tuple(1 if d is None else d for d in shape.dims)
+    dims = tuple(1 if d is None else d for d in node.dims or ())
     dtype = node.attrs["dtype"]
     if math.prod(dims) > MAX_ELEMENTS:
         raise GraphError(

@@ -187,8 +187,7 @@ def _columns(editor: Editor, memory: SeparateMemory) -> str:
 
 def _has_rows_first(node: Node) -> bool:
     """Whether a placeholder's batch is its first axis, as a memory's is."""
-    shape: TensorShape | None = node.attrs.get("shape")
-    return shape is None or not shape.dims or shape.dims[0] is None
+    return not node.dims or node.dims[0] is None
 
 
 def _size(shape: Sequence[int | None]) -> int:
