@@ -17,11 +17,14 @@ _FROM = 2 * MAX_FIELDS
 #: Numbers in one field are in a byte each in the file, and in eight in memory; eight of these count as a field.
 _PACKED = 3  # a shift
 _MESSAGE, _BYTES = 11, 2
+_MOST = (1 << 64) - 1
 #: FieldDescriptor.type of what is written as a varint: int64, uint64, int32, bool, uint32, enum, sint32, sint64.
 _VARINTS = frozenset((3, 4, 5, 8, 13, 14, 17, 18))
 #: Tag → the same of the message that the field holds; None: numbers.
 Table: TypeAlias = "dict[int, Table | None]"
 _TABLES: dict[str, Table] = {}
+#: That of a group, which none of our messages has: protobuf passes over it whatever is in it, and reads on behind it.
+_GROUP: Table = {}
 
 
 def check_size(message_class: Any, data: bytes) -> None:
@@ -44,7 +47,7 @@ def fields_of(data: bytes, table: Table, most: int) -> int:
     try:
         for count in range(1, most + 2):
             while at >= end:
-                if at > end or not ends:
+                if at > end or not ends or table is _GROUP:
                     return count - 1 + weight
                 end, table = ends.pop()
             tag = data[at]
@@ -83,7 +86,14 @@ def fields_of(data: bytes, table: Table, most: int) -> int:
                 at += 4
             elif wire == 1:
                 at += 8
-            elif wire > 5:
+            elif wire == 3:
+                ends.append((end, table))
+                table = _GROUP
+            elif table is not _GROUP:  # the end of no group, or no type of a field
+                return count + weight
+            elif wire == 4:
+                end, table = ends.pop()
+            else:
                 return count + weight
     except IndexError:  # cut off
         pass
@@ -97,7 +107,7 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
         at += 1
         value |= (byte & 0x7F) << shift
         if byte <= 0x7F:
-            return value, at
+            return value & _MOST, at  # as protobuf in Python has it; in C it refuses what is cut here
         shift += 7
         if shift > 63:
             raise IndexError

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from google.protobuf.message import DecodeError
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from converters import counting, schema
@@ -75,6 +76,30 @@ def test_a_command_says_so(name: str, tmp_path: Path) -> None:
     content = next(c for called, c in FILES.values() if called == name)
     (tmp_path / name).write_bytes(content())
     is_refused(export_model("inspect", tmp_path / name), name, "parts", "export the policy alone")
+
+
+#: What protobuf passes over or reads, at least where it works in Python, and what could be taken for damage.
+IN_FRONT = {
+    "a group with what is no node": b"\xc3\x3e" + b"\x0a\x01\x07" + b"\xc4\x3e",
+    "a group in a group": b"\xc3\x3e\x0b\x0a\x02\x0a\x05\x0c\xc4\x3e",
+    "a length of 65 bits": b"\x0a" + b"\x80" * 9 + b"\x02",
+}
+
+
+@pytest.mark.parametrize("name", IN_FRONT)
+def test_what_stands_in_front_does_not_hide_the_rest(name: str) -> None:
+    table = counting._table(schema.GraphDef.DESCRIPTOR)
+    found = fields_of(IN_FRONT[name] + b"\x0a\0" * 1000, table, 1 << 20)
+    assert 1000 < found < 1010
+    if "group" in name:
+        assert len(schema.GraphDef.FromString(IN_FRONT[name] + b"\x0a\0" * 1000).node) == 1000
+
+
+@pytest.mark.parametrize("damage", [b"\x0c", b"\x0b\x0f\x0c", b"\x0f", b"\x0a\x02\x0b\x0b"])
+def test_the_count_ends_where_protobuf_refuses(damage: bytes) -> None:
+    assert fields_of(damage + b"\x0a\0" * 1000, counting._table(schema.GraphDef.DESCRIPTOR), 1 << 20) < 5
+    with pytest.raises(DecodeError):
+        schema.GraphDef.FromString(damage + b"\x0a\0" * 1000)
 
 
 #: A message that knows no field: what protobuf makes of each is what is in the file.
