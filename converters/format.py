@@ -207,7 +207,10 @@ class Format:
     def artifact(self, policy: Policy, options: WriteOptions) -> Artifact:
         """The policy in this format, which has a writer. Raises GraphError and its like where it cannot be."""
         assert self.write is not None, f"{self.key} is not written"
-        return Artifact(self, policy.name, self.write(policy, options))
+        import numpy as np
+
+        with np.errstate(all="ignore"):  # weights may be any numbers
+            return Artifact(self, policy.name, self.write(policy, options))
 
     def loader(self, signature: str = "") -> Mapping[str, Any]:
         """What a child process is told beside the path; ``signature`` is the one to call, where it has some."""

@@ -42,11 +42,14 @@ def check_options(found: Format, path: Path, options: ReadOptions) -> None:
 
 def read_models(given: Fetched, found: Format, options: ReadOptions) -> list[SourceModel]:
     """The models of a source. Raises SourceError, GraphError and their kinds, UsageError."""
-    if found.read is not None:
-        return found.read(given, options)
-    members = [_artefact(given.path)] if found.members is None else found.members(given.path, options)
-    inside = replace(options, step=None)
-    return [model for member in members for model in _of_member(member, given, inside)]
+    import numpy as np
+
+    with np.errstate(all="ignore"):  # weights may be any numbers
+        if found.read is not None:
+            return found.read(given, options)
+        members = [_artefact(given.path)] if found.members is None else found.members(given.path, options)
+        inside = replace(options, step=None)
+        return [model for member in members for model in _of_member(member, given, inside)]
 
 
 def _artefact(folder: Path) -> Member:

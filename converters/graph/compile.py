@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from converters.graph.compilation import Compilation, Pass, on_graph, on_inputs, on_tensors
 from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
 from converters.graph.ops.table import is_fed
@@ -72,12 +74,13 @@ def compile_graph(
     Raises NotAPolicyError, SignatureError, UnsupportedOpError, GraphError, UsageError.
     """
     policies = []
-    for label, c in compilations(graph, options or CompileOptions(), facts or SourceFacts()):
-        for step in PASSES:
-            c = step.run(c)
-        assert c.signature is not None
-        own = f"{name}-{label}" if label else name
-        policies.append(Policy(own, c.graph, c.signature, c.feeds, c.fetches, source_map(c)))
+    with np.errstate(all="ignore"):  # weights may be any numbers
+        for label, c in compilations(graph, options or CompileOptions(), facts or SourceFacts()):
+            for step in PASSES:
+                c = step.run(c)
+            assert c.signature is not None
+            own = f"{name}-{label}" if label else name
+            policies.append(Policy(own, c.graph, c.signature, c.feeds, c.fetches, source_map(c)))
     return policies
 
 

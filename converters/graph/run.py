@@ -10,7 +10,7 @@ from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
-from converters.graph.shapes import run_kernel
+from converters.graph.shapes import run_kernel_as_it_is
 from signatures.errors import GraphError
 from signatures.records import dataclass
 
@@ -77,13 +77,14 @@ def run_graph(
     values: dict[str, np.ndarray] = {normal_ref(name): array for name, array in feeds.items()}
     plan = _plan(graph, values, fetch)
     values = {**plan.constants, **values}
-    for entry, node in plan.steps:
-        arguments = [values[r] for r in node.inputs]
-        if jitter is not None:
-            arguments = jitter.operands(entry, arguments)
-        results: Sequence[np.ndarray] = run_kernel(entry, node, arguments)
-        if jitter is not None:
-            results = jitter.results(entry, node, arguments, results)
-        for index, result in enumerate(results):
-            values.setdefault(ref(node.name, index), result)
+    with np.errstate(all="ignore"):  # infinities and NaNs are numbers to a model
+        for entry, node in plan.steps:
+            arguments = [values[r] for r in node.inputs]
+            if jitter is not None:
+                arguments = jitter.operands(entry, arguments)
+            results: Sequence[np.ndarray] = run_kernel_as_it_is(entry, node, arguments)
+            if jitter is not None:
+                results = jitter.results(entry, node, arguments, results)
+            for index, result in enumerate(results):
+                values.setdefault(ref(node.name, index), result)
     return {name: values[normal_ref(name)] for name in fetch}

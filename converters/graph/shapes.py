@@ -184,7 +184,16 @@ def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[Tensor
 
 
 def run_kernel(op: OpDef, node: Node, arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """The outputs of a node's kernel; raises GraphError that names the node."""
+    """The outputs of a node's kernel, without numpy's warnings: infinities and NaNs are numbers to a model.
+
+    Raises GraphError that names the node.
+    """
+    with np.errstate(all="ignore"):
+        return run_kernel_as_it_is(op, node, arrays)
+
+
+def run_kernel_as_it_is(op: OpDef, node: Node, arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """As ``run_kernel``, for who has silenced numpy's warnings for many."""
     assert op.kernel is not None
     try:
         result = op.kernel(node, *arrays)

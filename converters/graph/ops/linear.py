@@ -157,6 +157,13 @@ def _axes(node: Node, axes: np.ndarray, rank: int) -> tuple[int, ...]:
     return tuple(sorted({a + rank if a < 0 else a for a in wanted}))
 
 
+def _mean(x: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
+    """As ``np.mean``, which warns in words where it is of nothing: a NaN."""
+    if x.size:
+        return np.asarray(np.mean(x, axis=axis, keepdims=keepdims))
+    return np.asarray(np.sum(x, axis=axis, keepdims=keepdims) / np.float64(math.prod(x.shape[a] for a in axis)))
+
+
 def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[..., np.ndarray]:
     def kernel(node: Node, x: np.ndarray, axes: np.ndarray) -> np.ndarray:
         work = x.astype(np.float64) if wide and x.dtype.kind == "f" else x
@@ -270,7 +277,7 @@ OPS = (
         (T, Attr("data_format", "str", "NHWC")),
     ),
     _reduce("Sum", np.sum, "ReduceSum", "summed"),
-    _reduce("Mean", np.mean, "ReduceMean", "rounded"),
+    _reduce("Mean", _mean, "ReduceMean", "rounded"),
     _reduce("Prod", np.prod, "ReduceProd", "rounded"),
     _reduce("Max", np.max, "ReduceMax", "exact"),
     _reduce("Min", np.min, "ReduceMin", "exact"),
