@@ -13,6 +13,7 @@ from converters.fetch import Fetched
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.saved_model.signature import exposed
 from converters.source import ReadOptions, SourceModel
+from converters.tfjs.int8 import joined
 from converters.tfjs.reader import content_of, model_file, read_model, weights_of
 from converters.tfjs.unfuse import unfuse
 from signatures.contract import Contract
@@ -29,7 +30,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         graph, facts = exposed(graph, model.signature)
         return [SourceModel(graph, model.files, facts)]
     contract = contract_of(model.contract)
-    graph = _retyped(redrawn(graph, contract), contract)
+    graph = _retyped(redrawn(joined(graph), contract), contract)
     return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]
 
 

@@ -31,11 +31,12 @@ from converters.graph.ops.base import AttrKind
 from converters.graph.ops.table import op_of
 from converters.graph.passes.fuse import fuse
 from converters.graph.passes.lean import lean
-from converters.graph.passes.weights import Storage, are_steps, compact, stored
+from converters.graph.passes.weights import Storage, are_steps, compact
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
 from converters.pieces import Pieces
 from converters.policy import Policy
+from converters.tfjs.int8 import stepped
 from converters.tfjs.shorten import clipped
 from signatures.errors import UnsupportedOpError
 from signatures.spec import TensorSpec
@@ -183,11 +184,8 @@ def _acting() -> Mapping[str, Pieces]:
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
     roots = policy.fetches.values()
-    graph = fuse(
-        clipped(for_tfjs(lean(policy.graph, policy.signature, policy.fetches)), roots), roots, activations=True
-    )
-    if options.weights == "int8":
-        graph = stored(graph, options.weights, casts=False)
+    graph = clipped(for_tfjs(lean(policy.graph, policy.signature, policy.fetches)), roots)
+    graph = fuse(stepped(graph) if options.weights == "int8" else graph, roots, activations=True)
     entries, values = _weights(graph, options.weights)
     shards = _shards(Pieces(*values))
     contract = json.loads(options.contract)

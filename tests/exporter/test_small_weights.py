@@ -9,9 +9,11 @@ import pytest
 
 from converters.format import WriteOptions
 from converters.formats import DEFAULTS, WRITTEN
-from converters.graph.nodes import Graph, Node
-from converters.graph.passes.weights import LEAST, Storage, compact, rounded
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.passes.weights import LEAST, Storage, are_steps, compact, rounded
+from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
+from converters.tfjs.int8 import joined, stepped
 from exporter import export_model, verify_bundle
 from exporter.export.sources import read_source
 from exporter.reports.entry import of_result
@@ -71,6 +73,39 @@ def test_what_needs_every_digit_keeps_it(kept: Graph) -> None:
 def test_what_float16_cannot_hold_stays() -> None:
     large = graph_of(drawn(40, 24) * np.float32(1e6))
     assert rounded(large, "float16")["w"] == large["w"]
+
+
+def test_tensorflow_js_multiplies_the_products_of_layers_and_not_their_matrices() -> None:
+    matrix = rounded(graph_of(drawn(40, 24)), "int8")["w"].value
+    plain = Graph(
+        (
+            Node("x", "Placeholder", attrs={"dtype": np.dtype(np.float32), "shape": TensorShape((None, 40))}),
+            Node("w", "Const", value=matrix),
+            Node("b", "Const", value=drawn(24)),
+            Node("product", "MatMul", ("x", "w"), {"transpose_a": False, "transpose_b": False}),
+            Node("y", "BiasAdd", ("product", "b"), {"data_format": "NHWC"}),
+        )
+    )
+    made = stepped(plain)
+    product = made.producer(made["product"].inputs[0])
+    assert (made["product"].op, product.op) == ("Mul", "MatMul")
+    steps = made[product.inputs[1]].value
+    assert steps is not None and are_steps(steps)
+    x = drawn(5, 40, seed=3)
+    was, now = (run_graph(g, {"x": x}, ["y", "w"]) for g in (plain, made))
+    np.testing.assert_allclose(now["y"], was["y"], rtol=1e-5, atol=1e-5 * np.abs(was["y"]).max())
+    assert now["w"].tobytes() == was["w"].tobytes()  # who looks inside finds it
+    again = joined(made)
+    assert again["product"].op == "MatMul" and again["product"].inputs == ("x", "w")
+    assert run_graph(again, {"x": x}, ["y"])["y"].tobytes() == was["y"].tobytes()
+
+
+def test_a_matrix_that_is_turned_or_read_by_others_is_multiplied_itself() -> None:
+    matrix = rounded(graph_of(drawn(24, 40).T, transpose_b=True), "int8")["w"].value
+    for other in (("y", "MatMul", ("x", "w"), {"transpose_b": True}), ("y", "Square", ("w",), {})):
+        plain = Graph((Node("x", "Placeholder"), Node("w", "Const", value=matrix), Node(*other)))
+        assert stepped(plain)["y"] == plain["y"] and stepped(plain)["w"].op == "Mul"
+        assert joined(stepped(plain))["y"] == plain["y"]
 
 
 @pytest.mark.parametrize("storage", _KEPT)

@@ -39,11 +39,8 @@ def rounded(graph: Graph, storage: Storage) -> Graph:
     return editor.graph()
 
 
-def stored(graph: Graph, storage: Storage, *, casts: bool = True) -> Graph:
-    """The graph with weights that were rounded as constants of fewer bytes, widened under the weights' own names.
-
-    Without ``casts`` the file is what widens them, and the constants stay float32.
-    """
+def stored(graph: Graph, storage: Storage) -> Graph:
+    """The graph with weights that were rounded as constants of fewer bytes, widened under the weights' own names."""
     if storage == "float32":
         return graph
     editor = Editor(graph)
@@ -54,11 +51,11 @@ def stored(graph: Graph, storage: Storage, *, casts: bool = True) -> Graph:
             continue
         narrow, step = found
         cast: dict[str, Any] = {"DstT": FLOAT32, "Truncate": False}
-        wide = editor.const(narrow if casts else narrow.astype(np.float32), f"{node.name}/{storage}")
+        wide = editor.const(narrow, f"{node.name}/{storage}")
         if step is None:
             editor.keep(Node(node.name, "Cast", (wide,), cast, origin=node.origin))
         else:
-            wide = editor.add("Cast", [wide], f"{node.name}/steps", **cast) if casts else wide
+            wide = editor.add("Cast", [wide], f"{node.name}/steps", **cast)
             scale = editor.const(step, f"{node.name}/step")
             editor.keep(Node(node.name, "Mul", (wide, scale), origin=node.origin))
     return editor.graph()
