@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from string import Template
 
@@ -79,6 +80,11 @@ class Bundle:
         """Input → the variable that a snippet keeps for it from step to step."""
         kept = {} if self.memory is None else {self.memory[0].name: "memory"}
         return kept if self.previous is None else {**kept, self.previous.name: "previous"}
+
+    def beginnings(self, line: str, value: Callable[[TensorSpec], str]) -> list[str]:
+        """What declares the variables of ``kept``; ``line`` is given a variable, its first value and a comment."""
+        says = {"memory": "the start of an episode; a row per agent", "previous": "no action yet"}
+        return [line.format(name, value(self.signature.input(key)), says[name]) for key, name in self.kept.items()]
 
     @property
     def heads(self) -> tuple[TensorSpec, ...]:

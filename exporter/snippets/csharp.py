@@ -38,12 +38,8 @@ _TYPES = {
 
 def tensorflowsharp(bundle: Bundle) -> str:
     """TFGraph and TFSession."""
-    before, lines = [], ["var runner = session.GetRunner();"]
+    before, lines = bundle.beginnings("var {} = {};  // {}", _array), ["var runner = session.GetRunner();"]
     memory, previous = bundle.memory, bundle.previous
-    if memory is not None:
-        before.append(f"var memory = {_array(memory[0])};  // the start of an episode; a row per agent")
-    if previous is not None:
-        before.append(f"var previous = {_array(previous)};  // no action yet")
     for spec in bundle.signature.inputs:
         lines += [f"// {line}" for line in meaning(bundle, spec)]
         lines.append(f"runner.AddInput(graph[{quoted(spec.name)}][0], {bundle.kept.get(spec.name) or _array(spec)});")

@@ -104,13 +104,11 @@ def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: s
         lines += _entry(bundle, spec, bundle.kept.get(spec.name) or value(spec))
     lines += ["};", run]
     lines += [read.format(name, quoted(output.name)) for name, output in bundle.fetched.items()]
-    before: list[str] = []
+    before = bundle.beginnings("let {} = {};  // {}", value)
     memory, previous = bundle.memory, bundle.previous
     if memory is not None:
-        before.append(f"let memory = {value(memory[0])};  // the start of an episode; a row per agent")
         lines.append(f"memory = outputs[{quoted(memory[1])}];")
     if previous is not None:
-        before.append(f"let previous = {value(previous)};  // no action yet")
         lines.append(_again(previous, bundle.taken, tensorflow=value is _tf_value))
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
     chance = [f"outputs[{quoted(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]

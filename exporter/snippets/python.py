@@ -49,14 +49,9 @@ def load_policy(bundle: Bundle) -> str:
 
 def play(bundle: Bundle, run: list[str]) -> str:
     """From feeds to actions by ``run``, which makes ``outputs`` (name → array) of ``feeds``."""
-    before: list[str] = []
-    if _draws(bundle):
-        before.append("rng = np.random.default_rng()")
+    before = ["rng = np.random.default_rng()"] if _draws(bundle) else []
+    before += bundle.beginnings("{} = {}  # {}", array)
     memory, previous = bundle.memory, bundle.previous
-    if memory is not None:
-        before.append(f"memory = {array(memory[0])}  # the start of an episode; a row per agent")
-    if previous is not None:
-        before.append(f"previous = {array(previous)}  # no action yet")
     lines = ["feeds = {"]
     for spec in bundle.signature.inputs:
         lines += _entry(bundle, spec, _fed(bundle, spec))
