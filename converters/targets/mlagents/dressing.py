@@ -6,7 +6,7 @@ turned, a float cast, a row of memory reshaped); behind it the actions are broug
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
@@ -44,6 +44,8 @@ class Dressing:
     constants: dict[str, np.ndarray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     branches: tuple[int, ...] = ()
+    #: input → what is done to a camera's image before it is fed
+    images: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.builder = Builder(NameScope(n.name for n in self.policy.graph.nodes))
@@ -120,7 +122,7 @@ class Dressing:
         self.fetches[name] = pinned
         self.outputs.append(TensorSpec(name, role, kind.dtype.name, static_shape(kind.shape) or (None,), source))
 
-    def finished(self, memory: Memory | None, preprocess: Mapping[str, object], beside: Sequence[Node] = ()) -> Policy:
+    def finished(self, memory: Memory | None, beside: Sequence[Node] = ()) -> Policy:
         """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up."""
         graph = self.builder.graph().pruned(self.fetches.values())
         work, fetches = drop_identities(fold(graph).pruned(self.fetches.values()), self.fetches)
@@ -133,7 +135,7 @@ class Dressing:
             outputs=tuple(self.outputs),
             memory=memory,
             branches=self.branches,
-            preprocess=preprocess,
+            preprocess=self.images,
             constants={
                 **{n.name: _plain(n.value) for n in beside if n.value is not None},
                 **{k: _plain(v) for k, v in self.constants.items()},

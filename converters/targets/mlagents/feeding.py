@@ -58,6 +58,7 @@ def take_image(dressing: Dressing, name: str, spec: TensorSpec, layout: str) -> 
     if len(spec.shape) != 4 or None in spec.shape[1:]:
         _unknown_length(dressing, spec)
     _, *sizes = spec.shape
+    dressing.images[name] = {"layout": layout, "range": [0, 1], "from_bytes": "divide by 255"}
     same, (places, back) = done.get("layout", "NHWC") == layout, _TURNS[layout]
     tensor = dressing.take(name, spec, (None, *(sizes if same else (sizes[i] for i in places))))
     tensor = _as_colours(dressing, name, tensor, done)

@@ -45,7 +45,7 @@ def dress(policy: Policy, generation: Generation) -> Policy:
     """The policy under the names of a generation. Raises ProfileError where it cannot be held."""
     dressing = Dressing(policy, generation.name)
     feeding.refuse_parameters(dressing)
-    images = _take_observations(dressing, generation)
+    _take_observations(dressing, generation)
     masks = _take_masks(dressing, generation)
     carried = _take_previous_action(dressing, generation)
     size = _take_memory(dressing, carried)
@@ -67,10 +67,10 @@ def dress(policy: Policy, generation: Generation) -> Policy:
             given = dressing.builder.concat([given, dressing.builder.cast(dressing.fetches["action"], FLOAT32)], 1)
         dressing.give("recurrent_out", given, Role.MEMORY_OUT)
         memory = Memory(size, "recurrent_in", "recurrent_out", own.layout if carried is None else ())
-    return dressing.finished(memory, images, _beside(generation, found, width, size))
+    return dressing.finished(memory, _beside(generation, found, width, size))
 
 
-def _take_observations(dressing: Dressing, generation: Generation) -> dict[str, object]:
+def _take_observations(dressing: Dressing, generation: Generation) -> None:
     signature = dressing.policy.signature
     if any(s.role is Role.ENTITIES for s in signature.observations):
         dressing.refuse(
@@ -78,12 +78,9 @@ def _take_observations(dressing: Dressing, generation: Generation) -> dict[str, 
             why="ML-Agents 0.1 to 0.6 has vectors and cameras alone",
             fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
         )
-    images: dict[str, object] = {}
     for number, spec in enumerate(s for s in signature.observations if s.role is Role.VISUAL):
-        name = f"{generation.visual}{number}"
-        feeding.take_image(dressing, name, spec, "NHWC")
-        images[name] = {"layout": "NHWC", "range": [0, 1], "from_bytes": "divide by 255"}
-    if images and generation.pictures is not None:
+        feeding.take_image(dressing, f"{generation.visual}{number}", spec, "NHWC")
+    if dressing.images and generation.pictures is not None:
         dressing.notes.append(f"pictures are taken from 0 to 1; {generation.pictures}")
     vectors = [s for s in signature.observations if s.role is Role.VECTOR]
     if len(vectors) == 1 and np.dtype(vectors[0].dtype).kind in "iu":
@@ -93,7 +90,6 @@ def _take_observations(dressing: Dressing, generation: Generation) -> dict[str, 
         dressing.give_in(vectors[0], taken)
     elif vectors:
         feeding.take_joined(dressing, generation.vector, vectors)
-    return images
 
 
 def _take_masks(dressing: Dressing, generation: Generation) -> str | None:

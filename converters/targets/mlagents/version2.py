@@ -35,17 +35,17 @@ def dress(policy: Policy, profile: str) -> Policy:
             why="the ONNX of API version 2 gave no memory back, or one that was right for a single agent alone",
             fix="write a .nn, which has memories (--to nn), or use release 17 or later (--for barracuda-3)",
         )
-    images = _take_observations(dressing)
+    _take_observations(dressing)
     masks = feeding.take_masks(dressing)
     feeding.take_previous_action(dressing)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
     dressing.constants["version_number"] = np.array([_VERSION], np.float32)
     dressing.constants["memory_size"] = np.array([0], np.float32)
     _give_actions(dressing, heads(dressing), masks)
-    return dressing.finished(None, images)
+    return dressing.finished(None)
 
 
-def _take_observations(dressing: Dressing) -> dict[str, object]:
+def _take_observations(dressing: Dressing) -> None:
     signature = dressing.policy.signature
     entities = [s.name for s in signature.observations if s.role is Role.ENTITIES]
     if entities:
@@ -54,15 +54,11 @@ def _take_observations(dressing: Dressing) -> dict[str, object]:
             why="ML-Agents before 1.8 has no sensor of variable length, and no Barracuda of 1.x was seen to read one",
             fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
         )
-    images: dict[str, object] = {}
     for number, spec in enumerate(s for s in signature.observations if s.role is Role.VISUAL):
-        name = f"visual_observation_{number}"
-        feeding.take_observation(dressing, name, spec)
-        images[name] = {"layout": "NCHW", "range": [0, 1], "from_bytes": "divide by 255"}
+        feeding.take_observation(dressing, f"visual_observation_{number}", spec)
     vectors = [s for s in signature.observations if s.role is Role.VECTOR]
     if vectors:
         feeding.take_joined(dressing, VECTOR, vectors)
-    return images
 
 
 def _give_actions(dressing: Dressing, found: Heads, masks: str | None) -> None:

@@ -25,11 +25,8 @@ def dress(policy: Policy, profile: str) -> Policy:
     """The policy under the names of API version 3. Raises ProfileError where it cannot be held."""
     dressing = Dressing(policy, profile)
     feeding.refuse_parameters(dressing)
-    images: dict[str, object] = {}
     for name, spec in feeding.observation_names(dressing):
         feeding.take_observation(dressing, name, spec)
-        if spec.role is Role.VISUAL:
-            images[name] = {"layout": "NCHW", "range": [0, 1], "from_bytes": "divide by 255"}
     masks = feeding.take_masks(dressing)
     feeding.take_previous_action(dressing)
     size = _take_memory(dressing)
@@ -62,7 +59,7 @@ def dress(policy: Policy, profile: str) -> Policy:
         )
         dressing.give("recurrent_out", given, Role.MEMORY_OUT)
         memory = Memory(size, "recurrent_in", "recurrent_out", own.layout)
-    return dressing.finished(memory, images)
+    return dressing.finished(memory)
 
 
 def _take_memory(dressing: Dressing) -> int:

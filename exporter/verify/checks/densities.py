@@ -55,8 +55,8 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
             yield trial.finding(Draws, participant, name, difference, case.name)
             continue
         tolerance = trial.tolerance(name, participant)
-        columns = (s[name].reshape(len(s[name]), -1).T for s in samples)
-        p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in zip(*columns, strict=True)]
+        pairs = zip(one.T, other.T, strict=True)
+        p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in pairs]
         yield trial.finding(Draws, participant, name, likely(min(p_values, default=1.0)), case.name)
 
 

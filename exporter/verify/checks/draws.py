@@ -164,11 +164,8 @@ def _drawn(trial: Trial, participant: Participant, action: str, rows: Sequence[F
 def with_zeros(log_probs: np.ndarray, branches: Sequence[int], rate: float) -> np.ndarray:
     """Log-probabilities [inputs, ΣB] of a sampler whose uniform number is 0 at this rate."""
     probs = np.exp(log_probs.astype(np.float64)) * (1 - rate)
-    start = 0
-    for size in branches:
-        part = probs[:, start : start + size]
+    for part in np.split(probs, np.cumsum(branches)[:-1], axis=1):  # views
         part[np.arange(len(part)), np.argmax(part > 0, axis=1)] += rate
-        start += size
     with np.errstate(divide="ignore"):
         return np.log(probs)
 
