@@ -18,7 +18,7 @@ from converters.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value
 from converters.barracuda.layers import check_bypassed, translate
 from converters.barracuda.slices import upstream
 from converters.barracuda.vocabulary import LayerType
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape
+from converters.graph.nodes import Graph, NameScope
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
 from signatures.records import dataclass
@@ -126,8 +126,7 @@ class _Reader:
         integer = given.name in _INTEGER_INPUTS
         state = self.draws and given.name == MEMORY_IN
         dims = (None, 1, w) if state else (None, c) if (h, w) == (1, 1) else shape
-        attrs = {"dtype": INT32 if integer else FLOAT32, "shape": TensorShape(dims)}
-        self.builder.append(Node(name, "Placeholder", attrs=attrs, origin=given.name))
+        self.builder.named_input(name, INT32 if integer else FLOAT32, dims, given.name)
         if state:
             return self.builder.shaped(name, shape)
         if not integer:
@@ -137,8 +136,7 @@ class _Reader:
     def _entities(self, given: NnInput, count: int, size: int) -> Value:
         """A sensor of rank 2: [N, 1, W, C] in Unity, whose first dimension is C and second W; [B, C, W] here."""
         b, name = self.builder, self.nodes[given.name]
-        attrs = {"dtype": FLOAT32, "shape": TensorShape((None, size, count))}
-        b.append(Node(name, "Placeholder", attrs=attrs, origin=given.name))
+        b.named_input(name, FLOAT32, (None, size, count), given.name)
         turned = b.add("Transpose", [name, b.ints([0, 2, 1], "order")])
         return b.shaped(turned, (None, 1, count, size))
 
@@ -156,8 +154,7 @@ class _Reader:
                 why=f"a memory has at least one, and all together have at most {MAX_ELEMENTS}",
                 fix="copy or download the .nn again",
             )
-        attrs = {"dtype": FLOAT32, "shape": TensorShape((None, sum(sizes)))}
-        self.builder.append(Node(MEMORY_IN, "Placeholder", attrs=attrs, origin=_joined([m.input for m in memories])))
+        self.builder.named_input(MEMORY_IN, FLOAT32, (None, sum(sizes)), _joined([m.input for m in memories]))
         start = 0
         for memory, (h, w, c), size in zip(memories, shapes, sizes, strict=True):
             part, name = MEMORY_IN, self.nodes[memory.input]

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from converters.graph.allowance import MAX_MADE, Allowance
-from converters.graph.nodes import Graph, NameScope, Node, node_of, ref, topological
+from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE, op_of
 from converters.graph.shapes import Types, add_types, outputs_of
@@ -65,6 +65,13 @@ class Builder:
         """A new node with the op's default attributes; returns its output 0."""
         defaults = {a.name: a.default for a in TABLE[op].attrs if a.derive is None and a.default is not REQUIRED}
         return self.append(Node(self._fresh(name or op), op, tuple(inputs), {**defaults, **attrs}, origin=origin))
+
+    def named_input(
+        self, name: str, dtype: np.dtype[Any], dims: Sequence[int | None], origin: str | tuple[str, ...] | None = None
+    ) -> str:
+        """An input, called as it is said; None stands for a free length."""
+        attrs = {"dtype": dtype, "shape": TensorShape(tuple(dims))}
+        return self.append(Node(name, "Placeholder", attrs=attrs, origin=origin))
 
     def const(self, array: npt.ArrayLike, name: str = "const") -> str:
         """A constant; equal small ones under one prefix share a node."""

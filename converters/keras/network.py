@@ -92,12 +92,10 @@ class Network(Builder):
         dtype = layer.config.get("dtype") or "float32"
         kind = np.dtype(str(dtype["config"]["name"] if isinstance(dtype, Mapping) else dtype))
         kind = FLOAT32 if kind.kind == "f" else kind
-        shape = TensorShape((None, *(int(n) for n in rest if n is not None)))
+        dims = (None, *(int(n) for n in rest if n is not None))
         self.prefix = ""
-        made = self.append(
-            Node(self._fresh(layer.name), "Placeholder", attrs={"dtype": kind, "shape": shape}, origin=layer.name)
-        )
-        places[layer.name] = Tensor(made, kind, shape)
+        made = self.named_input(self._fresh(layer.name), kind, dims, layer.name)
+        places[layer.name] = Tensor(made, kind, TensorShape(dims))
         return made
 
     # ------------------------------------------------------------------ calls in their order
@@ -183,9 +181,7 @@ class Network(Builder):
     def state(self, width: int) -> str:
         """A state that a stateful layer keeps from call to call: an input of its own, zeros at first."""
         name = self._fresh("state_in").replace("/", "_")
-        made = self.append(
-            Node(name, "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, width))}, origin=name)
-        )
+        made = self.named_input(name, FLOAT32, (None, width), name)
         self.kept[made] = made.replace("state_in", "state_out")
         return made
 

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from converters.graph.nn.activations import clip
-from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32, INT32, INT64
 from converters.stable_baselines3.spaces import Space, space_of
 from converters.torch_checkpoint.activations import Activation, named, told
@@ -191,8 +191,7 @@ def _encoded(made: _Built, key: str, space: Space, module: str) -> str:
     name = f"{name}_observation" if name in _TAKEN or name in made.roles else name
     whole = bool(space.counts)
     shape = ((len(space.counts),) if space.kind == "MultiDiscrete" else ()) if whole else space.shape
-    dims = TensorShape((None, *shape))
-    x = net.append(Node(name, "Placeholder", attrs={"dtype": INT64 if whole else FLOAT32, "shape": dims}, origin=name))
+    x = net.named_input(name, INT64 if whole else FLOAT32, (None, *shape), name)
     made.roles[name] = {4: Role.VISUAL, 3: Role.ENTITIES}.get(len(shape) + 1, Role.VECTOR)
     net.at(f"{module}.{key}")
     if whole:

@@ -15,7 +15,7 @@ from converters.graph.builder import Builder
 from converters.graph.nn.activations import clip
 from converters.graph.nn.linear import matmul
 from converters.graph.nn.recurrent import gru, lstm
-from converters.graph.nodes import NameScope, Node, TensorShape
+from converters.graph.nodes import NameScope, Node
 from converters.graph.types import FLOAT32, INT32, INT64
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.weights import Weights
@@ -35,8 +35,7 @@ class Network(Builder):
 
     def input(self, name: str, *shape: int) -> str:
         """A float32 input [B, *shape]."""
-        shape_attr = TensorShape((None, *shape))
-        return self.append(Node(name, "Placeholder", attrs={"dtype": FLOAT32, "shape": shape_attr}, origin=name))
+        return self.named_input(name, FLOAT32, (None, *shape), name)
 
     def output(self, name: str, reference: str) -> None:
         """Call a tensor by the name of an output."""

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape, ref, split_ref
+from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref
 from converters.graph.passes.fold import fold
 from converters.graph.passes.naming import name_tensors
 from converters.graph.passes.simplify import collapse_views, drop_identities
@@ -58,14 +58,8 @@ class Dressing:
 
     def take(self, name: str, spec: TensorSpec, shape: tuple[int | None, ...], dtype: np.dtype[Any] = FLOAT32) -> str:
         """A new input of the consumer that stands for the policy's input ``spec``."""
-        made = self.builder.append(
-            Node(
-                self.builder.names.fresh(f"{self.profile}/{name}"),
-                "Placeholder",
-                attrs={"dtype": dtype, "shape": TensorShape(shape)},
-                origin=spec.source if isinstance(spec.source, str) else None,
-            )
-        )
+        origin = spec.source if isinstance(spec.source, str) else None
+        made = self.builder.named_input(self.builder.names.fresh(f"{self.profile}/{name}"), dtype, shape, origin)
         self.feeds[name] = made
         self.inputs.append(replace(spec, name=name, dtype=dtype.name, shape=shape))
         return made
