@@ -146,33 +146,25 @@ def _scope(bundle: Bundle) -> str:
 
 
 def _faults(bundle: Bundle, generation: Generation) -> list[str]:
-    signature = bundle.signature
-    roles = {s.role for s in signature.inputs}
-    vectors = [s for s in signature.inputs if s.role is Role.VECTOR]
-    faults = []
-    if len(bundle.heads) > 1:
-        faults.append("it has no hybrid actions")
-    elif not bundle.heads[0].is_continuous and _action(bundle).dtype != "int64":
-        faults.append("it reads discrete actions as int64")
-    if len(signature.branches) > 1 and not generation.branches:
-        faults.append("it has one branch of discrete actions")
-    if Role.MASKS in roles and not generation.masks:
-        faults.append("it does not feed action masks")
-    if Role.ENTITIES in roles or len(vectors) > 1:
-        faults.append("it feeds one vector observation")
-    if signature.memory is not None and not generation.memory:
-        faults.append("its memory does not work")
+    signature, previous = bundle.signature, bundle.previous
+    roles = [s.role for s in signature.inputs]
+    hybrid, remembers = len(bundle.heads) > 1, signature.memory is not None
+    counted = not bundle.heads[0].is_continuous and _action(bundle).dtype != "int64"
     asked = [n for n in ("memory_size", "sequence_length") if f"{_scope(bundle)}{n}" not in bundle.nodes]
-    if signature.memory is not None and generation.asks and asked:
-        wanted = f"tfsharp-{generation.name[-3:]}"
-        faults.append(f"it asks a policy with memory for {' and '.join(asked)}: export with --for {wanted}")
-    previous = bundle.previous
-    if previous is not None and generation.previous_rank != len(previous.shape):
-        faults.append(f"it does not feed {previous.name} {list(previous.shape)}".replace("None", "agents"))
-    layouts = {p.get("layout") for p in signature.preprocess.values()}
-    if "NCHW" in layouts:
-        faults.append("its images have the channels last")
-    return faults
+    wanted = f"export with --for tfsharp-{generation.name[-3:]}"
+    unfed = "" if previous is None else f"{previous.name} {list(previous.shape)}".replace("None", "agents")
+    told = (
+        (hybrid, "it has no hybrid actions"),
+        (counted and not hybrid, "it reads discrete actions as int64"),
+        (len(signature.branches) > 1 and not generation.branches, "it has one branch of discrete actions"),
+        (Role.MASKS in roles and not generation.masks, "it does not feed action masks"),
+        (Role.ENTITIES in roles or roles.count(Role.VECTOR) > 1, "it feeds one vector observation"),
+        (remembers and not generation.memory, "its memory does not work"),
+        (remembers and generation.asks and asked, f"it asks a policy with memory for {' and '.join(asked)}: {wanted}"),
+        (previous and generation.previous_rank != len(previous.shape), f"it does not feed {unfed}"),
+        (any(p.get("layout") == "NCHW" for p in signature.preprocess.values()), "its images have the channels last"),
+    )
+    return [text for wrong, text in told if wrong]
 
 
 def _learning_brain(bundle: Bundle) -> str:
