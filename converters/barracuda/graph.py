@@ -160,9 +160,7 @@ class _Reader:
             part, name = MEMORY_IN, self.nodes[memory.input]
             if len(memories) > 1:
                 begun = self.builder.start(Layer(memory.input, LayerType.NOP), name)
-                bounds = ([0, start], [0, start + size], [1, 1])
-                operands = [self.builder.ints(v, k) for v, k in zip(bounds, ("begin", "end", "steps"), strict=True)]
-                part = self.builder.add("StridedSlice", [MEMORY_IN, *operands], begin_mask=1, end_mask=1)
+                part = self.builder.slice(MEMORY_IN, 1, start, start + size)
                 part = self.builder.finish(part, begun, name, memory.input)
             start += size
             value = Value(part, (None, 1, 1, size))

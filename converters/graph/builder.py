@@ -301,8 +301,10 @@ class Builder:
         """The tensor in another dtype."""
         return reference if self.dtype(reference) == dtype else self.add("Cast", [reference], DstT=np.dtype(dtype))
 
-    def slice(self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1) -> str:
-        """``x[..., start:stop:step]`` at one axis."""
+    def slice(
+        self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1, *, dropped: bool = False
+    ) -> str:
+        """``x[..., start:stop:step]`` at one axis, which stays unless it is ``dropped``."""
         begin, end, steps = [0] * (axis + 1), [0] * (axis + 1), [1] * (axis + 1)
         masks = (1 << axis) - 1
         begin[axis], end[axis], steps[axis] = start or 0, stop or 0, step
@@ -311,6 +313,7 @@ class Builder:
             [reference, self.ints(begin, "begin"), self.ints(end, "end"), self.ints(steps, "steps")],
             begin_mask=masks | (1 << axis if start is None else 0),
             end_mask=masks | (1 << axis if stop is None else 0),
+            shrink_axis_mask=1 << axis if dropped else 0,
         )
 
     def take(self, reference: str, index: Sequence[int], axis: int) -> str:

@@ -127,7 +127,7 @@ def _gather(op: Op, net: Importer) -> str:
         raise op.refused(f"it takes an element that an axis of {length} does not have")
     if value is not None and value.ndim == 0 and (isinstance(length, int) or int(value) >= 0):
         index = int(value) % length if isinstance(length, int) else int(value)
-        return _taken(net, x, axis, index)
+        return net.slice(x, axis, index, index + 1, dropped=True)
     if value is not None:
         if (value < 0).any() and not isinstance(length, int):
             raise op.refused("its indices count from the end of an axis whose length is not known")
@@ -136,15 +136,6 @@ def _gather(op: Op, net: Importer) -> str:
     elif isinstance(length, int):
         indices = net.add("FloorMod", [net.cast(indices, INT32), net.ints(length, "length")])
     return net.add("GatherV2", [x, indices, net.ints(axis, "axis")])
-
-
-def _taken(net: Importer, x: str, axis: int, index: int) -> str:
-    """One element of an axis, the axis dropped."""
-    begin, end, steps = ([0] * axis + [v] for v in (index, index + 1, 1))
-    steps[:axis] = [1] * axis
-    operands = [net.ints(v, n) for v, n in ((begin, "begin"), (end, "end"), (steps, "steps"))]
-    mask = (1 << axis) - 1
-    return net.add("StridedSlice", [x, *operands], begin_mask=mask, end_mask=mask, shrink_axis_mask=1 << axis)
 
 
 def _pad(op: Op, net: Importer) -> str:
