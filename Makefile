@@ -91,6 +91,7 @@ bench: install
 N := 20000
 fuzz: install
 	$(BIN)/python -m tests.fuzz --count $(N)
+	$(BIN)/python -m tests.fuzz.differential
 	$(BIN)/python -m tests.hostile.contracts
 	$(BIN)/python -m tests.hostile.kills
 	EXPORT_MODEL_TEST_ANEW=1 $(PYTEST) -n 2 --dist worksteal -q -m "$(DAILY)"
