@@ -112,6 +112,7 @@ def test_an_endless_number_in_a_model_json_is_damage(attribute: str, tmp_path: P
         (node("odd", "Switch", "mu"), "does not belong to a loop"),
         (node("odd", "Mean", "mu", "mu", keep_dims="yes"), "which is no truth value"),
         (node("odd", "Tanh", "mu", "mu"), "it takes 1 inputs"),
+        (node("odd", "BiasAdd", "mu", "mu/bias", "mu/bias"), "it takes 2 inputs"),
         (node("odd", "StridedSlice", *["mu"] * 5), "it takes 4 inputs"),
         (node("odd", "OneHot", "mu", "mu", "mu"), "it takes 4 inputs"),
         (node("odd", "Squeeze", "mu", squeeze_dims=1.5), "which is no integer"),

@@ -98,6 +98,8 @@ def _lower_matmul(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    if len(args) != 2:
+        raise shape_error(node, args, "it takes 2 inputs")
     x, bias = args[0].shape, args[1].shape
     if x is not None and bias is not None:
         last = x[-1] if x else None
