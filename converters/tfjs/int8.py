@@ -45,32 +45,33 @@ def _are_products(name: str, step: np.ndarray, readers: Sequence[Node]) -> bool:
     return (
         step.ndim == 2
         and step.shape[0] == 1
-        and all(
-            r.op == "MatMul"
-            and r.inputs[1] == name != r.inputs[0]
-            and not (r.attrs.get("transpose_a") or r.attrs.get("transpose_b"))
-            for r in readers
-        )
+        and all(r.op == "MatMul" and r.inputs[1] == name != r.inputs[0] and not _is_turned(r) for r in readers)
     )
 
 
 def joined(graph: Graph) -> Graph:
-    """The graph with the matrices in their products again."""
-    whole = {
-        node.inputs: node.name
-        for node in graph.nodes
-        if node.op == "Mul" and all(graph.producer(r).op == "Const" for r in node.inputs) and _is_matrix(graph, node)
-    }
+    """The graph with the matrices in their products again; whoever may have written it."""
+    whole = {node.inputs: node.name for node in graph.nodes if _is_matrix(graph, node)}
     if not whole:
         return graph
     editor = Editor(graph)
     for node in graph.nodes:
-        product = graph.producer(node.inputs[0]) if node.op == "Mul" else node
-        matrix = whole.get((product.inputs[1], node.inputs[1])) if node.op == "Mul" and product.op == "MatMul" else None
+        product = graph.producer(node.inputs[0]) if node.op == "Mul" and len(node.inputs) == 2 else node
+        plain = product.op == "MatMul" and len(product.inputs) == 2 and not _is_turned(product)
+        matrix = whole.get((product.inputs[1], node.inputs[1])) if product is not node and plain else None
         editor.keep(node if matrix is None else product.moved(node.name, (product.inputs[0], matrix)))
     return editor.graph()
 
 
 def _is_matrix(graph: Graph, node: Node) -> bool:
-    value = graph.constant(node.inputs[0])
-    return value is not None and value.ndim == 2 and are_steps(value)
+    """Whether a node is steps times a step for each of their columns."""
+    if node.op != "Mul" or len(node.inputs) != 2:
+        return False
+    value, step = map(graph.constant, node.inputs)
+    if value is None or step is None or value.ndim != 2 or step.shape != (1, value.shape[1]):
+        return False
+    return are_steps(value)
+
+
+def _is_turned(product: Node) -> bool:
+    return bool(product.attrs.get("transpose_a") or product.attrs.get("transpose_b"))

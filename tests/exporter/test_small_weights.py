@@ -108,6 +108,32 @@ def test_a_matrix_that_is_turned_or_read_by_others_is_multiplied_itself() -> Non
         assert joined(stepped(plain))["y"] == plain["y"]
 
 
+@pytest.mark.parametrize(
+    "odd",
+    [
+        Node("odd", "Mul", ()),
+        Node("odd", "Mul", ("bare", "w/step")),
+        Node("odd", "Mul", ("turned", "w/step")),
+        Node("odd", "Mul", ("w/int8",)),
+    ],
+)
+def test_what_anyone_may_have_written_stays_as_it_is(odd: Node) -> None:
+    steps = np.random.default_rng(0).integers(-127, 128, (24, 24)).astype(np.float32)
+    assert are_steps(steps)
+    graph = Graph(
+        (
+            Node("x", "Placeholder", attrs={"dtype": np.dtype(np.float32), "shape": TensorShape((None, 24))}),
+            Node("w/int8", "Const", value=steps),
+            Node("w/step", "Const", value=np.ones((1, 24), np.float32)),
+            Node("w", "Mul", ("w/int8", "w/step")),
+            Node("bare", "MatMul", ("x",)),
+            Node("turned", "MatMul", ("x", "w/int8"), {"transpose_b": True}),
+            odd,
+        )
+    )
+    assert joined(graph) is graph
+
+
 @pytest.mark.parametrize("storage", _KEPT)
 def test_every_format_holds_the_same_numbers(storage: Storage, tmp_path: Path) -> None:
     ((_, policy),) = read_source(fixture("visual")).compiled()
