@@ -17,13 +17,6 @@ from converters.graph.ops.table import traits
 _NORMALISER = 6
 #: The activations of an LSTM's gates.
 _GATES = ("sigmoid", "tanh")
-#: What a box does → the ops that it is told by.
-_TOLD_BY_OPS = {
-    "max pool": {"MaxPool"},
-    "clip": {"Minimum", "Maximum"},
-    "log-probabilities": {"Sum", "Log", "RealDiv"},
-    "argmax": {"ArgMax"},
-}
 
 
 @dataclass
@@ -215,7 +208,15 @@ def _activations(nodes: Iterable[Node], ops: Mapping[str, int], *, lstm: bool) -
     if lstm:
         names = [n for n in names if n not in _GATES]
     words = ["swish" if n == "sigmoid" and ops.get("Mul") else n for n in names]
-    return words + [word for word, needed in _TOLD_BY_OPS.items() if needed <= ops.keys()]
+    if ops.get("MaxPool"):
+        words.append("max pool")
+    if ops.get("Minimum") and ops.get("Maximum"):
+        words.append("clip")
+    if ops.get("Sum") and ops.get("Log") and ops.get("RealDiv"):
+        words.append("log-probabilities")
+    if ops.get("ArgMax"):
+        words.append("argmax")
+    return words
 
 
 def _plain_title(nodes: Sequence[Node]) -> str:
