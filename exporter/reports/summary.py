@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from exporter.tables import sized, table
-from exporter.verify.findings import Accepted, Decisions, Size
+from exporter.verify.findings import Accepted, Decisions, Draws, Size
 from exporter.verify.report import ParityReport
 
 
@@ -62,8 +62,19 @@ def verdict(report: ParityReport) -> str:
         rest = f"; nothing runs the source{rest}"
         return f"SELF-CONSISTENT: {count} format/runtime pairs agree with {report.reference}{rest}"
     if report.passed:
-        return f"PASSED: {count} format/runtime pairs agree with {report.reference}{rest}"
-    return f"FAILED: {len(report.failures)} of {len(report.comparisons)} comparisons disagree with {report.reference}"
+        return f"PASSED: {count} format/runtime pairs agree with {report.reference}{rest}{_apart(report)}"
+    failed = f"{len(report.failures)} of {len(report.comparisons)} comparisons disagree with {report.reference}"
+    return f"FAILED: {failed}{_apart(report)}"
+
+
+def _apart(report: ParityReport) -> str:
+    """A clause on what was drawn, and what follows from it, where the source has nothing to hold it against."""
+    apart = [c for c in report.comparisons if c.against]
+    drawn = list(dict.fromkeys(c.output for c in apart if isinstance(c, Draws)))
+    if not drawn:
+        return ""
+    told = [*dict.fromkeys(c.output for c in apart if c.output not in drawn), f"the draws of {', '.join(drawn)}"]
+    return f"; compared between the formats, not with the source: {', '.join(told)}"
 
 
 def not_run_line(report: ParityReport) -> str | None:

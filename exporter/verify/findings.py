@@ -101,6 +101,8 @@ class Finding:
     smallest_tolerance: float | None = None
     #: Where a disagreement begins; None where it was not looked for (nothing failed, or the reason says it all).
     bisection: Bisection | None = None
+    #: What it was held against where that is not the report's reference: the source has no odds of what is drawn.
+    against: str = ""
 
     def __repr__(self) -> str:
         return f"<{self.where}: {self.output} {self.cell()}, {'ok' if self.passed else 'FAIL'} [{self.kind}]>"
@@ -175,6 +177,7 @@ class Finding:
                 histogram=by_decade(self.histogram) if any(self.histogram) else None,
                 smallest_tolerance=None if self.passed else self.smallest_tolerance,
                 bisection=None if self.bisection is None else self.bisection.to_dict(),
+                against=self.against or None,
             ),
         }
 

@@ -15,6 +15,7 @@ from converters.runtimes.process import LoadedModel, RunFailedError
 from exporter.verify.findings import Failure, failure
 from exporter.verify.original import Original
 from exporter.verify.participants import PolicyUnderTest
+from signatures.roles import Role
 
 Arrays = Mapping[str, np.ndarray]
 Answers = list[dict[str, np.ndarray]]
@@ -35,6 +36,8 @@ class Reference(AbstractContextManager["Reference"]):
         #: what the source's own runtime refused
         self.failures: list[Failure] = []
         self.name = "numpy"
+        #: the outputs that the source answered for
+        self._given: frozenset[str] = frozenset()
         own = WRITTEN[form].answers
         #: the outputs that the kernels have
         self.asked = [s.name for s in self.signature.outputs] if own is None else own(self.signature)
@@ -63,11 +66,26 @@ class Reference(AbstractContextManager["Reference"]):
         """The outputs that are not drawn; the numpy kernels answer for what the source cannot be asked."""
         answers = [{} if self.original is None else self.original.run(feeds) for feeds in inputs]
         given = answers[0] if answers else {}
+        self._given |= given.keys()
         rest = [s.name for s in self.signature.outputs if s.name not in given and s.name not in self.drawn]
         if rest:
             for answer, own in zip(answers, self.run(inputs, rest), strict=True):
                 answer.update(own)
         return answers
+
+    def apart(self) -> frozenset[str]:
+        """Of what was asked, the draws whose odds no tensor of the source tells, and what else of them the kernels
+        answered for in its stead. Nothing where the source takes no part: what all is held against says it then.
+        """
+        if self.original is None:
+            return frozenset()
+        told = any(s.role is Role.LOG_PROBS and s.name in self._given for s in self.signature.outputs)
+        heads = [h for h in self.signature.heads if h.name in self.drawn and not (h.spec.role is Role.SAMPLED and told)]
+        drawn = {h.name for h in heads}
+        follow = {h.plain.name for h in heads if h.plain is not None}
+        if any(h.spec.role is Role.SAMPLED for h in heads):
+            follow |= {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
+        return frozenset(drawn | (follow - self._given))
 
     def remember(self, inputs: Sequence[Arrays]) -> None:
         """Have the kernels answer for inputs that are asked about several times."""

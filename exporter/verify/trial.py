@@ -13,7 +13,7 @@ from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
 from exporter.verify.difference import SHARE, Difference, compare, compare_all, floored, spread, ties
-from exporter.verify.findings import Bisection, Finding
+from exporter.verify.findings import Bisection, Finding, Shape
 from exporter.verify.golden import Golden, read_golden
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
@@ -54,6 +54,7 @@ class Trial:
         inputs = [case.feeds for case in self.cases]
         reference.remember(inputs)
         self.expected = reference.answers(inputs)
+        self._apart = reference.apart()
         if self.signature.memory is not None and self.signature.memory.output in reference.drawn:
             self.steps = []  # it keeps what was drawn: every run goes another way
         self.expected_steps = self.rolled(lambda feeds: reference.answers([feeds])[0])
@@ -198,6 +199,7 @@ class Trial:
             difference.histogram,
             None if difference.passed else difference.smallest_tolerance,
             bisection,
+            "numpy" if output in self._apart and kind is not Shape else "",
         )
 
     def _judged_by(self, output: str, participant: Participant, difference: Difference) -> Tolerance:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
+from exporter.reports.entry import Entry
+from exporter.reports.markdown import markdown_text
+from exporter.reports.page import page
+from exporter.reports.summary import verdict
 from exporter.verify.checks.numbers import plausible
 from exporter.verify.original import Original
 from signatures.errors import SignatureError, UnsupportedOpError
@@ -23,6 +30,7 @@ from tests.exporter.rehearsal import (
     spoiling,
 )
 from tests.handmade import NodeDef, constant, continuous_policy, dense, graph_bytes, node, placeholder
+from tests.reports.validation import check_parity
 
 # ------------------------------------------------------------------ what is compared
 
@@ -201,6 +209,67 @@ def test_a_source_that_takes_some_rows_only_is_asked_in_parts(rows: int) -> None
     state = np.arange(21, dtype=np.float32).reshape(7, 3)
     np.testing.assert_array_equal(original.run({"state": state, "gain": np.ones(2)})["action"], 2 * state)
     assert asked == [rows] * -(-7 // rows)
+
+
+def _epsilon_greedy() -> list[NodeDef]:
+    """``action`` [B]: once in four times any of four classes, else the likeliest."""
+    return [
+        *(constant("axis", 1), constant("least", 0), constant("most", 4), constant("share", np.float32(0.25))),
+        *(constant("begin", [0]), constant("end", [1])),
+        node("whole", "Shape", "logits", out_type=np.int32),
+        node("rows", "StridedSlice", "whole", "begin", "end", "end", Index=np.int32),
+        node("any", "RandomUniformInt", "rows", "least", "most", Tout=np.int32, T=np.int32),
+        node("best", "ArgMax", "logits", "axis", output_type=np.int32),
+        node("u", "RandomUniform", "rows", dtype=np.float32),
+        node("exploits", "GreaterEqual", "u", "share"),
+        node("action", "Select", "exploits", "best", "any", T=np.int32),
+    ]
+
+
+_APART = "; compared between the formats, not with the source: "
+
+
+@pytest.mark.parametrize(
+    ("head", "noise", "apart"),
+    [
+        (_epsilon_greedy(), "lift", ["action_log_probs", "deterministic_action", "the draws of action"]),
+        (_head("draw"), "lift", []),
+        ([node("s", "Shape", "logits", out_type=np.int32), node("noise", "RandomStandardNormal", "s", dtype=np.float32),
+          node("action", "Add", "logits", "noise")], "keep", ["the draws of action"]),
+    ],
+    ids=["epsilon-greedy", "logits", "numbers"],
+)  # fmt: skip
+def test_draws_of_which_the_source_has_no_odds_say_what_they_were_held_against(
+    head: list[NodeDef], noise: Any, apart: list[str], exporting: Exporting, tmp_path: Path
+) -> None:
+    """The terminal, Markdown and HTML by the verdict, parity.json comparison by comparison; all others as before."""
+    nodes = [placeholder("vector_observation"), *dense("logits", "vector_observation", 3, 4), *head]
+    (tmp_path / "own.bytes").write_bytes(graph_bytes(nodes))
+    result = exporting(tmp_path / "own.bytes", compile=CompileOptions(noise=noise))
+    report = report_of(result)
+    assert (result.passed, report.reference) == (True, "source/tensorflow")
+    agreed, _, told = verdict(report).partition(_APART)
+    assert sorted(told.split(", ")) == (apart or [""])
+    assert agreed.endswith("agree with source/tensorflow")
+    for text in (markdown_text([Entry(report)]).replace("\\", ""), page([Entry(report)])):
+        assert text.count(_APART + told) == (1 if apart else 0)
+    written = (result.folder / "parity.json").read_text(encoding="utf-8")
+    check_parity(written)
+    held = {c["output"] for c in json.loads(written)["comparisons"] if c.get("against") == "numpy"}
+    assert held == {name.removeprefix("the draws of ") for name in apart}
+    assert all(c.kind in ("draws", "numbers") for c in report.comparisons if c.against)
+    failed = replace(report, passed=False)
+    assert verdict(failed).endswith(_APART + told if apart else "with source/tensorflow")
+
+
+def test_without_a_source_that_runs_the_verdict_says_no_more_than_it_did(exporting: Exporting, tmp_path: Path) -> None:
+    """It names the kernels as what all was compared with."""
+    nodes = [placeholder("vector_observation"), *dense("logits", "vector_observation", 3, 4), *_epsilon_greedy()]
+    (tmp_path / "own.bytes").write_bytes(graph_bytes(nodes))
+    report = report_of(exporting(tmp_path / "own.bytes", ActingPool(refused=frozenset({("source", "tensorflow")}))))
+    assert report.reference == "numpy"
+    assert _APART not in verdict(report)
+    assert not any("against" in c.to_dict() for c in report.comparisons)
 
 
 # ------------------------------------------------------------------ an action without chance
