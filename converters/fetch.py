@@ -8,7 +8,7 @@ import os
 import re
 import stat
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import BinaryIO
 
 from signatures.digest import sha256_hex, sha256_of_stream
@@ -22,6 +22,8 @@ MAX_WEIGHTS = 16 << 30
 _LARGE_HOLE, _MOST_HOLES = 1 << 24, 1 << 16
 #: What has become a pipe since it was looked at is not waited for.
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+#: Folders of huggingface_hub's cache, in that of a repository: a folder for each revision, and the files of all.
+_SNAPSHOTS, _BLOBS = "snapshots", "blobs"
 #: As a path keeps an address: with one slash of the two.
 _ADDRESS = re.compile("(https?|ftps?|s3|gs|gcs|hf|memory|ssh|git)://?")
 #: Addresses of these are fetched where fsspec is installed (exporter/remote).
@@ -119,6 +121,25 @@ def opened(path: Path, most: int = MAX_BYTES) -> BinaryIO:
         file.close()
         raise
     return file
+
+
+def inside(folder: Path, name: str) -> Path | None:
+    """The file that ``name`` says, its links followed; None where that lies elsewhere than in ``folder``.
+
+    The snapshots of huggingface_hub's cache are links to files named by their hashes, in ``blobs`` beside them: these
+    belong to the folder, where the name itself says nothing else.
+    """
+    said = PurePath(name)
+    try:
+        root = folder.resolve()
+        place = (root / said).resolve()
+    except (OSError, RuntimeError, ValueError):  # a circle of links (RuntimeError before Python 3.13), a null character
+        return None
+    if place.is_relative_to(root):
+        return place
+    if said.anchor or ".." in said.parts:
+        return None
+    return place if place.parent in [p.parent / _BLOBS for p in root.parents if p.name == _SNAPSHOTS] else None
 
 
 def is_hole(descriptor: int, size: int) -> bool:

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 
 from converters.bundle.embed import embedded, without_contract
 from converters.bundle.exchange import exchange, recover, stage
+from converters.fetch import inside
 from converters.format import Artifact, Format
 from converters.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph
@@ -108,12 +109,12 @@ class Bundle:
 
     def _verify(self, relative: str, entry: FileEntry) -> None:
         path = self.folder / relative
-        if not _is_inside(path, self.folder):
+        if inside(self.folder, relative) is None:
             raise BundleError(
                 f"names a file outside the bundle: {relative}",
                 where=str(self.folder / POLICY),
                 why="a bundle's files lie in its folder",
-                fix=f"do not use this bundle; {_AGAIN}",
+                fix=f"do not use this bundle; {_AGAIN}, or where the links are your own, give what cp -rL copies",
             )
         try:  # the size first: a file may be of any, and policy.json says which
             found = sha256_of_file(path) if _file_size(path) == entry.size else None
@@ -272,10 +273,3 @@ def _file_size(path: Path) -> int:
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "it is no file", str(path))
     return found.st_size
-
-
-def _is_inside(path: Path, folder: Path) -> bool:
-    try:
-        return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character
-        return False

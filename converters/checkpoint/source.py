@@ -40,7 +40,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
             )
         stem = re.sub(r"\.(cptk|ckpt)$", "", named.name)
         return [read_checkpoint(named, name=stem)]
-    name = path.resolve().parent.name if path.name in (listing.LIST, listing.RAW_GRAPH) else path.stem
+    name = path.parent.resolve().name if path.name in (listing.LIST, listing.RAW_GRAPH) else path.stem
     graph = None if path.name == listing.LIST else path
     found = listing.checkpoints(path.parent)
     if not found:

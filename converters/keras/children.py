@@ -39,7 +39,7 @@ def stored_in(path: Path) -> Stored:
         )
     try:
         with RuntimeProcess("h5py", child_command("converters.keras.hdf5_child")) as process:
-            answer = process.load(str(path.resolve())).run({}, [])
+            answer = process.load(str(path.absolute())).run({}, [])
     except RunFailedError as error:
         raise DamagedFileError(
             "its weights cannot be read",
@@ -64,7 +64,7 @@ def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
         )
     try:
         with RuntimeProcess("tensorflow", child_command("converters.runtimes.tensorflow.child")) as process:
-            answer = process.load(str(path.resolve()), kind="keras").run({}, ["graph", "names"])
+            answer = process.load(str(path.absolute()), kind="keras").run({}, ["graph", "names"])
     except RunFailedError as error:
         raise SourceError(
             "is a Keras model that TensorFlow cannot load",

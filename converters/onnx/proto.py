@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from converters import fetch
 from converters.counting import check_size
 from converters.detached import LARGE, LARGE_FILE, Detached, Fields
 from converters.fetch import MAX_WEIGHTS, read_bytes
@@ -258,17 +259,12 @@ def _bring(
 
 def _inside(folder: Path, location: str, name: str) -> Path:
     """The file of a tensor's data, which must lie in the model's folder (or below it) and be a plain file."""
-    root = folder.resolve()
-    try:
-        path = (root / location).resolve()
-        inside = bool(location) and "\0" not in location and path.is_relative_to(root) and path != root
-    except (OSError, RuntimeError, ValueError):
-        inside = False
-    if not inside:
+    path = fetch.inside(folder, location) if location and "\0" not in location else None
+    if path is None or path == folder.resolve():
         raise DamagedFileError(
             f"the weights of {name!r} are said to lie in {location!r}, outside the model's folder",
             why="a model file is untrusted: nothing else of this machine is read for it",
-            fix="put the file beside the model and export the model again",
+            fix="put the file beside the model (cp -L where it is a link) and export the model again",
         )
     if not path.is_file():
         raise DamagedFileError(

@@ -19,7 +19,7 @@ import numpy as np
 
 from converters import schema
 from converters.content import json_in
-from converters.fetch import Fetched, read_bytes
+from converters.fetch import Fetched, inside, read_bytes
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.graph.ops.table import IFS, WHILES, is_fed
 from converters.saved_model.signature import ModelSignature, Tensor
@@ -173,19 +173,15 @@ def _weights(
 
 def shard(folder: Path, name: str) -> Path:
     """A shard's path, which must stay inside the model's folder."""
-    path = folder / name
-    try:
-        inside = bool(name) and "://" not in name and path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # a circle of links (RuntimeError before Python 3.13)
-        inside = False
-    if not inside:
+    if not name or "://" in name or inside(folder, name) is None:
         raise SourceError(
             f"names the weights {name[:120]!r}",
             where=MODEL,
             why="the weights of a model lie in its own folder; nothing else is read",
-            fix="put the .bin files beside model.json, and their bare names into weightsManifest",
+            fix="put the .bin files beside model.json (cp -rL where they are links), and their bare names into "
+            "weightsManifest",
         )
-    return path
+    return folder / name
 
 
 def _bytes(given: Fetched, path: Path) -> bytes:

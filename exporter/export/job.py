@@ -89,7 +89,7 @@ def contract_of(
 ) -> Contract:
     """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
     origin = Origin(
-        printable(source.path.name),
+        printable(source.path.name or source.path.absolute().name),  # of the current folder
         source.sha256,
         None if model.name is None else printable(model.name),
         read.step,

@@ -35,7 +35,7 @@ class Source:
         if model.name is not None:
             return model.name
         if self.path.name in _NAMELESS or self.path.is_dir():
-            folder = self.path if self.path.is_dir() else self.path.resolve().parent
+            folder = self.path if self.path.is_dir() else self.path.parent
             return folder.resolve().name or self.path.stem
         return self.path.stem
 

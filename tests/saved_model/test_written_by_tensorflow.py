@@ -123,6 +123,13 @@ def test_keras_is_loaded_only_where_the_caller_trusts_it(models: Path) -> None:
     assert "--trust-source" in str(caught.value.fix)
 
 
+def test_keras_loads_a_link_by_its_own_name(models: Path, tmp_path: Path) -> None:
+    """As a cache has it: the file behind the link is called by its hash, and Keras goes by the end of a name."""
+    (tmp_path / "1f1f1f").write_bytes((models / "beyond.keras").read_bytes())
+    (tmp_path / "policy.keras").symlink_to("1f1f1f")
+    assert read_source(tmp_path / "policy.keras", TRUSTED).models
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [("stateful.keras", "its layer 'gru.*' keeps its state in itself"), ("stateful", "it keeps a memory in itself")],
