@@ -13,13 +13,12 @@ import numpy as np
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
 from converters.barracuda.lower import HEADS, INPUT_NAMES, base_name
-from converters.barracuda.writer import CONTRACT_KEY
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node
 from converters.graph.passes.noise import samplers
 from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
-from signatures.contract import json_of, parse_signature
+from signatures.contract import EMBEDDED, json_of, parse_signature
 from signatures.errors import DamagedFileError
 from signatures.fields import Field, FieldError
 from signatures.roles import Role
@@ -32,7 +31,7 @@ Arrays = Mapping[str, Array]
 def contract_of(model: NnModel) -> PolicySignature:
     """The contract that the writer left in the file. Raises DamagedFileError where there is none."""
     try:
-        return parse_signature(Field(json_of(model.metadata(CONTRACT_KEY) or "")))
+        return parse_signature(Field(json_of(model.metadata(EMBEDDED) or "")))
     except FieldError as error:
         raise DamagedFileError(
             "the .nn carries no contract of export-model",

@@ -8,10 +8,11 @@ from converters.barracuda.answers import contract_of
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import to_graph
 from converters.barracuda.slices import with_slices
-from converters.barracuda.writer import CONTRACT_KEY, PRODUCER
+from converters.barracuda.writer import PRODUCER
 from converters.fetch import Fetched
 from converters.source import ReadOptions, SourceModel
 from converters.understand.facts import SourceFacts
+from signatures.contract import EMBEDDED
 from signatures.roles import ACTION_NAMES
 from signatures.spec import PolicySignature
 
@@ -30,7 +31,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         memory_layout=_memory_layout(model),
         notes=(*_notes(model), *sliced, *reading.notes),
     )
-    if model.metadata(CONTRACT_KEY) is not None:
+    if model.metadata(EMBEDDED) is not None:
         facts = _told(facts, contract_of(model))
     return [SourceModel(reading.graph, (given.path,), facts)]
 

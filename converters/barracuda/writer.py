@@ -27,8 +27,8 @@ from converters.barracuda.lower import policy_model
 from converters.format import WriteOptions
 from converters.pieces import Pieces
 from converters.policy import Policy
+from signatures.contract import EMBEDDED
 
-CONTRACT_KEY = "export_model_contract"
 #: What Barracuda has for a model that no file was imported for.
 _NO_SOURCE, _NO_VERSION = "Script", "NA"
 PRODUCER = "export-model"
@@ -36,13 +36,13 @@ PRODUCER = "export-model"
 
 def write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     """The ``.nn``. Raises UnsupportedOpError or SignatureError that names what the format cannot hold."""
-    trailer = Trailer(_NO_SOURCE, _NO_VERSION, PRODUCER, metadata=((CONTRACT_KEY, options.contract),))
+    trailer = Trailer(_NO_SOURCE, _NO_VERSION, PRODUCER, metadata=((EMBEDDED, options.contract),))
     return {f"{policy.name}.nn": Pieces(encode(replace(policy_model(policy), trailer=trailer)))}
 
 
 def held(path: Path) -> str:
     """The contract that a ``.nn`` carries, empty where it has none. Raises OSError, DamagedFileError."""
-    return parse(path.read_bytes()).metadata(CONTRACT_KEY) or ""
+    return parse(path.read_bytes()).metadata(EMBEDDED) or ""
 
 
 def encode(model: NnModel) -> bytes:

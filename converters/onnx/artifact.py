@@ -18,9 +18,10 @@ from converters.folders import scratch_folder
 from converters.format import Port, Ports
 from converters.inner import Feeds, InnerTensors, Loaded, View
 from converters.mapped import Mapped
-from converters.onnx.messages import CONTRACT_KEY, files_of
+from converters.onnx.messages import files_of
 from converters.onnx.proto import array_of, decoded, dtype_name, load_external
 from converters.onnx.tensor_map import TENSORS_KEY, loads
+from signatures.contract import EMBEDDED
 
 
 def ports(path: Path) -> Ports:
@@ -41,7 +42,7 @@ def _port(value: Any) -> Port:
 def held(path: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     model = decoded(read_bytes(path), Detached())
-    return next((str(p.value) for p in model.metadata_props if p.key == CONTRACT_KEY), None)
+    return next((str(p.value) for p in model.metadata_props if p.key == EMBEDDED), None)
 
 
 @contextmanager

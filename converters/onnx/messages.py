@@ -19,8 +19,6 @@ from converters.graph.types import DATA_TYPES
 from converters.messages import message_classes
 from converters.pieces import Pieces
 
-#: The key of the metadata that hold a contract of ours.
-CONTRACT_KEY = "export_model_contract"
 _CLASSES = message_classes(
     "export_model_onnx",
     {

@@ -24,11 +24,12 @@ from converters.graph.shapes import Types, infer_types
 from converters.graph.types import FLOAT32, TensorType
 from converters.inner import View
 from converters.onnx import messages
-from converters.onnx.messages import CONTRACT_KEY, files_of
+from converters.onnx.messages import files_of
 from converters.onnx.shorten import pooled_first, shortened
 from converters.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.pieces import Pieces, equal
 from converters.policy import Policy
+from signatures.contract import EMBEDDED
 from signatures.errors import GraphError, UsageError
 from signatures.spec import TensorSpec
 
@@ -311,7 +312,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         producer=PRODUCER,
         ir_version=IR_VERSIONS[options.opset],
         opset=options.opset,
-        props={CONTRACT_KEY: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
+        props={EMBEDDED: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
     )
     if options.checked:
         _check(model, builder.detached, policy.name)

@@ -16,11 +16,11 @@ from converters.bundle.embed import contract_of, redrawn
 from converters.bundle.embed import facts_of as facts_of_contract
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
-from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.reader import OnnxModel
 from converters.understand.brains import depends_on_input
 from converters.understand.facts import SourceFacts
 from converters.understand.generations import torch_generation
+from signatures.contract import EMBEDDED
 from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
@@ -41,7 +41,7 @@ _IMAGE = 4
 
 def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     """The graph, faults of old exporters repaired where the repair is the same at batch 1, and the facts."""
-    text = model.metadata.get(CONTRACT_KEY)
+    text = model.metadata.get(EMBEDDED)
     if text is not None:
         contract = contract_of(text)
         return redrawn(model.graph, contract), facts_of_contract(model.graph, contract, model.outputs)

@@ -12,7 +12,7 @@ import pytest
 
 from converters.barracuda.answers import NnPolicy, answered, contract_of
 from converters.barracuda.format import parse
-from converters.barracuda.writer import CONTRACT_KEY, encode
+from converters.barracuda.writer import encode
 from converters.format import WriteOptions
 from converters.formats import DEFAULTS, WRITTEN
 from converters.graph.options import CompileOptions
@@ -22,6 +22,7 @@ from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from exporter.reports.summary import failure_lines
 from exporter.verify.tolerances import Tolerance, tolerance_for
+from signatures.contract import EMBEDDED
 from signatures.errors import BundleError, DamagedFileError
 from signatures.roles import Role
 from tests.barracuda.conftest import SHARED, params
@@ -98,7 +99,7 @@ def test_a_nn_whose_numbers_or_contract_were_changed_is_found(tmp_path: Path, po
     assert {c.format for c in report.comparisons if not c.passed} == {"nn"}
     assert model.trailer is not None
     changed = model.trailer.metadata[0][1].replace("continuous", "discrete")
-    put(encode(replace(model, trailer=replace(model.trailer, metadata=((CONTRACT_KEY, changed),)))))
+    put(encode(replace(model, trailer=replace(model.trailer, metadata=((EMBEDDED, changed),)))))
     with pytest.raises(BundleError, match="has been changed"):
         verify_folder(result.folder, runtimes="numpy")
 

@@ -18,7 +18,7 @@ import pytest
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.lower import HEADS, base_name
 from converters.barracuda.vocabulary import LayerType
-from converters.barracuda.writer import CONTRACT_KEY, write
+from converters.barracuda.writer import write
 from converters.format import WriteOptions
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.options import CompileOptions
@@ -26,6 +26,7 @@ from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from converters.policy import Policy
 from exporter.export.sources import read_source
+from signatures.contract import EMBEDDED
 from signatures.errors import SignatureError, UnsupportedOpError
 from signatures.roles import Role
 from signatures.spec import Memory, PolicySignature, TensorSpec
@@ -112,9 +113,9 @@ def test_the_bytes_are_the_same_every_time_and_carry_the_contract(path: Path) ->
     (data,), (again,) = (write(p, WriteOptions(contract)).values() for p in (policies(path)[0], policies(path)[0]))
     data = data.joined()
     assert data == again.joined()
-    assert parse(data).metadata(CONTRACT_KEY) == contract
+    assert parse(data).metadata(EMBEDDED) == contract
     # What a loader of a version-16 file reads after the weights ends before the contract.
-    assert data.index(b"export-model") < data.index(CONTRACT_KEY.encode())
+    assert data.index(b"export-model") < data.index(EMBEDDED.encode())
 
 
 def handmade(nodes: list[Node], outputs: list[TensorSpec], action_space: str, branches: tuple[int, ...] = ()) -> Policy:

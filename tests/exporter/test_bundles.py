@@ -16,7 +16,6 @@ from converters.bundle import bundle
 from converters.bundle.bundle import Bundle
 from converters.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph
-from converters.onnx.messages import CONTRACT_KEY
 from converters.schema import SavedModel, parse
 from exporter import __version__
 from fixtures import FIXTURES
@@ -186,7 +185,7 @@ def in_tfjs(folder: Path, name: str) -> str:
 def in_onnx(folder: Path, name: str) -> str:
     model = onnx.load(folder / f"{name}.onnx")
     properties = {p.key: p.value for p in model.metadata_props}
-    return properties[CONTRACT_KEY]
+    return properties[EMBEDDED]
 
 
 @pytest.mark.parametrize("embedded", [in_bytes, in_saved_model, in_tfjs, in_onnx])
@@ -195,7 +194,7 @@ def test_every_artefact_embeds_the_contract(name: str, embedded: Callable[[Path,
     content = contract_of(bundles / name)
     del content["files"]
     assert json.loads(embedded(bundles / name, name)) == content
-    assert EMBEDDED == CONTRACT_KEY == "export_model_contract"
+    assert EMBEDDED == "export_model_contract"
 
 
 @pytest.mark.parametrize("name", POLICIES)

@@ -12,14 +12,13 @@ import pytest
 from converters.format import WriteOptions
 from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from converters.onnx.messages import CONTRACT_KEY
 from converters.onnx.writer import write
 from converters.policy import Policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
-from signatures.contract import Contract, Origin
+from signatures.contract import EMBEDDED, Contract, Origin
 from signatures.errors import DamagedFileError
 from signatures.roles import Role
 from signatures.sampling import draw_cases
@@ -97,7 +96,7 @@ def test_ours_is_compared_with_itself_by_onnxruntime(bench: Bench, tmp_path: Pat
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"name": 1}', '{"name": "x", "inputs": [{}]}'])
 def test_a_contract_that_is_none_is_refused(text: str, tmp_path: Path) -> None:
     message = mlagents("0.28", continuous=True)
-    message.metadata_props.add(key=CONTRACT_KEY, value=text)
+    message.metadata_props.add(key=EMBEDDED, value=text)
     with pytest.raises(DamagedFileError, match="contract"):
         read_source(save(message, tmp_path))
 

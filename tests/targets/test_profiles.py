@@ -11,7 +11,6 @@ import onnx
 import pytest
 
 from converters.barracuda.format import parse
-from converters.barracuda.writer import CONTRACT_KEY
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH
@@ -20,6 +19,7 @@ from converters.targets.profile import Profile
 from converters.targets.profiles import PROFILES, profile
 from exporter import export_model
 from exporter.verify.checks.consumer import consumers
+from signatures.contract import EMBEDDED
 from signatures.errors import ProfileError, UsageError
 from signatures.roles import Role
 from tests import commands, known
@@ -318,7 +318,7 @@ def test_a_nn_is_of_the_version_that_its_consumer_runs_and_says_whom_it_is_for(
     file = result.folder / "recurrent.nn"
     model = parse(file.read_bytes())
     assert model.number("version_number") == version
-    assert json.loads(model.metadata(CONTRACT_KEY) or "")["tool"]["profile"] == wanted
+    assert json.loads(model.metadata(EMBEDDED) or "")["tool"]["profile"] == wanted
     assert bool(model.memories) == (version == 2)
     if version == 3:
         assert {i.name: i.shape for i in model.inputs}["recurrent_in"] == (-1, 1, 32, 1)
