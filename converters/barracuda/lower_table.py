@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from converters.barracuda import lower_elementwise as elementwise
 from converters.barracuda import lower_linear as linear
 from converters.barracuda.lower_base import NnBuilder
 from converters.barracuda.lower_values import Value
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, reached, ref
 from converters.graph.ops.base import MISFIT, misfit
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
@@ -112,22 +112,20 @@ def lower_graph(b: NnBuilder, graph: Graph, given: dict[str, Value], wanted: Ite
 
 def _needed(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict[str, Value]) -> set[str]:
     """The nodes that data comes from; what is known before the graph runs is a constant and ends the search."""
-    seen: set[str] = set()
-    stack = list(wanted)
-    while stack:
-        reference = stack.pop()
-        name = node_of(reference)
-        if name in seen or b.type_of(reference).constant is not None:
-            continue
-        seen.add(name)
+
+    def makers(references: Iterable[str]) -> Iterator[str]:
+        return (node_of(r) for r in references if b.type_of(r).constant is None)
+
+    def ahead(name: str) -> Iterable[str]:
         if name in given:
-            continue
+            return ()
         node = graph[name]
         if node.op not in _OPS or (node.op == "Multinomial" and not b.draws):
             b.node = node
             raise _unknown(b, node)
-        stack.extend(normal_ref(r) for r in node.inputs[_OPS[node.op][1]])
-    return seen
+        return makers(map(normal_ref, node.inputs[_OPS[node.op][1]]))
+
+    return reached(makers(wanted), ahead)
 
 
 def _unknown(b: NnBuilder, node: Node) -> UnsupportedOpError:

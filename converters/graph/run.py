@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, reached, ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel_as_it_is
@@ -17,15 +17,11 @@ from signatures.records import dataclass
 
 def _needed(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:
     """Names of the nodes that must be computed: those upstream of ``fetch``, not behind tensors that are fed."""
-    needed: set[str] = set()
-    stack = [normal_ref(name) for name in fetch]
-    while stack:
-        reference = stack.pop()
-        if reference in fed or node_of(reference) in needed:
-            continue
-        needed.add(node_of(reference))
-        stack.extend(graph.producer(reference).inputs)
-    return needed
+
+    def makers(references: Iterable[str]) -> Iterator[str]:
+        return (node_of(r) for r in references if r not in fed)
+
+    return reached(makers(map(normal_ref, fetch)), lambda name: makers(graph[name].inputs))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from converters.graph.builder import MAX_NODES
 from converters.onnx.importer.node import STANDARD
 from converters.onnx.importer.table import TABLE
 from converters.onnx.messages import packaged
+from converters.onnx.proto import bodies
 from signatures.errors import DamagedFileError, UnsupportedOpError
 from signatures.records import dataclass
 
@@ -200,12 +201,7 @@ class _Unfolding:
 
 def all_nodes(graph: Any) -> list[Any]:
     """The nodes of a graph or function, those of its bodies too."""
-    found = list(graph.node)
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("g"):
-                found.extend(all_nodes(attribute.g))
-    return found
+    return [node for body in bodies(graph) for node in body.node]
 
 
 def opsets_of(model: Any) -> dict[str, int]:

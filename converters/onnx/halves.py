@@ -6,13 +6,12 @@ part of a policy, so both what is read and what it is compared with are the mode
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from converters.detached import LARGE, Detached
-from converters.onnx.proto import raw_of, tensors
+from converters.onnx.proto import bodies, raw_of, tensors
 from signatures.errors import DamagedFileError
 
 _FLOAT, _FLOAT16, _BFLOAT16 = 1, 10, 16  # TensorProto.DataType
@@ -32,7 +31,7 @@ def widen(model: Any, detached: Detached | None = None) -> bool:
             if tensor.data_type in _HALVES:
                 found = True
                 _widen_tensor(tensor, detached)
-        for body in _bodies(part):
+        for body in bodies(part):
             values = (*body.input, *body.output, *body.value_info)
             for value in (v for v in values if not isinstance(v, str)):  # a function's are names
                 if value.type.tensor_type.elem_type in _HALVES:
@@ -43,15 +42,6 @@ def widen(model: Any, detached: Detached | None = None) -> bool:
                     found = True
                     attribute.i = _FLOAT
     return found
-
-
-def _bodies(part: Any) -> Iterator[Any]:
-    """A graph or function and the bodies inside."""
-    yield part
-    for node in part.node:
-        for attribute in node.attribute:
-            if attribute.HasField("g"):
-                yield from _bodies(attribute.g)
 
 
 def _widen_tensor(tensor: Any, detached: Detached | None) -> None:

@@ -198,6 +198,15 @@ def inside(message: Any, kind: str) -> Iterator[Any]:
                 stack.extend(value)
 
 
+def bodies(part: Any) -> Iterator[Any]:
+    """A graph or function and, each behind the one that it is in, the graphs that its nodes hold."""
+    yield part
+    for node in part.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                yield from bodies(attribute.g)
+
+
 def tensors(part: Any) -> Iterator[Any]:
     """Every TensorProto of a graph or function: initializers, constants, those of subgraphs and defaults."""
     return inside(part, "TensorProto")
