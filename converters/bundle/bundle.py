@@ -56,7 +56,7 @@ class Bundle:
         path = folder / POLICY
         try:
             if _file_size(path) > _MOST_BYTES:
-                raise BundleError("is too large", where=str(path), why="no contract is", fix=_AGAIN)
+                raise unfit(path, "is too large", "no contract is")
             content = json_of(path.read_bytes())
             contract = parse(content)
         except (FileNotFoundError, NotADirectoryError) as error:
@@ -67,7 +67,7 @@ class Bundle:
                 fix="give the folder that export-model wrote",
             ) from error
         except OSError as error:
-            raise BundleError("cannot be read", where=str(path), why=error.strerror, fix=_AGAIN) from error
+            raise unfit(path, "cannot be read", error.strerror) from error
         except FieldError as error:
             raise BundleError(
                 f"{error.field} {error.why}",
@@ -76,7 +76,7 @@ class Bundle:
                 fix=f"{_AGAIN}, or use the version of export-model that wrote it",
             ) from error
         if not contract.files:
-            raise BundleError("files is empty", where=str(path), why="a bundle holds a model", fix=_AGAIN)
+            raise unfit(path, "files is empty", "a bundle holds a model")
         return cls(folder, contract, content)
 
     @property
@@ -119,9 +119,9 @@ class Bundle:
         try:  # the size first: a file may be of any, and policy.json says which
             found = sha256_of_file(path) if _file_size(path) == entry.size else None
         except FileNotFoundError as error:
-            raise BundleError("is missing", where=str(path), why=f"{POLICY} names it", fix=_AGAIN) from error
+            raise unfit(path, "is missing", f"{POLICY} names it") from error
         except OSError as error:
-            raise BundleError("cannot be read", where=str(path), why=error.strerror, fix=_AGAIN) from error
+            raise unfit(path, "cannot be read", error.strerror) from error
         if found != entry.sha256:
             raise BundleError(
                 "has been changed since it was exported",
@@ -161,12 +161,8 @@ class Bundle:
         except FieldError:
             same = False
         if not same:
-            raise BundleError(
-                "has been changed since it was exported",
-                where=str(self.folder / POLICY),
-                why="it is not the contract that the artefact embeds",
-                fix=_AGAIN,
-            )
+            why = "it is not the contract that the artefact embeds"
+            raise unfit(self.folder / POLICY, "has been changed since it was exported", why)
 
     def check_fits(self, place: Path, declared: Declared) -> None:
         """Raise BundleError where an artefact has a tensor otherwise than policy.json says.
@@ -175,22 +171,21 @@ class Bundle:
         """
         for spec in (*self.signature.inputs, *self.signature.outputs):
             if spec.name not in declared:
-                raise BundleError(
-                    f"has no tensor {spec.name!r}", where=str(place), why=f"{POLICY} names it", fix=_AGAIN
-                )
+                raise unfit(place, f"has no tensor {spec.name!r}", f"{POLICY} names it")
             dtype, shape = declared[spec.name]
             axes = None if shape is None else [n if isinstance(n, int) else None for n in shape]
             if (dtype is not None and dtype != spec.dtype) or (axes is not None and not _goes(axes, spec.shape)):
-                raise BundleError(
-                    f"has {spec.name!r} as {dtype or 'a tensor'} {axes}",
-                    where=str(place),
-                    why=f"{POLICY} says {spec.dtype} {list(spec.shape)}",
-                    fix=_AGAIN,
-                )
+                what = f"has {spec.name!r} as {dtype or 'a tensor'} {axes}"
+                raise unfit(place, what, f"{POLICY} says {spec.dtype} {list(spec.shape)}")
 
     def check_graph(self, graph: Graph) -> None:
         """As ``check_fits``, of the graph of its ``.bytes``. Raises GraphError where that is damaged."""
         self.check_fits(self.folder / f"{self.name}.bytes", declared_by(graph))
+
+
+def unfit(where: Path, what: str, why: str | None) -> BundleError:
+    """The error of a bundle that is not, or no more, what an export wrote."""
+    return BundleError(what, where=str(where), why=why, fix=_AGAIN)
 
 
 def declared_by(graph: Graph) -> Declared:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from converters.bundle.bundle import Bundle
+from converters.bundle.bundle import Bundle, unfit
 from converters.bundle.embed import runnable
 from converters.folders import scratch_folder
 from converters.formats import WRITTEN
@@ -173,7 +173,7 @@ def _check_asked(
 ) -> None:
     """Raise where a bundle in a consumer's names lacks the file, or is to be compared without its source."""
     if "onnx" not in artefacts:
-        raise _incomplete(folder, "has no file that its consumer loads", f"it was made for {made_for}")
+        raise unfit(folder, "has no file that its consumer loads", f"it was made for {made_for}")
     if runtimes != "auto" or (options is not None and (options.golden or options.rules)):
         raise UsageError(
             f"without its source, a bundle that was made for {made_for} is asked of its consumer's checkers alone",
@@ -194,12 +194,8 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
             graph = saved_graph(artefacts["saved_model"])
         missing = [name for name in names if name not in graph]
     if missing:
-        raise _incomplete(artefacts["bytes"], f"has no tensor {missing[0]!r}", f"{POLICY} names it")
+        raise unfit(artefacts["bytes"], f"has no tensor {missing[0]!r}", f"{POLICY} names it")
     return graph
-
-
-def _incomplete(where: Path, what: str, why: str) -> BundleError:
-    return BundleError(what, where=str(where), why=why, fix="export the policy again")
 
 
 def _outline(signature: PolicySignature, *, noise_kept: bool) -> Graph:
@@ -255,7 +251,7 @@ def _check_meaning(found: Source, contract: Contract, folder: Path) -> None:
     wrong = [[what for what, ours, its in _meanings(contract.signature, s) if ours != its] for s in alike]
     if wrong and all(wrong):
         what = f"says otherwise of {', '.join(wrong[0])} than its source"
-        raise _incomplete(folder / POLICY, what, f"{found.path.name} was read again, and means something else")
+        raise unfit(folder / POLICY, what, f"{found.path.name} was read again, and means something else")
 
 
 def _meanings(ours: PolicySignature, its: PolicySignature) -> list[tuple[str, object, object]]:
