@@ -12,8 +12,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from converters.bundle.exchange import exchange, stage
@@ -58,6 +59,14 @@ def built_beside(target: Path, is_whole: Callable[[Path], bool], what: str, fix:
         raise RuntimeUnavailableError(
             f"{what} cannot be installed", where=str(target), why=str(error), fix=fix
         ) from error
+
+
+def carried_out(command: Sequence[str], folder: Path | None = None) -> tuple[int, list[str]]:
+    """(status, lines on stderr that are not blank) of a program that fetches, in ``folder`` or where we stand."""
+    done = subprocess.run(
+        command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", errors="replace"
+    )
+    return done.returncode, [line for line in done.stderr.splitlines() if line.strip()]
 
 
 def check(folder: Path, known: Mapping[str, str], fix: str) -> None:

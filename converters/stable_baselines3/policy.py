@@ -16,7 +16,7 @@ import numpy as np
 
 from converters.graph.nn.activations import clip
 from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32, INT32, INT64
+from converters.graph.types import FLOAT32, INT64
 from converters.stable_baselines3.spaces import Space, space_of
 from converters.torch_checkpoint.activations import Activation, named, told
 from converters.torch_checkpoint.archive import Archive
@@ -90,7 +90,7 @@ def to_graph(
         family.algorithm == "MaskablePPO",
     )
     observed = space_of(data, "observation_space")
-    _check_class(kwargs, observed)
+    _check_class(kwargs)
     family.build(made, observed)
     weights.check_all_read()
     algorithm = family.algorithm or _on_policy(data)
@@ -161,7 +161,7 @@ def _activation(kwargs: Mapping[str, Any], family: _Family, wanted: str | None) 
     return said
 
 
-def _check_class(kwargs: Mapping[str, Any], observed: Observed) -> None:
+def _check_class(kwargs: Mapping[str, Any]) -> None:
     """Raise SourceError where the observations go through an extractor of the user's own."""
     text = str(kwargs.get("features_extractor_class", ""))
     name = text.strip("<>'").rpartition(".")[2].strip("'")
@@ -323,9 +323,7 @@ def _continuous(made: _Built, mean: str, spread: str | None) -> None:
         raise _mixed(f"its network has {net.width(mean)} actions, and its space {made.actions.size}")
     value = mean
     if spread is not None:
-        shape = net.add("Shape", [mean], "shape", out_type=INT32)
-        noise = net.add("RandomStandardNormal", [shape], origin="action/RandomStandardNormal", dtype=FLOAT32)
-        value = net.add("Add", [mean, net.add("Mul", [noise, spread])])
+        value = net.add("Add", [mean, net.add("Mul", [net.normals_like(mean, "action"), spread])])
     low, high = made.actions.bounds()
     if made.squashed:
         value = net.add("Tanh", [value])

@@ -13,7 +13,6 @@ from typing import Any
 
 from converters.graph.nn.normalisation import layer
 from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32, INT32
 from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
@@ -265,9 +264,8 @@ def _sac(making: _Making) -> str:
     logarithm = net.add("Tanh", [net.linear(x, "fc_logstd", net.width(mean))])
     share = net.add("Mul", [net.add("Add", [logarithm, net.floats(1)]), net.floats((_HIGHEST - _LOWEST) / 2)])
     spread = net.add("Exp", [net.add("Add", [share, net.floats(_LOWEST)])])
-    shape = net.add("Shape", [mean], "shape", out_type=INT32)
-    noise = net.add("RandomStandardNormal", [shape], origin="action/RandomStandardNormal", dtype=FLOAT32)
-    net.output("action", _scaled(net, net.add("Add", [mean, net.add("Mul", [noise, spread])])))
+    noise = net.add("Mul", [net.normals_like(mean, "action"), spread])
+    net.output("action", _scaled(net, net.add("Add", [mean, noise])))
     making.outputs["action"] = Role.ACTION
     return "the action is drawn, squashed by tanh and scaled"
 

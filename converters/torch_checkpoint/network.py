@@ -177,11 +177,15 @@ class Network(Builder):
             self.at(f"{module}.log_sigma")
             log_sigma = self.const(self.state.array(f"{module}.log_sigma", 1, actions), "log_sigma")
         self.at(module)
-        shape = self.add("Shape", [mean], "shape", out_type=INT32)
-        drawn = f"{self.prefix}/RandomStandardNormal"  # which reports of lifted noise give
-        noise = self.add("RandomStandardNormal", [shape], origin=drawn, dtype=FLOAT32)
+        noise = self.normals_like(mean, self.prefix)
         spread = self.add("Mul", [noise, self.add("Exp", [log_sigma])])
         return mean, self.add("Add", [mean, spread]), conditional
+
+    def normals_like(self, mean: str, module: str) -> str:
+        """Draws from N(0, 1), one for each number of ``mean``; ``module`` is whose, as reports of lifted noise say."""
+        shape = self.add("Shape", [mean], "shape", out_type=INT32)
+        origin = f"{module}/RandomStandardNormal"
+        return self.add("RandomStandardNormal", [shape], origin=origin, dtype=FLOAT32)
 
     def highest(self, values: str) -> None:
         """The outputs of a network of values per action: ``q_values``, and as ``action`` the one of the highest."""

@@ -37,8 +37,8 @@ def histograms(output: str, comparisons: Sequence[Finding]) -> Markup:
     for decade in range(math.ceil(first), math.floor(last) + 1, 1 + int(last - first) // 8):
         x = edge(decade)
         parts.append(el("line", class_="grid", x1=x, x2=x, y1=6.0, y2=bottom))
-        parts.append(el("text", _power(decade), class_="tick", x=x, y=bottom + 14, text_anchor="middle"))
-    parts.append(el("text", "0", class_="tick", x=left + _BAR / 2, y=bottom + 14, text_anchor="middle"))
+        parts.append(_tick(_power(decade), x, bottom + 14))
+    parts.append(_tick("0", left + _BAR / 2, bottom + 14))
     for row, (c, name) in enumerate(zip(comparisons, names, strict=True)):
         base = 8 + _STRIP * (row + 1) - 2
         parts.append(el("text", name, class_="label", x=left, y=base - 25))
@@ -101,19 +101,10 @@ def drift(output: str, comparisons: Sequence[Finding], pairs: Sequence[tuple[str
     for decade in range(high, low - 1, -every):
         here = y(10.0**decade)
         parts.append(el("line", class_="grid", x1=left, x2=right, y1=here, y2=here))
-        parts.append(
-            el(
-                "text",
-                _power(decade) if decade > low else "0",
-                class_="tick",
-                x=left - 6,
-                y=here + 4,
-                text_anchor="end",
-            )
-        )
+        parts.append(_tick(_power(decade) if decade > low else "0", left - 6, here + 4, "end"))
     marked = range(0, steps, max(1, math.ceil(steps / 8)))
-    parts += [el("text", s + 1, class_="tick", x=x(s), y=bottom + 16, text_anchor="middle") for s in marked]
-    parts.append(el("text", "step", class_="tick", x=(left + right) / 2, y=bottom + 30, text_anchor="middle"))
+    parts += [_tick(str(s + 1), x(s), bottom + 16) for s in marked]
+    parts.append(_tick("step", (left + right) / 2, bottom + 30))
     bound = max(c.tolerance.atol for c in comparisons)
     if bound > 0:
         parts.append(el("line", class_="bound", x1=left, x2=right, y1=y(bound), y2=y(bound)))
@@ -174,6 +165,10 @@ def diagram_parts(blocks: Sequence[Block]) -> tuple[list[Markup], float, float, 
     described = f"Layers from {names['input']} to {names['output']}: {layers}"
     height = placed.height
     return parts, math.ceil(placed.width), height, described
+
+
+def _tick(text: str, x: float, y: float, anchor: str = "middle") -> Markup:
+    return el("text", text, class_="tick", x=x, y=y, text_anchor=anchor)
 
 
 def _power(exponent: int) -> Markup:

@@ -10,12 +10,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 from functools import partial
 from pathlib import Path
 
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
-from converters.runtimes.installed import built_beside, cache_folder, check
+from converters.runtimes.installed import built_beside, cache_folder, carried_out, check
 from converters.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
@@ -101,15 +100,12 @@ def install_packages(progress: Progress) -> Path:
 def _run_npm_ci(npm: list[str], folder: Path) -> None:
     """``npm ci`` in a folder; install scripts stay off because packages are data here, not programs to trust."""
     command = [*npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
-    done = subprocess.run(
-        command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", errors="replace"
-    )
-    if done.returncode == 0 and _has_packages(folder):
+    status, said = carried_out(command, folder)
+    if status == 0 and _has_packages(folder):
         return
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
     raise RuntimeUnavailableError(
-        f"npm ci failed with status {done.returncode}" if done.returncode else "npm ci did not install the packages",
-        why="\n".join(lines[-_STDERR_LINES:]) or "npm said nothing on stderr",
+        f"npm ci failed with status {status}" if status else "npm ci did not install the packages",
+        why="\n".join(said[-_STDERR_LINES:]) or "npm said nothing on stderr",
         fix=f"check that npm reaches its registry (npm ping), then: {INSTALL_TFJS}",
     )
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import mmap
 import shutil
 import struct
-import subprocess
 import sys
 import tempfile
 import zipfile
 from pathlib import Path
 
 from converters.runtimes.base import Progress
-from converters.runtimes.installed import built_beside
+from converters.runtimes.installed import built_beside, carried_out
 from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     LIBRARIES,
@@ -67,12 +66,9 @@ def _download(release: Release, folder: Path) -> Path:
     command = [sys.executable, "-P", "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
     command += ["--disable-pip-version-check", "--python-version", "3.6", "--platform", "manylinux1_x86_64"]
     command += ["--dest", str(folder), f"tensorflow=={release.version}"]
-    done = subprocess.run(
-        command, stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", errors="replace", check=False
-    )
+    status, said = carried_out(command)
     wheels = list(folder.glob("*.whl"))
-    if done.returncode or len(wheels) != 1:
-        said = [line for line in done.stderr.splitlines() if line.strip()]
+    if status or len(wheels) != 1:
         raise RuntimeUnavailableError(
             f"TensorFlow {release.version} could not be fetched",
             why="\n".join(said[-_ERROR_LINES:]) or "pip said nothing on stderr",

@@ -91,12 +91,8 @@ class Brain:
 
 def sensors_of(shapes: Sequence[Sequence[int]]) -> tuple[Sensor, ...]:
     """Sensors of these shapes, in this order, with Unity's default names."""
-    seen: dict[int, int] = {}
-    found = []
-    for shape in shapes:
-        found.append(Sensor.of(shape, seen.get(len(shape), 0)))
-        seen[len(shape)] = seen.get(len(shape), 0) + 1
-    return tuple(found)
+    ranks = [len(shape) for shape in shapes]
+    return tuple(Sensor.of(shape, ranks[:i].count(len(shape))) for i, shape in enumerate(shapes))
 
 
 def parse_sensors(text: str) -> tuple[Sensor, ...]:
