@@ -144,10 +144,10 @@ def _final(path: Path) -> str | None:
 def _as_step(path: Path, behavior: str) -> int | None:
     """The step of an export that was kept on the way (``<behavior>-<step>.onnx``), None where it is a final one."""
     stem, step = step_of(path.stem)
-    return step if path.suffix in STEPPED and (stem == behavior or _has_checkpoint(path, stem)) else None
+    return step if path.suffix in STEPPED and (stem == behavior or _has_checkpoint(path)) else None
 
 
-def _has_checkpoint(path: Path, stem: str) -> bool:
+def _has_checkpoint(path: Path) -> bool:
     return path.with_name(path.stem + ".ckpt.index").exists() or path.with_name(path.stem + ".pt").exists()
 
 

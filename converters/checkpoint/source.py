@@ -105,10 +105,10 @@ def newest(found: Sequence[listing.Kept], step: int | None, folder: Path) -> lis
     return wanted[-1]
 
 
-def no_such_step(step: int, steps: Sequence[int], where: str | None = None) -> UsageError:
+def no_such_step(step: int, steps: Sequence[int]) -> UsageError:
     """The error that lists the steps there are."""
     shown = ", ".join(map(str, sorted(set(steps)))) or "none"
-    return UsageError(f"--step {step}: there is no checkpoint of that step", where=where, fix=f"the steps are {shown}")
+    return UsageError(f"--step {step}: there is no checkpoint of that step", fix=f"the steps are {shown}")
 
 
 def left_out(names: Sequence[str]) -> tuple[str, ...]:

@@ -153,7 +153,7 @@ def _layers(policy: Policy) -> dict[str, str]:
     if sum(n.value is None for n in graph.nodes) > _MOST_NODES:
         return {}
     sizes = {s.name: "×".join("?" if n is None else str(n) for n in s.shape[1:]) or "1" for s in signature.inputs}
-    blocks = blocks_of(graph, sizes, [head.name for head in signature.heads])
+    blocks = blocks_of(graph, [head.name for head in signature.heads])
     ways = {head.name: chain(blocks, head.name) for head in signature.heads}
     return {name: " → ".join(sizes.get(word, word) for word in way) for name, way in ways.items()}
 

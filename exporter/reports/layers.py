@@ -30,7 +30,7 @@ class Block:
     detail: str = ""
 
 
-def blocks_of(graph: Graph, inputs: Iterable[str], outputs: Iterable[str]) -> list[Block]:
+def blocks_of(graph: Graph, outputs: Iterable[str]) -> list[Block]:
     """Blocks in topological order; ``before`` holds the places of those that a block reads from."""
     wanted = [o for o in outputs if o in graph]
     needed = graph.ancestors(wanted)

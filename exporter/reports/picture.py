@@ -27,8 +27,7 @@ def picture(policy: Policy) -> str:
     signature = policy.signature
     specs = {s.name: s for s in (*signature.inputs, *signature.outputs)}
     nodes = sum(node.value is None for node in policy.graph.nodes)
-    names = ([s.name for s in side] for side in (signature.inputs, signature.outputs))
-    blocks = blocks_of(policy.graph, *names) if nodes <= _MOST_NODES else []
+    blocks = blocks_of(policy.graph, [s.name for s in signature.outputs]) if nodes <= _MOST_NODES else []
     if not 0 < len(blocks) <= _MOST_BLOCKS:
         raise UsageError(
             f"--svg: the policy {policy.name!r} is too large for a picture ({nodes} nodes)",

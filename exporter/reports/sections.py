@@ -192,10 +192,10 @@ def policy_graph(entry: Entry) -> Markup | None:
     """The layers as a picture, and every node in a list that opens."""
     if entry.graph is None or entry.signature is None:
         return None
-    inputs, outputs = ([s.name for s in specs] for specs in (entry.signature.inputs, entry.signature.outputs))
+    outputs = [s.name for s in entry.signature.outputs]
     nodes = [n for n in entry.graph.nodes if n.value is None]
     content: list[Child] = []
-    blocks = blocks_of(entry.graph, inputs, outputs) if len(nodes) <= _MOST_NODES else []
+    blocks = blocks_of(entry.graph, outputs) if len(nodes) <= _MOST_NODES else []
     if 0 < len(blocks) <= _MOST_BLOCKS:
         picture = el("div", charts.diagram(blocks), class_="scroll", tabindex=0, role="region", aria_label="Layers")
         content.append(el("figure", picture, class_="diagram"))

@@ -23,9 +23,8 @@ from fixtures import path as fixture
 def blocks(path: Path) -> list[list[Block]]:
     found = []
     for policy in read_source(path).policies(CompileOptions()):
-        signature = policy.signature
-        inputs, outputs = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
-        made = blocks_of(policy.graph, inputs, outputs)
+        outputs = [s.name for s in policy.signature.outputs]
+        made = blocks_of(policy.graph, outputs)
         needed = policy.graph.ancestors(outputs)
         drawn = sorted(n.name for b in made for n in b.nodes)
         assert drawn == sorted(n.name for n in policy.graph.nodes if n.name in needed and n.value is None)
@@ -56,7 +55,7 @@ def test_layers_have_the_names_that_people_use(name: str, titles: set[str]) -> N
 @pytest.mark.parametrize("op", sorted(SAMPLERS))
 def test_every_sampler_is_a_draw(op: str) -> None:
     graph = Graph((Node("in", "Placeholder"), Node("out", op, ("in",))))
-    assert [b.title for b in blocks_of(graph, ["in"], ["out"])] == ["in", "draw", "out"]
+    assert [b.title for b in blocks_of(graph, ["out"])] == ["in", "draw", "out"]
 
 
 @st.composite
@@ -79,7 +78,7 @@ def graphs(draw: st.DrawFn) -> Graph:
 @given(graphs())
 def test_no_graph_gives_a_circle(graph: Graph) -> None:
     last = graph.nodes[-1].name
-    made = blocks_of(graph, ["in0", "in1"], [last])
+    made = blocks_of(graph, [last])
     assert all(place < i for i, block in enumerate(made) for place in block.before)
     assert {n.name for b in made for n in b.nodes} == {n for n in graph.ancestors([last]) if n != "w"}
 

@@ -105,7 +105,7 @@ def _strided_slice(node: Node, x: np.ndarray, begin: np.ndarray, end: np.ndarray
     return np.asarray(x[tuple(index)])
 
 
-def _strided_operands(node: Node, args: Sequence[TensorType]) -> tuple[list[int], list[int], list[int]] | None:
+def _strided_operands(args: Sequence[TensorType]) -> tuple[list[int], list[int], list[int]] | None:
     values = [a.constant for a in args[1:4]]
     if any(v is None for v in values):
         return None
@@ -115,7 +115,7 @@ def _strided_operands(node: Node, args: Sequence[TensorType]) -> tuple[list[int]
 
 def _infer_strided_slice(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     shape = args[0].shape
-    operands = _strided_operands(node, args)
+    operands = _strided_operands(args)
     if shape is None or operands is None:
         return [TensorType(args[0].dtype, None)]
     steps = strided_steps(node, len(shape), *operands)
@@ -141,7 +141,7 @@ def _infer_strided_slice(node: Node, args: Sequence[TensorType], symbols: Symbol
 
 def _lower_strided_slice(node: Node, builder: OnnxBuilder) -> Any:
     kind = builder.type_of(node.inputs[0])
-    operands = _strided_operands(node, [builder.type_of(r) for r in node.inputs])
+    operands = _strided_operands([builder.type_of(r) for r in node.inputs])
     if operands is None or kind.shape is None:
         raise not_constant(node, "the bounds of a slice")
     steps = strided_steps(node, len(kind.shape), *operands)
