@@ -6,19 +6,22 @@ Runtimes approximate some functions, each in its own way: ``ops/approximations.p
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from converters.graph.nodes import Node
 from converters.graph.ops.approximations import APPROXIMATIONS, RANGES
 from converters.graph.ops.base import OpDef
+from converters.graph.ops.linear import matmul
 from converters.graph.shapes import run_kernel
 
 #: Of functions that were not measured.
 _ELSE = (4.0, 0.0)
 #: Operands of more elements are not moved one by one, which a policy of some megabytes takes seconds for.
 _MOST_DRAWN = 1 << 22
+#: Elements that are moved at once, which fit into caches.
+_AT_ONCE = 1 << 16
 #: Mean square of one unit in the last place, in ε² of the number it is of: mantissas spread as logarithms do.
 _UNIT = 0.75 / (2 * math.log(2))
 
@@ -63,16 +66,20 @@ class Jitter:
         """Every float moved up or down; zeros stay."""
         if array.dtype.kind != "f":
             return array
-        signs = np.asarray(self._random.random(array.shape) - 0.5, array.dtype)
-        with np.errstate(all="ignore"):
-            step = _spacing(array)
+
+        def move(some: np.ndarray) -> np.ndarray:
+            signs = np.asarray(self._random.random(some.shape) - 0.5, some.dtype)
+            step = _spacing(some)
             if ulps != 1:
                 step = step * ulps
             if absolute:
                 step = np.maximum(step, absolute)
-            moved = np.asarray(array + np.copysign(step, signs))
-        np.copyto(moved, array, where=(array == 0) | ~np.isfinite(array))
-        return moved
+            moved = np.asarray(some + np.copysign(step, signs))
+            np.copyto(moved, some, where=(some == 0) | ~np.isfinite(some))
+            return moved
+
+        with np.errstate(all="ignore"):
+            return _piecewise(move, array)
 
     def _added_up(
         self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]
@@ -91,13 +98,31 @@ class Jitter:
             terms = operands[1].size / max(1, results[0].shape[-1])
         with np.errstate(all="ignore"):
             terms = terms / 16 + _UNIT * sum(a.size > _MOST_DRAWN for a in operands)
-            squares = run_kernel(entry, node, [np.square(a) if a.dtype.kind == "f" else a for a in operands])
-            moved = []
-            for result, square in zip(results, squares, strict=True):
+            if entry.kernel is matmul:
+                squares: Sequence[np.ndarray] = [matmul(node, operands[0], operands[1], squared=True)]
+            else:
+                squares = run_kernel(entry, node, [np.square(a) if a.dtype.kind == "f" else a for a in operands])
+
+            def move(result: np.ndarray, square: np.ndarray) -> np.ndarray:
                 step = np.finfo(result.dtype).eps * np.sqrt(terms * np.maximum(square, 0))
                 signs = self._signs(result.shape)
-                moved.append(np.where(np.isfinite(step), result + signs * step, result).astype(result.dtype))
-        return moved
+                return np.where(np.isfinite(step), result + signs * step, result).astype(result.dtype)
+
+            return [_piecewise(move, *pair) for pair in zip(results, squares, strict=True)]
+
+
+def _piecewise(move: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+    """What ``move`` makes of arrays of one shape, element by element, in their order; of large ones a piece at a time,
+    so that what it takes on the way is never held for all of them. Chance comes in the order of the elements.
+    """
+    first = arrays[0]
+    if first.size <= _AT_ONCE or not all(a.flags.c_contiguous and a.shape == first.shape for a in arrays):
+        return move(*arrays)
+    moved = np.empty(first.shape, first.dtype)
+    flat, into = [a.reshape(-1) for a in arrays], moved.reshape(-1)
+    for i in range(0, first.size, _AT_ONCE):
+        into[i : i + _AT_ONCE] = move(*(a[i : i + _AT_ONCE] for a in flat))
+    return moved
 
 
 def _spacing(array: np.ndarray) -> np.ndarray:

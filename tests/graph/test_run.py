@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node
+from converters.graph.ops.linear import matmul
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from signatures.errors import ExportModelError, GraphError
@@ -119,6 +122,58 @@ def test_what_rounding_moves_it_moves_by_units_in_the_last_place(dtype: str, ulp
             moved = np.where(up, array + step, array - step)
         expected = np.where((array == 0) | ~np.isfinite(array), array, moved)
         np.testing.assert_array_equal(Jitter(3)._moved(array, ulps, absolute), expected)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("shape", [(), (1,), (1 << 16,), (65537,), (3, 50_000), (2, 3, 33_333), (400, 401)], ids=str)
+def test_what_is_moved_piece_by_piece_is_moved_as_the_whole_is(
+    dtype: str, shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random = np.random.default_rng(1)
+    given = (random.standard_normal(shape) * 10.0 ** random.integers(-9, 5, shape)).astype(dtype)
+    given = np.where(random.random(shape) < 0.01, random.choice([0.0, -0.0, np.nan, np.inf, 1e-7], shape), given)
+    array = np.asarray(given, dtype)
+    entry, each = TABLE["MatMul"], Node("y", "MatMul")
+    left, right = (random.standard_normal(s).astype(dtype) for s in ((700, 5), (5, 300)))
+
+    def moved() -> list[bytes]:
+        jitter = Jitter(7)
+        made = [jitter._moved(a, *how) for a in (array, array.T) for how in ((), (2.37, 1e-6))]
+        return [m.tobytes() for m in (*made, *jitter.results(entry, each, [left, right], [left @ right]))]
+
+    pieces = moved()
+    monkeypatch.setattr("converters.graph.jitter._AT_ONCE", 1 << 30)
+    assert pieces == moved()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("piece", [100, 1 << 16])
+def test_a_product_of_squares_is_that_of_the_squared_operands(
+    piece: int, turned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random = np.random.default_rng(2)
+    a, b = random.standard_normal((3, 50)).astype(np.float32), random.standard_normal((50, 17)).astype(np.float32)
+    b = b.T.copy() if turned else b
+    monkeypatch.setattr("converters.graph.ops.linear._LARGE", piece)
+    monkeypatch.setattr("converters.graph.ops.linear._AT_ONCE", piece)
+    each = Node("y", "MatMul", attrs={"transpose_b": turned})
+    expected = matmul(each, np.square(a), np.square(b))
+    assert matmul(each, a, b, squared=True).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_rounding_makes_of_a_large_layer_is_computed_without_another_one(turned: bool) -> None:
+    weights = np.resize(np.random.default_rng(3).standard_normal(2111).astype(np.float32), (2048, 2304))
+    product = Node("y", "MatMul", ("x", "w"), {"transpose_b": turned})
+    graph = Graph((Node("x", "Placeholder"), Node("w", "Const", value=weights), product))
+    feeds = {"x": np.ones((2, weights.shape[turned]), np.float32)}
+    run_graph(graph, feeds, ["y"], Jitter(1))
+    tracemalloc.start()
+    try:
+        run_graph(graph, feeds, ["y"], Jitter(1))
+        assert tracemalloc.get_traced_memory()[1] < weights.nbytes / 4
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("arithmetic", ["processor", "graphics"])

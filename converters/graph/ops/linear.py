@@ -34,7 +34,8 @@ T = type_attr()
 _LARGE, _AT_ONCE = 1 << 22, 1 << 16
 
 
-def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def matmul(node: Node, a: np.ndarray, b: np.ndarray, *, squared: bool = False) -> np.ndarray:
+    """The product in float64, rounded; ``squared``: of what the operands are when squared, in their own dtype."""
     if node.attrs.get("transpose_a") or node.attrs.get("adj_x"):
         a = np.swapaxes(a, -1, -2)
     if node.attrs.get("transpose_b") or node.attrs.get("adj_y"):
@@ -42,23 +43,33 @@ def _matmul(node: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         if a.dtype.kind != "f":
             return np.asarray(a @ b)
-        return _product(a.astype(np.float64), b).astype(a.dtype)
+        left = np.square(a) if squared else a
+        return _product(left.astype(np.float64), b, _square if squared else _same).astype(a.dtype)
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _same(part: np.ndarray) -> np.ndarray:
+    return part.astype(np.float64)
+
+
+def _square(part: np.ndarray) -> np.ndarray:
+    squares: np.ndarray = np.square(part)
+    return squares.astype(np.float64)
+
+
+def _product(a: np.ndarray, b: np.ndarray, wide: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """In float64; of a large matrix a piece at a time, as it lies in memory: it is never held in twice its bytes
     (which takes longer, too).
     """
     if b.size <= _LARGE or b.ndim > 2:
-        return np.asarray(a @ b.astype(np.float64))
+        return np.asarray(a @ wide(b))
     if b.strides[0] < b.strides[1]:  # transposed
         step = max(1, _AT_ONCE // len(b))
-        columns = [a @ b[:, i : i + step].astype(np.float64) for i in range(0, b.shape[1], step)]
+        columns = [a @ wide(b[:, i : i + step]) for i in range(0, b.shape[1], step)]
         return np.concatenate(columns, axis=-1)
     step = max(1, _AT_ONCE // b.shape[1])
     total = np.zeros((*a.shape[:-1], b.shape[1]))
     for i in range(0, len(b), step):
-        total += a[..., i : i + step] @ b[i : i + step].astype(np.float64)
+        total += a[..., i : i + step] @ wide(b[i : i + step])
     return total
 
 
@@ -134,7 +145,7 @@ def lower_activated(node: Node, value: str, builder: OnnxBuilder) -> str:
 
 def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
-        return activated(node, _matmul(node, a, b) + bias)
+        return activated(node, matmul(node, a, b) + bias)
 
 
 def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
@@ -268,8 +279,8 @@ _GRADIENT = (Attr("grad_a", "bool", False, since="2.16"), Attr("grad_b", "bool",
 _ADJOINED = (Attr("adj_x", "bool", False), Attr("adj_y", "bool", False))
 
 OPS = (
-    _dense("MatMul", _matmul, _lower_matmul, (*_TRANSPOSED, *_GRADIENT), fused="_FusedMatMul"),
-    _dense("BatchMatMul", _matmul, _lower_matmul, _ADJOINED, spellings=("BatchMatMulV2", "BatchMatMulV3")),
+    _dense("MatMul", matmul, _lower_matmul, (*_TRANSPOSED, *_GRADIENT), fused="_FusedMatMul"),
+    _dense("BatchMatMul", matmul, _lower_matmul, _ADJOINED, spellings=("BatchMatMulV2", "BatchMatMulV3")),
     _dense("_FusedMatMul", _fused_matmul, _lower_fused_matmul, (*_TRANSPOSED, *FUSED), since="1.15"),
     OpDef(
         "BiasAdd",
