@@ -18,8 +18,8 @@ from signatures.errors import DamagedFileError, SourceError
 MAX_BYTES = (2 << 30) - 1
 #: Weights that lie beside a model, all together; no policy comes near it.
 MAX_WEIGHTS = 16 << 30
-#: Bytes from which on a file is asked for holes, and how many of them are looked at.
-_LARGE_HOLE, _MOST_HOLES = 1 << 24, 1 << 16
+#: Bytes from which on a file is asked for holes (fewer zeros are read at no cost), and how many are looked at.
+_LARGE_HOLE, _MOST_HOLES = 1 << 28, 1 << 16
 #: What has become a pipe since it was looked at is not waited for.
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 #: Folders of huggingface_hub's cache, in that of a repository: a folder for each revision, and the files of all.
@@ -115,7 +115,7 @@ def opened(path: Path, most: int = MAX_BYTES) -> BinaryIO:
                 f"is said to have {status.st_size} bytes, most of which were never written",
                 where=str(path),
                 why="it is a hole, as a copy or a download leaves one that was cut off",
-                fix="copy or download it again",
+                fix="copy or download it again; if it is whole, give what cp --sparse=never makes of it",
             )
     except BaseException:
         file.close()

@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 import socket
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -193,6 +194,24 @@ def test_a_file_with_some_holes_is_read(tmp_path: Path) -> None:
         file.seek(10 << 20, os.SEEK_CUR)
         file.write(b"\1")
     assert len(read_bytes(path)) == (30 << 20) + 1
+
+
+@pytest.mark.parametrize(("size", "is_read"), [(200 << 20, True), (256 << 20, False)])
+def test_a_file_of_zeros_is_read_where_that_costs_nothing(size: int, is_read: bool, tmp_path: Path) -> None:
+    """ZFS and cp --sparse=always keep zeros that were written as holes."""
+    path = tmp_path / "weights"
+    with path.open("wb") as file:
+        file.write(b"\1")
+        file.truncate(size)
+    if is_read:
+        assert len(read_bytes(path)) == size
+        return
+    with pytest.raises(SourceError, match="never written") as caught:
+        read_bytes(path)
+    assert "cp --sparse=never" in str(caught.value.fix)
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "--sparse=never", path, copy], check=True)
+    assert len(read_bytes(copy)) == size
 
 
 def test_files_that_are_only_hashed_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
