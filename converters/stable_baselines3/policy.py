@@ -14,11 +14,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from converters.graph.nn.activations import clip
+from converters.graph.nn.activations import Activation, clip
 from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32, INT64
 from converters.stable_baselines3.spaces import Space, space_of
-from converters.torch_checkpoint.activations import Activation, named, told
+from converters.torch_checkpoint.activations import named, told
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.weights import Weights, pytorch_alone

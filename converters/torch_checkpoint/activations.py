@@ -9,49 +9,26 @@ lie. Of that file the lines ``key: value`` are read by their indentation; nothin
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 from converters.fetch import Fetched
-from converters.graph.builder import Builder
 from converters.graph.nn.activations import (
+    NAMED,
+    Activation,
     celu,
     clip,
-    elu,
-    gelu,
     hard_sigmoid,
     hard_swish,
     leaky_relu,
     log_sigmoid,
-    mish,
-    selu,
-    swish,
 )
 from signatures.errors import SourceError, UsageError
 
-Activation = Callable[[Builder, str], str]
 LEAKY_SLOPE = 0.01
-
-
-def _plain(op: str) -> Activation:
-    return lambda b, x: b.add(op, [x])
-
-
 _KNOWN: dict[str, Activation] = {
-    "relu": _plain("Relu"),
-    "tanh": _plain("Tanh"),
-    "sigmoid": _plain("Sigmoid"),
-    "softplus": _plain("Softplus"),
-    "softsign": _plain("Softsign"),
-    "elu": elu,
-    "selu": selu,
-    "celu": celu,
+    **NAMED,
     "crelu": celu,
-    "gelu": gelu,
-    "silu": swish,
-    "swish": swish,
-    "mish": mish,
     "leakyrelu": partial(leaky_relu, alpha=LEAKY_SLOPE),
     "lrelu": partial(leaky_relu, alpha=LEAKY_SLOPE),
     "relu6": partial(clip, low=0, high=6),

@@ -11,9 +11,9 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from converters.graph.nn.activations import Activation
 from converters.graph.nn.normalisation import layer
 from converters.graph.nodes import Graph
-from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.rsl_rl import per_action

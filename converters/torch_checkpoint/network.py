@@ -12,12 +12,11 @@ import re
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.nn.activations import clip
+from converters.graph.nn.activations import Activation, clip
 from converters.graph.nn.linear import matmul
 from converters.graph.nn.recurrent import gru, lstm
 from converters.graph.nodes import NameScope, Node
 from converters.graph.types import FLOAT32, INT32, INT64
-from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.weights import Weights
 
 #: Added before a logarithm (``EPSILON`` in distributions.py).

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from converters.graph.nn.activations import Activation
 from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32
-from converters.torch_checkpoint.activations import Activation
 from converters.torch_checkpoint.archive import Archive
 from converters.torch_checkpoint.network import Network
 from converters.torch_checkpoint.weights import Weights, pytorch_alone

@@ -6,9 +6,11 @@ Formulas: onnx/docs/Operators.md; Unity Barracuda's are the same (ReferenceCPUOp
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 
 from converters.graph.builder import Builder
 
+Activation = Callable[[Builder, str], str]
 #: The constants of tf.nn.selu and torch.nn.SELU.
 SELU_ALPHA, SELU_GAMMA = 1.67326319217681884765625, 1.05070102214813232421875
 _CLOSE = 1e-6
@@ -120,3 +122,24 @@ def gelu(b: Builder, x: str, *, tanh: bool = False) -> str:
     else:
         bell = b.add("Erf", [b.add("Mul", [x, b.number(x, math.sqrt(0.5))])])
     return b.add("Mul", [half, b.add("Add", [bell, b.number(x, 1)])])
+
+
+# ------------------------------------------------------------------ by name
+
+
+def of_op(op: str) -> Activation:
+    """The one that is an op itself."""
+    return lambda b, x: b.add(op, [x])
+
+
+#: What Keras and PyTorch call alike.
+NAMED: Mapping[str, Activation] = {
+    **{op.lower(): of_op(op) for op in ("Relu", "Tanh", "Sigmoid", "Softplus", "Softsign")},
+    "elu": elu,
+    "selu": selu,
+    "celu": celu,
+    "gelu": gelu,
+    "silu": swish,
+    "swish": swish,
+    "mish": mish,
+}

@@ -7,14 +7,14 @@ state's kernel, ``bias`` [gates·H] the sum of the input's and the state's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from converters.graph.builder import Builder
+from converters.graph.nn.activations import Activation
 
 Array = np.ndarray
-Activation = Callable[[Builder, str], str]
 
 
 def tanh(b: Builder, x: str) -> str:

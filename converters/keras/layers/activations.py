@@ -10,16 +10,11 @@ from typing import Any
 
 from converters.graph.builder import Builder
 from converters.graph.nn import activations as nn
+from converters.graph.nn.activations import Activation
 from converters.graph.nn.reduction import over_last_axis
 from converters.keras.layers.step import Step, Translate
 from converters.keras.model import layer_of
 from signatures.errors import UnsupportedOpError
-
-Activation = Callable[[Builder, str], str]
-
-
-def _op(name: str) -> Activation:
-    return lambda b, x: b.add(name, [x])
 
 
 def _softmax(op: str) -> Activation:
@@ -45,21 +40,10 @@ def _glu(b: Builder, x: str) -> str:
 
 _OLD_HARD_SIGMOID: Activation = lambda b, x: nn.hard_sigmoid(b, x, 0.2, 0.5)  # noqa: E731
 _ACTIVATIONS: Mapping[str, Activation] = {
+    **nn.NAMED,
     "linear": lambda b, x: x,
-    "relu": _op("Relu"),
-    "relu6": _op("Relu6"),
-    "sigmoid": _op("Sigmoid"),
-    "tanh": _op("Tanh"),
-    "elu": nn.elu,
-    "selu": nn.selu,
-    "celu": nn.celu,
-    "softplus": _op("Softplus"),
-    "softsign": _op("Softsign"),
-    "exponential": _op("Exp"),
-    "swish": nn.swish,
-    "silu": nn.swish,
-    "mish": nn.mish,
-    "gelu": nn.gelu,
+    "relu6": nn.of_op("Relu6"),
+    "exponential": nn.of_op("Exp"),
     "gelu_new": lambda b, x: nn.gelu(b, x, tanh=True),
     "leaky_relu": lambda b, x: nn.leaky_relu(b, x, 0.2),
     "hard_sigmoid": lambda b, x: nn.hard_sigmoid(b, x, 1 / 6, 0.5),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nn import recurrent as nn
+from converters.graph.nn.activations import Activation
 from converters.graph.types import FLOAT32
 from converters.keras.layers.activations import activation_of
 from converters.keras.layers.step import Step, Translate
@@ -65,8 +66,8 @@ def _gru(
     kernel: np.ndarray,
     inner: np.ndarray,
     bias: np.ndarray | None,
-    activation: nn.Activation,
-    gate: nn.Activation,
+    activation: Activation,
+    gate: Activation,
 ) -> Turn:
     b = step.net
     kernels, recurrent = ([b.const(p.copy(), "kernel") for p in np.split(a, 3, axis=1)] for a in (kernel, inner))
