@@ -47,6 +47,8 @@ class Role(StrEnum):
 
 
 OBSERVATIONS = (Role.VECTOR, Role.VISUAL, Role.ENTITIES)
+#: As Unity orders sensors by the names that it gives them: BufferSensor, CameraSensor, VectorSensor.
+SENSOR_ORDER = (Role.ENTITIES, Role.VISUAL, Role.VECTOR)
 INPUT_ROLES = (
     *OBSERVATIONS,
     Role.NOISE,

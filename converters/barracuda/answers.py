@@ -12,7 +12,7 @@ import numpy as np
 
 from converters.barracuda.format import NnModel, parse
 from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
-from converters.barracuda.lower import HEADS, INPUT_NAMES, base_name
+from converters.barracuda.lower import INPUT_NAMES, base_name
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node
 from converters.graph.passes.noise import samplers
@@ -21,7 +21,7 @@ from converters.graph.run import run_graph
 from signatures.contract import EMBEDDED, json_of, parse_signature
 from signatures.errors import DamagedFileError
 from signatures.fields import Field, FieldError
-from signatures.roles import Role
+from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import PolicySignature, TensorSpec
 
 Array = np.ndarray
@@ -128,7 +128,7 @@ class NnPolicy:
 
     def _head(self, spec: TensorSpec) -> str:
         """The action that a companion stands beside."""
-        heads = [base_name(s) for s in self.signature.outputs if base_name(s) in HEADS]
+        heads = [base_name(s) for s in self.signature.outputs if base_name(s) in ACTION_NAMES]
         if spec.role is Role.LOG_PROBS or spec.dtype.startswith("int"):
             return next(h for h in heads if self._discrete(h))
         return next(h for h in heads if not self._discrete(h))

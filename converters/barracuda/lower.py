@@ -38,7 +38,7 @@ from converters.graph.types import BATCH, Dim
 from converters.policy import Policy
 from signatures.errors import SignatureError
 from signatures.records import dataclass
-from signatures.roles import Role
+from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, Role
 from signatures.spec import TensorSpec
 
 #: What ML-Agents calls the layout of names and constants that is written here.
@@ -49,8 +49,6 @@ _IMAGE_NCHW: Axes = (0, 3, 1, 2)
 #: What ML-Agents calls the inputs that there is one of.
 INPUT_NAMES = {Role.MASKS: "action_masks", Role.PREV_ACTION: "prev_action", Role.NOISE: "epsilon"}
 _EXTRA = {Role.VALUE: "value_estimate", Role.ACTION_PROBS: "action_probs"}
-#: What an action is called: alone, or by its kind.
-HEADS = ("action", "continuous_actions", "discrete_actions")
 #: The parts of a memory that does not say of how many it is made; ML-Agents asks for a ``_c`` and a ``_h``.
 _PARTS = ("c", "h")
 
@@ -83,9 +81,10 @@ class _Lowering:
         self.graph: Graph = fuse(policy.graph, policy.fetches.values(), activations=False)
         self.inputs: list[NnInput] = []
         self.parts = self._memory_parts()
-        self.heads = [s for s in self.signature.outputs if base_name(s) in HEADS]
-        taken = [*HEADS, *INPUT_NAMES.values(), *_EXTRA.values(), *_CONSTANTS, "vector_observation", "recurrent_in"]
-        taken += [f"visual_observation_{i}" for i in range(len(self.signature.inputs))]
+        self.heads = [s for s in self.signature.outputs if base_name(s) in ACTION_NAMES]
+        taken = [*ACTION_NAMES, *CONSTANT_NAMES, *INPUT_NAMES.values(), *_EXTRA.values()]
+        cameras = (f"visual_observation_{i}" for i in range(len(self.signature.inputs)))
+        taken += ["vector_observation", "recurrent_in", *cameras]
         taken += [name for part in self.parts for name in (part.taken, part.given)]
         taken += [base_name(spec) for spec in self.signature.outputs]
         self.b = NnBuilder(infer_types(self.graph), taken)
@@ -306,16 +305,6 @@ class _Lowering:
         constants = {n: np.array([number], np.float32) for n, number in self._constants().items()}
         memories = [NnMemory((1, 1, 1, p.size), p.taken, p.given) for p in self.parts]
         return assembled(self.b, self.inputs, self.outputs, constants, memories)
-
-
-_CONSTANTS = (
-    "version_number",
-    "memory_size",
-    "is_continuous_control",
-    "action_output_shape",
-    "continuous_action_output_shape",
-    "discrete_action_output_shape",
-)
 
 
 _PASSED = ("Reshape", "Cast", "Identity", "ExpandDims", "Squeeze")

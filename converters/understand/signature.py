@@ -21,14 +21,13 @@ from converters.understand.observations import highest_colour, normaliser
 from converters.understand.outputs import LOG_PROBS
 from signatures.errors import SignatureError
 from signatures.labels import remaining
-from signatures.roles import OBSERVATIONS, Role, canonical_name, numbers
+from signatures.roles import ACTION_NAMES, OBSERVATIONS, Role, canonical_name, numbers
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
 
 _INPUT_ORDER = (*OBSERVATIONS, Role.MASKS, Role.PREV_ACTION, Role.MEMORY_IN, Role.NOISE, Role.PARAMETER)
-_HEAD_NAMES = ("action", "continuous_actions", "discrete_actions")
 _OUTPUT_ORDER = (
-    *_HEAD_NAMES,
-    *(f"deterministic_{name}" for name in _HEAD_NAMES),
+    *ACTION_NAMES,
+    *(f"deterministic_{name}" for name in ACTION_NAMES),
     LOG_PROBS,
     "action_probs",
     "value_estimate",

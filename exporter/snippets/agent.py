@@ -9,11 +9,8 @@ from __future__ import annotations
 import re
 
 from exporter.snippets.contract import Bundle, branch_lines, class_name, filled, folded, numbered
-from signatures.roles import Role
+from signatures.roles import SENSOR_ORDER, Role
 from signatures.spec import TensorSpec
-
-#: The order in which a policy's observations are sensors where their names do not say it.
-_ORDER = (Role.ENTITIES, Role.VISUAL, Role.VECTOR)
 
 
 def agent(bundle: Bundle) -> str:
@@ -47,7 +44,7 @@ def _sensors(bundle: Bundle) -> list[TensorSpec]:
     numbers = {s.name: int(s.name.removeprefix("obs_")) for s in specs if re.fullmatch("obs_[0-9]+", s.name)}
     if len(numbers) == len(specs):
         return sorted(specs, key=lambda s: numbers[s.name])
-    return sorted(specs, key=lambda s: _ORDER.index(s.role))
+    return sorted(specs, key=lambda s: SENSOR_ORDER.index(s.role))
 
 
 def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) -> list[str]:

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from converters.barracuda.format import NnModel
-from converters.barracuda.lower import HEADS, base_name
+from converters.barracuda.lower import base_name
 from converters.policy import Policy
-from signatures.roles import Role
+from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import TensorSpec
 from tests.barracuda.reference import evaluate
 
@@ -64,9 +64,9 @@ def answered(policy: Policy, model: NnModel, feeds: Arrays, dtype: type = np.flo
         name = base_name(spec)
         if spec.role is Role.MEMORY_OUT:
             found[spec.name] = np.concatenate([values[m.output].reshape(rows, -1) for m in model.memories], axis=1)
-        elif name in HEADS and spec.role is Role.DETERMINISTIC and spec.dtype.startswith("int"):
+        elif name in ACTION_NAMES and spec.role is Role.DETERMINISTIC and spec.dtype.startswith("int"):
             found[spec.name] = best(values[name].reshape(rows, -1), signature.branches)
-        elif name in HEADS or spec.role in (Role.VALUE, Role.ACTION_PROBS):
+        elif name in ACTION_NAMES or spec.role in (Role.VALUE, Role.ACTION_PROBS):
             found[spec.name] = values[name].reshape(rows, -1)
     return found
 
@@ -83,9 +83,9 @@ def wanted(policy: Policy, answers: Arrays) -> dict[str, Array]:
     scores = [s.name for s in policy.signature.outputs if s.role is Role.LOG_PROBS]
     for spec in policy.signature.outputs:
         value = answers[spec.name]
-        if base_name(spec) in HEADS and spec.role is Role.SAMPLED:
+        if base_name(spec) in ACTION_NAMES and spec.role is Role.SAMPLED:
             value = answers[scores[0]]
-        elif base_name(spec) in HEADS and spec.role is Role.PROBS:
+        elif base_name(spec) in ACTION_NAMES and spec.role is Role.PROBS:
             with np.errstate(divide="ignore"):
                 value = np.log(value)
         found[spec.name] = np.asarray(value, np.float64).reshape(len(value), -1)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from converters.barracuda.format import NnModel, parse
-from converters.barracuda.lower import HEADS, base_name
+from converters.barracuda.lower import base_name
 from converters.barracuda.vocabulary import LayerType
 from converters.barracuda.writer import write
 from converters.format import WriteOptions
@@ -28,7 +28,7 @@ from converters.policy import Policy
 from exporter.export.sources import read_source
 from signatures.contract import EMBEDDED
 from signatures.errors import SignatureError, UnsupportedOpError
-from signatures.roles import Role
+from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import Memory, PolicySignature, TensorSpec
 from tests import known
 from tests.barracuda.accepted import assert_accepted
@@ -61,7 +61,7 @@ def assert_answers(policy: Policy, model: NnModel, batches: tuple[int, ...] = (1
         expected = wanted(policy, run_graph(policy.graph, feeds, [s.name for s in policy.signature.outputs]))
         got, rounded = (answered(policy, model, feeds, dtype) for dtype in (np.float64, np.float32))
         outputs = policy.signature.outputs
-        assert set(got) >= {s.name for s in outputs if base_name(s) in HEADS or s.role is Role.MEMORY_OUT}
+        assert set(got) >= {s.name for s in outputs if base_name(s) in ACTION_NAMES or s.role is Role.MEMORY_OUT}
         for name, value in got.items():
             # The kernels round to float32 after every op: how much that is, the same rules tell in float32.
             with np.errstate(invalid="ignore"):

@@ -11,11 +11,10 @@ from converters.targets.mlagents.dressing import Dressing, row
 from converters.targets.mlagents.feeding import supply_masks
 from converters.understand.action import action_meaning
 from signatures.records import dataclass
-from signatures.roles import Role
+from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import TensorSpec
 
 _DISCRETE = (Role.SAMPLED, Role.LOG_PROBS, Role.PROBS, Role.DETERMINISTIC)
-_HEADS = ("action", "continuous_actions", "discrete_actions")
 #: What is taken from the scores of a forbidden action, as the torch exporter does it (networks.py, 0.22 on).
 _FORBIDDEN = 1e8
 
@@ -31,7 +30,7 @@ class Heads:
 def heads(dressing: Dressing) -> Heads:
     """Which outputs are the actions."""
     signature = dressing.policy.signature
-    own = [s for s in signature.outputs if s.name in _HEADS or s.name.rpartition("/")[2] in _HEADS]
+    own = [s for s in signature.outputs if s.name.rpartition("/")[2] in ACTION_NAMES]
     return Heads(
         next((s for s in own if s.is_continuous), None),
         next((s for s in own if s.role in _DISCRETE and not s.is_continuous), None),

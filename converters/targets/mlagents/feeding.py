@@ -14,10 +14,9 @@ import numpy as np
 
 from converters.graph.types import BATCH, FLOAT32, INT32
 from converters.targets.mlagents.dressing import Dressing
-from signatures.roles import Role
+from signatures.roles import SENSOR_ORDER, Role
 from signatures.spec import TensorSpec
 
-_SENSOR_ORDER = (Role.ENTITIES, Role.VISUAL, Role.VECTOR)
 _OBS = re.compile(r"(?:.*/)?obs_(\d+)(?::0)?")
 MASKS, PREVIOUS = "action_masks", "prev_action"
 
@@ -30,7 +29,7 @@ def observation_names(dressing: Dressing) -> list[tuple[str, TensorSpec]]:
         return sorted(
             ((f"obs_{m[1]}", s) for m, s in zip(numbers, specs, strict=True) if m), key=lambda p: int(p[0][4:])
         )
-    ranked = sorted(specs, key=lambda s: _SENSOR_ORDER.index(s.role))
+    ranked = sorted(specs, key=lambda s: SENSOR_ORDER.index(s.role))
     if len(ranked) > 1 and {s.role for s in ranked} != {Role.VECTOR}:
         names = ", ".join(f"obs_{i} = {s.name}" for i, s in enumerate(ranked))
         dressing.notes.append(f"sensors are fed in the order of their names; this file takes {names}")

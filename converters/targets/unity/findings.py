@@ -30,6 +30,11 @@ class Finding:
         return {"severity": self.severity.value, "message": self.message, "where": self.where, "fix": self.fix}
 
 
+def warning(message: str, where: str, fix: str) -> Finding:
+    """What does not end anything."""
+    return Finding(Severity.WARNING, message, where, fix)
+
+
 @dataclass(frozen=True, slots=True)
 class Thrown:
     """An exception of Unity's: its C# class, its message, what in the file it comes from, how to mend it.

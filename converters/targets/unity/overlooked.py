@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Collection, Iterator, Mapping
 
 from converters.targets.unity.consumers import Consumer, Engine
-from converters.targets.unity.findings import Finding, Severity, Thrown, UnityThrows
+from converters.targets.unity.findings import Finding, Thrown, UnityThrows, warning
 from converters.targets.unity.model import (
     ACTION,
     CONTINUOUS,
@@ -69,11 +69,11 @@ def _outputs(model: CheckedModel, fetched: Mapping[str, tuple[str, ...] | Thrown
     for names in fetched.values():
         if isinstance(names, Thrown):
             text = f"a player throws {names.exception} when it looks for the outputs to fetch"
-            yield _found(text, names.where, names.fix)
+            yield warning(text, names.where, names.fix)
             continue
         for name in names:
             if name not in model.outputs and not (name == RECURRENT_OUT and model.memories):
-                yield _found(
+                yield warning(
                     f"a player fetches the output {name}, which the file does not have",
                     f"output {name}",
                     f"name the output {name}; --for {profile} does",
@@ -86,7 +86,7 @@ def _kinds(brain: Brain, fetched: Mapping[str, tuple[str, ...] | Thrown]) -> Ite
             continue
         for kind, wanted in ((CONTINUOUS, brain.continuous > 0), (DISCRETE, bool(brain.branches))):
             if wanted and not any(name.endswith(kind) for name in names):
-                yield _found(
+                yield warning(
                     f"no {kind} are fetched ({mode} inference), and the agent has some: they stay 0",
                     f"output {kind}",
                     f"give the file {kind} for this mode, or take them off the agent",
@@ -104,7 +104,7 @@ def _widths(model: CheckedModel, shapes: Shapes, profile: str) -> Iterator[Findi
         for output in (name, DETERMINISTIC + name):
             shape = shapes.get(output, ())
             if output in model.outputs and width and shape and shape[-1] not in (None, width):
-                yield _found(
+                yield warning(
                     f"the output {output} has {shape[-1]} columns, and the file's constant says {width}",
                     f"output {output}",
                     f"make the constant and the output agree; --for {profile} does",
@@ -114,7 +114,7 @@ def _widths(model: CheckedModel, shapes: Shapes, profile: str) -> Iterator[Findi
 def _masks(model: CheckedModel, profile: str) -> Iterator[Finding]:
     for view in model.inputs:
         if view.name == MASKS and model.discrete_size and view.last not in (0, 1, model.discrete_size):
-            yield _found(
+            yield warning(
                 f"{MASKS} has {view.last} columns, and the branches together {model.discrete_size}",
                 f"input {MASKS}",
                 f"a mask has one column per action of each branch; --for {profile} writes it so",
@@ -124,7 +124,7 @@ def _masks(model: CheckedModel, profile: str) -> Iterator[Finding]:
 def _memory(model: CheckedModel, shapes: Shapes, profile: str) -> Iterator[Finding]:
     size = model.memory_size
     if RECURRENT_IN in shapes and RECURRENT_IN in model.input_names and not size:
-        yield _found(
+        yield warning(
             f"the file has {RECURRENT_IN}, and {MEMORY_SIZE} is 0: no memory is kept from step to step",
             f"constant {MEMORY_SIZE}",
             f"set {MEMORY_SIZE} to the length of {RECURRENT_IN}; --for {profile} does",
@@ -135,7 +135,7 @@ def _memory(model: CheckedModel, shapes: Shapes, profile: str) -> Iterator[Findi
         if size <= 0 or shape is None or not there:
             continue
         if len(shape) != 3 or shape[1] != 1 or shape[2] != size:
-            yield _found(
+            yield warning(
                 f"{name} is {_text(shape)}, and a memory of {MEMORY_SIZE} {size} is carried as [N, 1, {size}]",
                 f"{'input' if name == RECURRENT_IN else 'output'} {name}",
                 f"give {name} the shape [N, 1, {size}]; --for {profile} does",
@@ -145,7 +145,7 @@ def _memory(model: CheckedModel, shapes: Shapes, profile: str) -> Iterator[Findi
 def _batches(file: OnnxFile) -> Iterator[Finding]:
     for given in file.inputs:
         if given.dims and len(given.dims) > 1 and (given.dims[0] or 0) > 0 and SEQUENCE not in given.name:
-            yield _found(
+            yield warning(
                 f"{given.name} is declared for {given.dims[0]} agents, and a player feeds as many as decide at once",
                 f"input {given.name}",
                 "leave the first length free; --names canonical and every --for do",
@@ -158,7 +158,7 @@ def _types(file: OnnxFile, strips_zero: bool) -> Iterator[Finding]:
         whole = value.type.tensor_type.elem_type in _INTEGERS
         for kind, wants_whole in ((CONTINUOUS, False), (DISCRETE, True)):
             if name in (kind, DETERMINISTIC + kind) and whole is not wants_whole:
-                yield _found(
+                yield warning(
                     f"the output {name} is given out as {'integers' if whole else 'floats'}, and ML-Agents reads "
                     f"{'integers' if wants_whole else 'floats'} (not run)",
                     f"output {name}",
@@ -168,7 +168,3 @@ def _types(file: OnnxFile, strips_zero: bool) -> Iterator[Finding]:
 
 def _text(shape: tuple[int | None, ...]) -> str:
     return f"[{', '.join(['N', *('?' if d is None else str(d) for d in shape[1:])])}]"
-
-
-def _found(message: str, where: str, fix: str) -> Finding:
-    return Finding(Severity.WARNING, message, where, fix)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from converters.targets.unity.findings import Finding, Severity
+from converters.targets.unity.findings import Finding, Severity, warning
 from converters.targets.unity.model import (
     ACTION,
     ACTION_SHAPE,
@@ -60,7 +60,7 @@ def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str
     if refused is not None:
         yield refused
     if model.memory_size == -1:
-        yield _warning(
+        yield warning(
             f"Missing node in the model provided : {MEMORY_SIZE}",
             f"constant {MEMORY_SIZE}",
             "set it to 0, or to the length of recurrent_in",
@@ -112,13 +112,13 @@ def _expected(model: CheckedModel, deterministic: bool, profile: str) -> Finding
     """Each would end the check; the first does."""
     for name in (VERSION, MEMORY_SIZE):
         if model.constant(name) is None:
-            yield _warning(
+            yield warning(
                 f'Required constant "{name}" was not found in the model file.',
                 f"constant {name}",
                 f"a constant output of that very name is needed; --for {profile} writes it",
             )
     if not any(model.has_output(name) for name in _ACTION_OUTPUTS):
-        yield _warning(
+        yield warning(
             "The model does not contain any Action Output Node.",
             "outputs",
             f"name the actions {CONTINUOUS} or {DISCRETE}; --for {profile} does",
@@ -138,13 +138,13 @@ def _deprecated_constants(model: CheckedModel, profile: str) -> Findings:
         "This is only required for model that uses a deprecated model format.",
     }
     fix = f"name the actions {CONTINUOUS} or {DISCRETE}, with the shape's constant; --for {profile} does"
-    yield from (_warning(text, f"constant {name}", fix) for name, text in said.items() if model.constant(name) is None)
+    yield from (warning(text, f"constant {name}", fix) for name, text in said.items() if model.constant(name) is None)
 
 
 def _kind_of_action(model: CheckedModel, name: str, kind: str, end: str, deterministic: bool, profile: str) -> Findings:
     shape = CONTINUOUS_SHAPE if name == CONTINUOUS else DISCRETE_SHAPE
     if model.constant(shape) is None:
-        yield _warning(
+        yield warning(
             f"The model uses {kind.lower()} action but does not contain {kind} Action Output Shape Node.",
             f"constant {shape}",
             f"a constant output {shape} is needed; --for {profile} writes it",
@@ -154,7 +154,7 @@ def _kind_of_action(model: CheckedModel, name: str, kind: str, end: str, determi
     if not there:
         inference, variant = ("deterministic", "Deterministic") if deterministic else ("stochastic", "")
         wanted = action_output(name, deterministic)
-        yield _warning(
+        yield warning(
             f"The model uses {inference} inference but does not contain {variant} {kind} Action Output Tensor. "
             f"Uncheck `Deterministic inference` flag{end}",
             f"output {wanted}",
@@ -179,7 +179,7 @@ def _inputs_of_version_3(model: CheckedModel, brain: Brain, deterministic: bool,
 def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool) -> Findings:
     names = model.input_names
     if brain.vector_observation_size != 0 and VECTOR not in names:
-        yield _warning(
+        yield warning(
             "The model does not contain a Vector Observation Placeholder Input. "
             "You must set the Vector Observation Space Size to 0.",
             f"input {VECTOR}",
@@ -189,7 +189,7 @@ def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool)
     for index, sensor in enumerate(brain.sensors):
         if len(sensor.shape) == 3:
             if f"{VISUAL}{cameras}" not in names:
-                yield _warning(
+                yield warning(
                     "The model does not contain a Visual Observation Placeholder Input for sensor component "
                     f"{cameras} ({sensor.kind}).",
                     f"input {VISUAL}{cameras}",
@@ -200,7 +200,7 @@ def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool)
             yield _no_observation(index, sensor)
     expected = sum(i.name.startswith(VISUAL) for i in model.inputs)
     if expected > cameras:
-        yield _warning(
+        yield warning(
             f"The model expects {expected} visual inputs, but only found {cameras} visual sensors.",
             "sensors",
             "give the agent the cameras that it was trained with",
@@ -212,7 +212,7 @@ def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool)
 
 
 def _no_observation(index: int, sensor: Sensor) -> Finding:
-    return _warning(
+    return warning(
         f"The model does not contain an Observation Placeholder Input for sensor component {index} ({sensor.kind}).",
         f"input {_observation(index)}",
         f"sensor {index} ({sensor.name}, {'x'.join(map(str, sensor.shape))}) is fed as {_observation(index)}: "
@@ -221,11 +221,11 @@ def _no_observation(index: int, sensor: Sensor) -> Finding:
 
 
 def _no_recurrent_input(fix: str) -> Finding:
-    return _warning("The model does not contain a Recurrent Input Node but has memory_size.", "inputs", fix)
+    return warning("The model does not contain a Recurrent Input Node but has memory_size.", "inputs", fix)
 
 
 def _no_masks(profile: str) -> Finding:
-    return _warning(
+    return warning(
         "The model does not contain an Action Mask but is using Discrete Control.",
         f"input {MASKS}",
         f"an input {MASKS} is needed for discrete actions"
@@ -247,7 +247,7 @@ def _shapes(model: CheckedModel, brain: Brain, testers: dict[str, Tester], spare
             if found is not None:
                 yield found
         elif view.name not in _TOLERATED and (spared is None or spared not in view.name):
-            yield _warning(
+            yield warning(
                 f"Model contains an unexpected input named : {view.name}",
                 f"input {view.name}",
                 "nothing feeds it: give the agent the sensor it stands for, rename it, or fix it with --set NAME=VALUE",
@@ -293,7 +293,7 @@ def _camera(view: InputView, sensor: Sensor) -> Finding | None:
 
 
 def _mismatch(what: str, sensed: list[int], held: list[int], view: InputView, sensor: Sensor) -> Finding:
-    return _warning(
+    return warning(
         f"{what} of the model does not match. Received TensorProxy of shape [?x{'x'.join(map(str, sensed))}] "
         f"but was expecting [?x{'x'.join(map(str, held))}] for the {sensor.name} Sensor.",
         f"input {view.name}",
@@ -307,7 +307,7 @@ def _vector(view: InputView, brain: Brain) -> Finding | None:
     if sum(sizes) == view.last:
         return None
     listed = f"[{', '.join(map(str, sizes))}]" if sizes else "]"
-    return _warning(
+    return warning(
         f"Vector Observation Size of the model does not match. Was expecting {view.last} but received: \n"
         f"Vector observations: {brain.vector_observation_size} x {brain.stacked}\n"
         f"Total [Observable] attributes: 0\nSensor sizes: {listed}.",
@@ -319,7 +319,7 @@ def _vector(view: InputView, brain: Brain) -> Finding | None:
 def _previous_action(view: InputView, brain: Brain) -> Finding | None:
     if len(brain.branches) == view.last:
         return None
-    return _warning(
+    return warning(
         "Previous Action Size of the model does not match. "
         f"Received {len(brain.branches)} but was expecting {view.last}.",
         f"input {PREVIOUS}",
@@ -332,7 +332,7 @@ def _previous_action(view: InputView, brain: Brain) -> Finding | None:
 
 def _actions(model: CheckedModel, brain: Brain) -> Findings:
     if brain.continuous != model.continuous_size:
-        yield _warning(
+        yield warning(
             "Continuous Action Size of the model does not match. The BrainParameters and ActuatorComponents expect "
             f"{brain.continuous} but the model contains {model.continuous_size}.",
             f"constant {CONTINUOUS_SHAPE}",
@@ -350,7 +350,7 @@ def _actions(model: CheckedModel, brain: Brain) -> Findings:
 
 
 def _branches(expected: str, held: str, what: str) -> Finding:
-    return _warning(
+    return warning(
         f"Discrete Action Size of the model does not match. The BrainParameters expect {expected} "
         f"but the model contains {held}.",
         f"constant {DISCRETE_SHAPE}",
@@ -362,7 +362,7 @@ def _each_branch(wanted: tuple[int, ...], held: tuple[int, ...]) -> Findings:
     """Only the first difference is told."""
     for index, (expected, size) in enumerate(zip(wanted, held, strict=True)):
         if expected != size:
-            yield _warning(
+            yield warning(
                 f"The number of Discrete Actions of branch {index} does not match. "
                 f"Was expecting {expected} but the model contains {size} ",
                 f"constant {DISCRETE_SHAPE}",
@@ -373,7 +373,3 @@ def _each_branch(wanted: tuple[int, ...], held: tuple[int, ...]) -> Findings:
 
 def _observation(index: int) -> str:
     return f"obs_{index}"
-
-
-def _warning(message: str, where: str, fix: str) -> Finding:
-    return Finding(Severity.WARNING, message, where, fix)
