@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from signatures.errors import NotAPolicyError
 
 #: Fields of a file, those of messages in messages too: a graph may have 131,072 nodes, of two dozen each.
@@ -17,10 +19,12 @@ _FROM = 2 * MAX_FIELDS
 #: Numbers in one field are in a byte each in the file, and in eight in memory; eight of these count as a field.
 _PACKED = 3  # a shift
 _MESSAGE, _BYTES = 11, 2
+#: Where ONNX and TensorFlow may keep weights of 16 bits, in two or three bytes each: many such count as no fields.
+_HALVES, _LARGE = ("int32_data", "half_val"), 1 << 20
 _MOST = (1 << 64) - 1
 #: FieldDescriptor.type of what is written as a varint: int64, uint64, int32, bool, uint32, enum, sint32, sint64.
 _VARINTS = frozenset((3, 4, 5, 8, 13, 14, 17, 18))
-#: Tag → the same of the message that the field holds; None: numbers.
+#: Tag → the same of the message that it holds; None: numbers. Where they may be weights, -tag is there too.
 Table: TypeAlias = "dict[int, Table | None]"
 _TABLES: dict[str, Table] = {}
 #: That of a group, which none of our messages has: protobuf passes over it whatever is in it, and reads on behind it.
@@ -67,7 +71,8 @@ def fields_of(data: bytes, table: Table, most: int) -> int:
                 if tag in table:
                     inner = table[tag]
                     if inner is None:
-                        weight += length >> _PACKED
+                        if length < _LARGE or -tag not in table or not _is_dense(data, at, min(at + length, end)):
+                            weight += length >> _PACKED
                         at += length
                         if count + weight > most:
                             return count + weight
@@ -100,6 +105,11 @@ def fields_of(data: bytes, table: Table, most: int) -> int:
     return count + weight
 
 
+def _is_dense(data: bytes, start: int, end: int) -> bool:
+    """Whether numbers of 32 bits take at most twice in memory what they take in the file."""
+    return 2 * int(np.count_nonzero(np.frombuffer(data, np.uint8, end - start, start) < 0x80)) <= end - start
+
+
 def _varint(data: bytes, at: int) -> tuple[int, int]:
     value = shift = 0
     while True:
@@ -123,4 +133,6 @@ def _table(descriptor: Any) -> Table:
                 found[field.number << 3 | _BYTES] = _table(field.message_type)
             elif field.type in _VARINTS:
                 found[field.number << 3 | _BYTES] = None
+                if field.name in _HALVES:
+                    found[-(field.number << 3 | _BYTES)] = None
     return found

@@ -66,7 +66,7 @@ def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached 
 def _values(proto: Any, dtype: np.dtype) -> np.ndarray:
     try:
         if dtype == np.float16:
-            return np.array(list(proto.half_val), np.uint16).view(np.float16)
+            return np.fromiter(proto.half_val, np.uint16, len(proto.half_val)).view(np.float16)
         return np.array(getattr(proto, _VALUE_FIELDS[dtype.name]), dtype)
     except OverflowError as error:
         raise _damaged(f"it holds a value that {dtype} does not have") from error

@@ -46,7 +46,7 @@ def widen(model: Any, detached: Detached | None = None) -> bool:
 
 def _widen_tensor(tensor: Any, detached: Detached | None) -> None:
     whole = tensor.HasField("raw_data")
-    stored = raw_of(tensor, detached) if whole else np.array(tensor.int32_data, "<i4")
+    stored = raw_of(tensor, detached) if whole else np.fromiter(tensor.int32_data, "<i4", len(tensor.int32_data))
     data = stored if whole else stored.astype("<u2")
     if data.nbytes % 2 or (not whole and (data != stored).any()):
         raise DamagedFileError(

@@ -123,7 +123,8 @@ def array_of(tensor: Any, detached: Detached | None) -> np.ndarray:
         values = getattr(tensor, field)
         if len(values) != count:
             raise _damaged(name, f"it holds {len(values)} values where its shape needs {count}")
-        array = np.array(values).astype(dtype)
+        # Of whole numbers no object is kept each: those of int32_data are counted by their bytes (counting).
+        array = (np.fromiter(values, np.int64, count) if field == "int32_data" else np.array(values)).astype(dtype)
     array = array.reshape(shape)
     if tensor.data_type == _DOUBLE:
         with np.errstate(over="ignore"):

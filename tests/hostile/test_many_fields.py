@@ -7,14 +7,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from google.protobuf.message import DecodeError
 from google.protobuf.unknown_fields import UnknownFieldSet
+from onnx import TensorProto
 
 from converters import counting, schema
 from converters.counting import MAX_FIELDS, fields_of
+from converters.frozen_graph.tensors import to_array
 from converters.messages import message_classes
+from converters.onnx.halves import widen
 from converters.onnx.messages import ModelProto
+from converters.onnx.proto import array_of, decoded
 from exporter.export.sources import read_source
 from signatures.bounded import MAX_VALUES, loads
 from signatures.contract import json_of
@@ -144,6 +149,41 @@ def test_a_long_chain_is_counted_in_one_flat_loop() -> None:
     begun = time.process_time()
     counting.check_size(schema.GraphDef, data)
     assert time.process_time() - begun < 6.0
+
+
+def packed(bits: np.ndarray) -> bytes:
+    """Numbers of 16 bits as varints of three bytes each."""
+    wide = bits.astype(np.uint32)
+    return np.stack([wide & 0x7F | 0x80, wide >> 7 & 0x7F | 0x80, wide >> 14], -1).astype(np.uint8).tobytes()
+
+
+def test_weights_of_16_bits_that_are_kept_as_numbers_are_no_parts() -> None:
+    """More of them than there may be fields of eight bytes each."""
+    halves = np.linspace(-3, 3, 9 << 20, dtype=np.float32).astype(np.float16)
+    numbers = packed(halves.view(np.uint16))
+    assert len(numbers) > 8 * MAX_FIELDS
+    kind = TensorProto(dims=[halves.size], data_type=TensorProto.FLOAT16).SerializeToString()
+    model = decoded(onnx_policy() + inside(7, inside(5, kind, inside(5, numbers))))
+    widen(model)
+    assert (array_of(model.graph.initializer[-1], None) == halves.astype(np.float32)).all()
+    like = schema.TensorProto(dtype=19)
+    like.tensor_shape.dim.add(size=halves.size)
+    graph = attribute(inside(8, like.SerializeToString(), inside(13, numbers)))
+    counting.check_size(schema.GraphDef, graph)
+    (tensor,) = (a.tensor for n in schema.GraphDef.FromString(graph).node for a in n.attr.values() if a.tensor.half_val)
+    assert (to_array(tensor) == halves).all()
+
+
+@pytest.mark.parametrize("field", [1, 5, 7, 11])
+@pytest.mark.parametrize("number", [b"\x01", b"\x01\x81\x01", b"\x80\x80\x01"])
+def test_numbers_are_parts_that_are_small_or_no_weights(field: int, number: bytes) -> None:
+    """Of axes an object is made each, and others have eight bytes."""
+    data = onnx_policy() + inside(7, inside(5, inside(field, number * (8 * TOO_MANY // len(number) + 1))))
+    if field == 5 and number[0] == 0x80:
+        counting.check_size(ModelProto, data)
+        return
+    with pytest.raises(NotAPolicyError, match="parts"):
+        counting.check_size(ModelProto, data)
 
 
 @pytest.mark.parametrize("text", ["[" + "[]," * MAX_VALUES + "1]", '{"a":[' + "1," * MAX_VALUES + "1]}"])
