@@ -14,8 +14,9 @@ from pathlib import Path
 #: Bytes that a child may take beside what it has when it is ready; and threads have stacks and pools, per processor.
 FREE = 768 << 20
 _PER_PROCESSOR = 16 << 20
-#: Bytes that it may take for each byte of its models, and for each that it is fed in a request.
-PER_MODEL_BYTE = 16
+#: Bytes that it may take for each byte of its models, and for each that it is fed in a request. TensorFlow 2.21 takes
+#: 26 for a SavedModel of 200 MB with two signatures (each has copies of all constants), and dies where it gets fewer.
+PER_MODEL_BYTE = 32
 PER_FED_BYTE = 64
 
 

@@ -10,11 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.formats import WRITTEN
+from converters.runtimes import memory
 from converters.runtimes.confinement import in_force
 from converters.runtimes.memory import FREE
+from converters.runtimes.pool import RuntimePool
 from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.runtimes.python import child_command, confined
+from exporter.export.pipeline import ExportOptions, export
 from signatures.errors import RuntimeUnavailableError
+from tests.bench.big_policies import OBSERVED, frozen
 
 pytestmark = pytest.mark.skipif(not all(in_force().values()), reason="this kernel lacks Landlock or seccomp")
 
@@ -136,6 +141,24 @@ def test_memory_grows_with_what_it_is_fed(tmp_path: Path) -> None:
         fed = np.zeros(FREE // 16 // 8, np.int64)
         fed[0] = FREE + (FREE >> 1)
         assert model.run({"x": fed}, ["y"])["y"][0] == 1
+
+
+@pytest.mark.slow
+def test_tensorflow_has_what_a_large_saved_model_takes(
+    pool: RuntimePool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of 200 MB made it die (a segmentation fault): what each byte may take is asked, with little beside it."""
+    frozen(64, tmp_path / "large.bytes")
+    options = ExportOptions(tmp_path / "out", targets=("saved_model",), verify="none")
+    (result,) = export([tmp_path / "large.bytes"], options)
+    monkeypatch.setattr(memory, "FREE", 64 << 20)
+    with RuntimePool() as own:
+        form = WRITTEN["saved_model"]
+        model = own.process("tensorflow").load(
+            str(result.folder / form.main_of("large")), **form.loader("serving_default")
+        )
+        (output,) = model.run({"state": np.zeros((3, OBSERVED), np.float32)}, ["action"]).values()
+    assert output.shape[0] == 3
 
 
 def test_its_folder_is_gone_when_it_is() -> None:

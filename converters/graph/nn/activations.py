@@ -134,7 +134,11 @@ def of_op(op: str) -> Activation:
 
 #: What Keras and PyTorch call alike.
 NAMED: Mapping[str, Activation] = {
-    **{op.lower(): of_op(op) for op in ("Relu", "Tanh", "Sigmoid", "Softplus", "Softsign")},
+    "relu": of_op("Relu"),
+    "tanh": of_op("Tanh"),
+    "sigmoid": of_op("Sigmoid"),
+    "softplus": of_op("Softplus"),
+    "softsign": of_op("Softsign"),
     "elu": elu,
     "selu": selu,
     "celu": celu,
