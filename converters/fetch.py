@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib.util
 import os
@@ -101,7 +102,8 @@ def opened(path: Path, most: int = MAX_BYTES) -> BinaryIO:
         raise unreadable(path, error) from error
     except ValueError as error:  # a null character in the path
         raise SourceError("is no path", where=repr(str(path)), why=str(error), fix="check the path") from error
-    try:
+    with contextlib.ExitStack() as refused:
+        refused.enter_context(file)
         status = os.fstat(file.fileno())
         _check_kind(path, status.st_mode)  # what is there now
         if status.st_size > most:
@@ -117,9 +119,7 @@ def opened(path: Path, most: int = MAX_BYTES) -> BinaryIO:
                 why="it is a hole, as a copy or a download leaves one that was cut off",
                 fix="copy or download it again; if it is whole, give what cp --sparse=never makes of it",
             )
-    except BaseException:
-        file.close()
-        raise
+        refused.pop_all()  # it stays open
     return file
 
 
