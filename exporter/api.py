@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from converters.source import ReadOptions
+from converters.formats.source import ReadOptions
 from exporter.export.again import verify_folder
 from exporter.export.labels import Labels
 from exporter.export.options import ExportOptions, compile_options, storage

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from converters.fetch import read_bytes
+from converters.files.fetch import read_bytes
 from signatures.errors import SourceError, UsageError
 
 _MOST_BYTES = 1 << 20

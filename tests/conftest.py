@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from converters.formats import DEFAULTS, WRITTEN
-from converters.policy import Policy
+from converters.formats.registry import DEFAULTS, WRITTEN
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from tests.tracing import Tracing
@@ -149,7 +149,7 @@ def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
 
 @pytest.fixture(scope="session", autouse=True)
 def _what_is_written_fits_its_schema() -> Iterator[None]:
-    from converters.bundle import bundle
+    from converters.formats.bundle import bundle
     from tests.reports.validation import check_parity, check_policy
 
     written = bundle.dumps

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters import schema
-from converters.frozen_graph.tensors import from_array
+from converters.files import tensorflow_messages as schema
+from converters.formats.frozen_graph.tensors import from_array
 from converters.graph.nodes import TensorShape
 
 Array = npt.NDArray[Any]

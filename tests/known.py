@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 

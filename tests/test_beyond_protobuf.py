@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats import WRITTEN
+from converters.formats.registry import WRITTEN
+from converters.formats.saved_model.writer import DETERMINISTIC, SERVING
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
-from converters.saved_model.writer import DETERMINISTIC, SERVING
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import path as fixture
@@ -20,8 +20,8 @@ from signatures.sampling import draw_cases
 
 @pytest.fixture(autouse=True)
 def _low_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.detached.MAX_MESSAGE", 10_000)
-    monkeypatch.setattr("converters.detached.LARGE_FILE", 10_000)
+    monkeypatch.setattr("converters.files.external_data.MAX_MESSAGE", 10_000)
+    monkeypatch.setattr("converters.files.external_data.LARGE_FILE", 10_000)
 
 
 def test_weights_lie_beside_the_model_and_the_runtimes_find_them(tmp_path: Path, pool: RuntimePool) -> None:

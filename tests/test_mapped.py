@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.detached import LARGE_FILE
-from converters.fetch import read_bytes
-from converters.mapped import Mapped
+from converters.files.external_data import LARGE_FILE
+from converters.files.fetch import read_bytes
+from converters.files.memory_mapped import Mapped
 from exporter import export_model
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, SourceError
@@ -62,7 +62,7 @@ def test_what_was_let_go_takes_no_memory(tmp_path: Path) -> None:
 
 
 def test_both_are_looked_into_by_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.mapped.LARGE_FILE", 1)
+    monkeypatch.setattr("converters.files.memory_mapped.LARGE_FILE", 1)
     seen = set[tuple[str, type]]()
     read = Mapped.read
 

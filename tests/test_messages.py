@@ -11,7 +11,7 @@ from tests.commands import ROOT, python
 SCRIPT = """
 import sys
 from google.protobuf.internal import api_implementation
-from converters.messages import message_classes
+from converters.files.protobuf_messages import message_classes
 
 classes = message_classes(
     "tried",

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
-from converters.detached import LARGE, LARGE_FILE, Detached
-from converters.frozen_graph.reader import read_graph
-from converters.pieces import Pieces, equal
+from converters.files import tensorflow_messages as schema
+from converters.files.chunks import Pieces, equal
+from converters.files.external_data import LARGE, LARGE_FILE, Detached
+from converters.formats.frozen_graph.reader import read_graph
 from exporter import export_model
 from signatures.digest import sha256_hex
 from signatures.errors import DamagedFileError

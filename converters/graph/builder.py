@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.graph.allowance import MAX_MADE, Allowance
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED
 from converters.graph.ops.table import TABLE, op_of
 from converters.graph.shapes import Types, add_types, outputs_of
+from converters.graph.size_limits import MAX_MADE, Allowance
 from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.allowance import Allowance
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.base import Shape
 from converters.graph.ops.table import is_fed
 from converters.graph.shapes import add_types
+from converters.graph.size_limits import Allowance
 from converters.graph.types import Symbols, TensorType
 from signatures.errors import ExportModelError
 

@@ -10,10 +10,10 @@ from math import inf
 
 import numpy as np
 
-from converters.graph.allowance import Allowance
 from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.base import MISFIT, Kernel, OpDef, misfit, shape_error
 from converters.graph.ops.table import CONTROL_FLOW, op_of
+from converters.graph.size_limits import Allowance
 from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, of_array
 from signatures.errors import ExportModelError, GraphError
 

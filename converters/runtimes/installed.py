@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from converters.bundle.exchange import exchange, stage
+from converters.formats.bundle.exchange import exchange, stage
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 
-from converters.format import Format
-from converters.runtimes.process import RuntimeProcess
+from converters.files.children.process import RuntimeProcess
+from converters.formats.format import Format
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
 from signatures.errors import RuntimeUnavailableError, UsageError, meant
 

@@ -51,11 +51,11 @@ def confined(command: Sequence[str], scratch: str) -> list[str]:
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
     if tuple(command[:3]) == _PYTHON and command[3].startswith(_PATH):
         # A child of ours gives up by itself, before it does anything else: a program for it costs another 30 ms.
-        first = f"from converters.runtimes import confinement; confinement.begin({scratch!r}, {parent}); "
+        first = f"from converters.files.children import confinement; confinement.begin({scratch!r}, {parent}); "
         return [*_PYTHON, _PATH + first + command[3].removeprefix(_PATH), *command[4:]]
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
-    program = str(Path(converters.__file__).resolve().parent / "runtimes" / "confinement.py")
+    program = str(Path(converters.__file__).resolve().parent / "files" / "children" / "confinement.py")
     return [sys.executable, "-I", "-S", program, scratch, str(parent), *command]
 
 

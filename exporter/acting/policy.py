@@ -19,7 +19,7 @@ from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
 
 if TYPE_CHECKING:
-    from converters.bundle.bundle import Declared
+    from converters.formats.bundle.bundle import Declared
 
 Array = np.ndarray
 Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
@@ -357,9 +357,9 @@ def load_policy(
 
 
 def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
-    from converters.bundle.bundle import Bundle
-    from converters.folders import scratch_folder
-    from converters.formats import WRITTEN
+    from converters.files.folders import scratch_folder
+    from converters.formats.bundle.bundle import Bundle
+    from converters.formats.registry import WRITTEN
 
     found = Bundle.open(folder)
     named = {r: found.path(WRITTEN[key]) for r, key in _TAKES.items() if found.has(WRITTEN[key])}
@@ -393,9 +393,9 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
 
 def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) -> LoadedPolicy:
     """A source's only policy, compiled and written in memory."""
-    from converters.format import WriteOptions
-    from converters.formats import WRITTEN
-    from converters.graph.options import CompileOptions
+    from converters.compiler.options import CompileOptions
+    from converters.formats.format import WriteOptions
+    from converters.formats.registry import WRITTEN
     from exporter.export.sources import read_source
 
     policies = read_source(path).policies(CompileOptions(brain=brain))
@@ -437,8 +437,8 @@ def _in_onnxruntime(model: bytes) -> tuple[Run, Declared]:
 
 
 def _in_numpy(model: bytes) -> tuple[Run, Declared]:
-    from converters.bundle.bundle import declared_by
-    from converters.bundle.embed import read_runnable
+    from converters.formats.bundle.bundle import declared_by
+    from converters.formats.bundle.embed import read_runnable
     from converters.graph.run import run_graph
 
     graph = read_runnable(model)

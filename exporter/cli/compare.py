@@ -13,8 +13,8 @@ from exporter.cli.group import PATH, command
 from exporter.cli.options import JUDGING, as_given, comparing, pairs, trusting, understanding
 
 if TYPE_CHECKING:
-    from converters.graph.options import CompileOptions
-    from converters.policy import Policy
+    from converters.compiler.options import CompileOptions
+    from converters.policy.policy import Policy
     from exporter.verify.options import VerifyOptions
 
 
@@ -45,8 +45,8 @@ def compare_command(
     options: VerifyOptions,
 ) -> None:
     """Compare files made by any tool with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
-    from converters.fetch import shown
-    from converters.source import ReadOptions
+    from converters.files.fetch import shown
+    from converters.formats.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
     from exporter.reports.entry import Entry
 

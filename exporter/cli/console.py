@@ -166,7 +166,7 @@ class Console:
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""
-        from converters.targets.profiles import PROFILES
+        from converters.consumers.profiles import PROFILES
 
         if self.as_json:
             entries = [
@@ -194,7 +194,7 @@ class Console:
         if profile is not None:
             last = results[-1]
             files = ", ".join(sorted(p.name for p in last.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
-            from converters.targets.profiles import profile as known
+            from converters.consumers.profiles import profile as known
             from exporter.tables import typed
 
             wanted = known(profile)

@@ -26,7 +26,7 @@ def demo_command(out: Path, no_open: bool) -> None:
     """Export a trained 3DBall that comes with the package, compare the formats in the installed runtimes, and open
     the page on which it acts.
     """
-    from converters.bundle.bundle import writing
+    from converters.formats.bundle.bundle import writing
     from exporter.demo import BALL
     from signatures.errors import UsageError
 

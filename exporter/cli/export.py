@@ -15,7 +15,7 @@ from exporter.cli.options import RULES, activating, as_given, comparing, read_op
 from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
-    from converters.graph.options import CompileOptions
+    from converters.compiler.options import CompileOptions
     from exporter.export.pipeline import ExportResult
     from exporter.reports.entry import Entry
     from exporter.verify.options import VerifyOptions
@@ -103,7 +103,7 @@ def export_command(
 
     This is the default command: 'export-model SOURCE' runs it.
     """
-    from converters.fetch import address_of
+    from converters.files.fetch import address_of
     from exporter.export.options import ExportOptions, storage
     from exporter.export.pipeline import export
     from exporter.fleet.sources import is_many

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from converters.fetch import shown
+from converters.files.fetch import shown
 from exporter.cli.console import Console
 from exporter.cli.options import RULES, as_given
 from exporter.cli.terminal import say_lines

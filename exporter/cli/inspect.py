@@ -15,8 +15,8 @@ from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
-    from converters.graph.options import CompileOptions
-    from converters.source import ReadOptions
+    from converters.compiler.options import CompileOptions
+    from converters.formats.source import ReadOptions
 
 
 @command(
@@ -67,8 +67,8 @@ def inspect_command(
 
     With --unity, what ML-Agents in Unity says about it instead; the status is 1 if a release does not accept it.
     """
-    from converters.fetch import shown
-    from converters.graph.options import CompileOptions
+    from converters.compiler.options import CompileOptions
+    from converters.files.fetch import shown
     from exporter.remote.fetching import nearby
     from exporter.tables import typed
 
@@ -148,7 +148,7 @@ def _unity(
     if svg is not None:
         if len(verdicts) != 1:
             raise UsageError("--svg draws one verdict", fix="name one release and one file")
-        from converters.bundle.bundle import writing
+        from converters.formats.bundle.bundle import writing
         from exporter.inspect.behavior_parameters import behavior_parameters
 
         with writing(svg):

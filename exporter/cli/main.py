@@ -70,7 +70,7 @@ def _stoppable(told: list[int]) -> Iterator[None]:
 
 def _clean_up() -> None:
     """Remove the folders of this process, if it came as far as to make any."""
-    folders = sys.modules.get("converters.folders")
+    folders = sys.modules.get("converters.files.folders")
     if folders is not None:
         folders.remove_all()
 

@@ -16,7 +16,7 @@ from exporter.cli.group import FILE
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from converters.source import ReadOptions
+    from converters.formats.source import ReadOptions
 
 
 def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
@@ -32,7 +32,7 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
 
 def one_bundle(place: Path, command: str) -> Path | None:
     """The bundle at ``place``, or the only one in that folder; None where there is none. Raises UsageError."""
-    from converters.bundle.bundle import bundles_in
+    from converters.formats.bundle.bundle import bundles_in
     from exporter.tables import typed
 
     found = bundles_in(place)
@@ -46,7 +46,7 @@ def one_bundle(place: Path, command: str) -> Path | None:
 
 def as_given(names: Container[str]) -> list[str]:
     """The options of this call whose parameters ``names`` has, word for word, where the command line had them."""
-    from converters.fetch import shown
+    from converters.files.fetch import shown
 
     context = click.get_current_context()
     words: list[str] = []
@@ -94,7 +94,7 @@ def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int
 
 def read_options(step: int | None, sensors: str | None, trust_source: bool, activation: str | None) -> ReadOptions:
     """What a reader is told, of the command line's words. Raises UsageError."""
-    from converters.source import ReadOptions
+    from converters.formats.source import ReadOptions
 
     shapes, goals = sensors_of(sensors)
     return ReadOptions(step, shapes, trust_source, goals, activation)

@@ -23,7 +23,7 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     """List the installed runtimes with their versions, and how to install the others."""
     if ctx.invoked_subcommand is not None:
         return
-    from converters.runtimes.confinement import in_force
+    from converters.files.children.confinement import in_force
     from converters.runtimes.registry import available_runtimes
     from exporter.tables import table
 

@@ -74,7 +74,7 @@ def _bundle_of(place: Path) -> Iterator[Path]:
     if found is not None or not place.exists():
         yield found or place
         return
-    from converters.folders import scratch_folder
+    from converters.files.folders import scratch_folder
     from exporter.export.options import ExportOptions
     from exporter.export.pipeline import export
     from exporter.tables import typed

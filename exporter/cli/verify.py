@@ -49,7 +49,7 @@ def verify_command(
 
     Given a folder of bundles, it verifies all of them.
     """
-    from converters.bundle.bundle import bundles_in
+    from converters.formats.bundle.bundle import bundles_in
     from exporter.export.again import verify_folder
     from exporter.export.pipeline import counted
     from exporter.remote.fetching import nearby

@@ -17,16 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.bundle.bundle import Bundle
-from converters.folders import scratch_folder, size_of
-from converters.format import Format, Port, Ports
-from converters.frozen_graph.writer import frozen
-from converters.graph.options import CompileOptions
-from converters.policy import Policy
-from converters.read import ports_of
+from converters.compiler.options import CompileOptions
+from converters.files.children.process import LoadedModel, RunFailedError
+from converters.files.folders import scratch_folder, size_of
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.format import Format, Port, Ports
+from converters.formats.frozen_graph.writer import frozen
+from converters.formats.read import ports_of
+from converters.formats.source import OriginalRun, ReadOptions
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.runtimes.process import LoadedModel, RunFailedError
-from converters.source import OriginalRun, ReadOptions
 from exporter.export.sources import read_source
 from exporter.remote.fetching import nearby
 from exporter.verify.checks.size import check_budget

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from converters.bundle.bundle import Bundle, unfit
-from converters.bundle.embed import runnable
-from converters.folders import scratch_folder
-from converters.formats import WRITTEN
-from converters.frozen_graph.writer import frozen
+from converters.files.folders import scratch_folder
+from converters.formats.bundle.bundle import Bundle, unfit
+from converters.formats.bundle.embed import runnable
+from converters.formats.frozen_graph.writer import frozen
+from converters.formats.registry import WRITTEN
+from converters.formats.saved_model.writer import signatures_of
+from converters.formats.source import OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.saved_model.writer import signatures_of
-from converters.source import OriginalRun, ReadOptions
 from exporter.export.job import Job, tested_in
 from exporter.export.options import storage_of
 from exporter.export.pipeline import Progress, consumer, joined
@@ -36,7 +36,7 @@ from signatures.roles import Role
 from signatures.spec import PolicySignature
 
 if TYPE_CHECKING:
-    from converters.targets.profile import Profile
+    from converters.consumers.profile import Profile
 
 
 def verify_folder(

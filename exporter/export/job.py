@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.format import Artifact, Format, WriteOptions
-from converters.formats import WRITTEN
-from converters.graph.passes.weights import Storage, rounded
-from converters.policy import Policy
-from converters.source import ReadOptions, SourceModel
+from converters.compiler.passes.weights import Storage, rounded
+from converters.formats.format import Artifact, Format, WriteOptions
+from converters.formats.registry import WRITTEN
+from converters.formats.source import ReadOptions, SourceModel
+from converters.policy.policy import Policy
 from exporter import __version__
 from exporter.export.options import ExportOptions
 from exporter.export.sources import Source
@@ -23,7 +23,7 @@ from signatures.fields import FieldError, known, printable
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
-    from converters.targets.profile import Profile
+    from converters.consumers.profile import Profile
     from exporter.verify.participants import PolicyUnderTest
 
 
@@ -72,7 +72,7 @@ def artefacts_of(
         how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
         artifacts = [f.artifact(job.policy, how) for f in formats]
         if job.profile.importers:
-            from converters.targets.importable import importable
+            from converters.consumers.importable import importable
 
             for artifact in artifacts:
                 importable(job.profile, artifact.files, job.policy.name)
@@ -112,8 +112,8 @@ def contract_of(
 
 def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     """A policy whose artefacts lie in ``stage``; what else verification needs is put into ``scratch``."""
-    from converters.frozen_graph.writer import frozen
-    from converters.saved_model.writer import signatures_of
+    from converters.formats.frozen_graph.writer import frozen
+    from converters.formats.saved_model.writer import signatures_of
     from exporter.verify.participants import PolicyUnderTest
 
     policy = job.policy

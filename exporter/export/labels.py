@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.options_file import read_options
 from signatures.errors import UsageError
 from signatures.labels import checked

@@ -8,7 +8,7 @@ from dataclasses import field
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Generic, Protocol, TypeVar
 
-from converters.fetch import address_of, shown
+from converters.files.fetch import address_of, shown
 from signatures.contract import safe_name
 from signatures.records import dataclass
 

@@ -7,9 +7,9 @@ from dataclasses import field
 from pathlib import Path
 from typing import get_args
 
-from converters.graph.options import CompileOptions, NoiseMode
-from converters.graph.passes.weights import Storage
-from converters.source import ReadOptions
+from converters.compiler.options import CompileOptions, NoiseMode
+from converters.compiler.passes.weights import Storage
+from converters.formats.source import ReadOptions
 from exporter.export.labels import Labels
 from exporter.verify.options import VerifyOptions
 from signatures.errors import UsageError

@@ -9,12 +9,12 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from converters.bundle import bundle
-from converters.fetch import shown
-from converters.folders import scratch_folder
-from converters.format import Artifact, Format
-from converters.formats import DEFAULTS, WRITTEN, written
-from converters.policy import Policy
+from converters.files.fetch import shown
+from converters.files.folders import scratch_folder
+from converters.formats.bundle import bundle
+from converters.formats.format import Artifact, Format
+from converters.formats.registry import DEFAULTS, WRITTEN, written
+from converters.policy.policy import Policy
 from exporter.export.job import (
     Job,
     artefacts_of,
@@ -41,9 +41,9 @@ from signatures.errors import (
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
+    from converters.consumers.profile import Profile
     from converters.runtimes.pool import RuntimePool
     from converters.runtimes.registry import RuntimeInfo
-    from converters.targets.profile import Profile
     from exporter.verify.report import ParityReport
 
 Progress = Callable[[str], None]
@@ -271,7 +271,7 @@ def counted(progress: Progress, number: int, total: int) -> Progress:
 
 def consumer(name: str) -> Profile:
     """The profile that ``--for`` names. Raises UsageError."""
-    from converters.targets.profiles import profile  # most exports are for no consumer in particular
+    from converters.consumers.profiles import profile  # most exports are for no consumer in particular
 
     return profile(name)
 

@@ -7,12 +7,12 @@ from contextlib import contextmanager
 from dataclasses import field, replace
 from pathlib import Path
 
-from converters.format import Format
-from converters.graph.compile import compile_graph
-from converters.graph.options import CompileOptions
-from converters.policy import Policy
-from converters.read import check_options, fetched, read_models
-from converters.source import ReadOptions, SourceModel
+from converters.compiler.compile import compile_graph
+from converters.compiler.options import CompileOptions
+from converters.formats.format import Format
+from converters.formats.read import check_options, fetched, read_models
+from converters.formats.source import ReadOptions, SourceModel
+from converters.policy.policy import Policy
 from signatures.errors import naming
 from signatures.records import dataclass
 
@@ -66,8 +66,8 @@ def live_source(kind: str, given: object) -> Iterator[Source]:
     It lasts as long as the context: what TensorFlow runs the original from lies in a temporary folder. Raises
     UsageError, and what ``read_source`` raises.
     """
-    from converters.folders import scratch_folder
-    from converters.live.source import label, read_live
+    from converters.files.folders import scratch_folder
+    from converters.formats.live.source import label, read_live
 
     with scratch_folder() as folder:
         place = Path(label(kind))

@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from converters.fetch import address_of, shown
+from converters.files.fetch import address_of, shown
 from converters.runtimes.pool import RuntimePool
 from exporter import __version__
 from exporter.export.labels import read_labels

@@ -16,7 +16,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from converters.fetch import shown
+from converters.files.fetch import shown
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claim, Names, Turns
 from exporter.export.options import ExportOptions

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.fetch import address_of, read_bytes, shown
+from converters.files.fetch import address_of, read_bytes, shown
 from exporter import __version__
 from exporter.export.labels import read_labels
 from exporter.export.options import ExportOptions

@@ -7,10 +7,10 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from converters.bundle import BUNDLE
-from converters.fetch import Fetched, shown, unreadable
-from converters.recognise import recognised
-from converters.source import ReadOptions
+from converters.files.fetch import Fetched, shown, unreadable
+from converters.formats.bundle import BUNDLE
+from converters.formats.recognise import recognised
+from converters.formats.source import ReadOptions
 from exporter.remote.filesystem import is_pattern, matching, remote
 from signatures.errors import SourceError, UsageError
 

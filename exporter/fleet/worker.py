@@ -11,8 +11,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from converters.fetch import shown
-from converters.runtimes.child import end_with_parent
+from converters.files.children.child import end_with_parent
+from converters.files.fetch import shown
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claim, Claimed, Naming
 from exporter.export.options import ExportOptions

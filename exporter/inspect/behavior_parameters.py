@@ -8,8 +8,8 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from converters.targets.unity.checker import UnityVerdict
-from converters.targets.unity.findings import Thrown
+from converters.consumers.unity.checker import UnityVerdict
+from converters.consumers.unity.findings import Thrown
 from exporter.reports.markup import Markup, el, svg_file
 
 _WIDTH, _LINE, _MARGIN, _VALUE = 560, 22, 16, 250

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.format import Format, WriteOptions
-from converters.formats import WRITTEN
+from converters.compiler.options import CompileOptions
+from converters.formats.format import Format, WriteOptions
+from converters.formats.registry import WRITTEN
+from converters.formats.source import ReadOptions
 from converters.graph.nodes import Graph
-from converters.graph.options import CompileOptions
-from converters.policy import Policy
-from converters.source import ReadOptions
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from exporter.reports.layers import blocks_of, chain
 from exporter.tables import paragraph, size_text, table

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.bundle.bundle import distinct_names, writing
+from converters.formats.bundle.bundle import distinct_names, writing
 from signatures.contract import safe_name
 from signatures.errors import BundleError, UsageError
 
@@ -23,7 +23,7 @@ def write_pictures(inspection: Inspection, logdir: Path | None = None, svg: Path
     if logdir is not None:
         if not inspection.graphs:
             raise UsageError(f"--logdir {logdir}: the source has no graph", fix="give the file of a policy")
-        from converters.tensorboard import FILE_NAME, event_file
+        from converters.formats.tensorboard import FILE_NAME, event_file
 
         distinct_names([(name, f"model {i}") for i, (name, _) in enumerate(inspection.graphs)])
         files.update({logdir / name / FILE_NAME: event_file(graph) for name, graph in inspection.graphs})

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.targets.unity.checker import ModeVerdict, UnityVerdict, check_file
-from converters.targets.unity.consumers import CONSUMERS, consumer
-from converters.targets.unity.findings import Finding, Thrown
-from converters.targets.unity.settings import Brain, parse_actions, parse_sensors, read_brain
+from converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
+from converters.consumers.unity.consumers import CONSUMERS, consumer
+from converters.consumers.unity.findings import Finding, Thrown
+from converters.consumers.unity.settings import Brain, parse_actions, parse_sensors, read_brain
 from exporter.tables import paragraph
 from signatures.errors import UsageError
 from signatures.fields import printable

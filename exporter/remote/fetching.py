@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from converters.fetch import shown
-from converters.folders import scratch_folder
+from converters.files.fetch import shown
+from converters.files.folders import scratch_folder
 from exporter.remote.filesystem import MAX_FILES, asking, filesystem, is_http, remote
 from signatures.digest import sha256_hex
 from signatures.errors import ExportModelError, SourceError

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
 
-from converters.fetch import FETCHED, address_of, fetches, shown
+from converters.files.fetch import FETCHED, address_of, fetches, shown
 from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
 #: Files of one source, or links of one level of a web server's pages; bytes of these pages.

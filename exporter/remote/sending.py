@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from converters.bundle import bundle
-from converters.fetch import address_of, fetches, shown
-from converters.folders import scratch_folder
+from converters.files.fetch import address_of, fetches, shown
+from converters.files.folders import scratch_folder
+from converters.formats.bundle import bundle
 from exporter.remote.filesystem import asking, filesystem, is_http, remote
 from signatures.contract import POLICY
 from signatures.errors import BundleError, UsageError

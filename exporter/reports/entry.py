@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.bundle.bundle import Bundle
-from converters.fetch import shown
+from converters.files.fetch import shown
+from converters.formats.bundle.bundle import Bundle
 from converters.graph.nodes import Graph
 from exporter.export.pipeline import ExportResult
 from exporter.verify.report import ParityReport

@@ -9,7 +9,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 
-from converters.formats import FORMATS
+from converters.formats.registry import FORMATS
 from exporter.reports.entry import Entry
 from exporter.reports.summary import verdict
 from exporter.verify.findings import Failure, Finding

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.reports.charts import diagram_parts
 from exporter.reports.layers import Block, blocks_of
 from exporter.reports.markup import Markup, el, svg_file

@@ -7,15 +7,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import converters.tfjs
-from converters.bundle.bundle import Bundle, dumps, writing
-from converters.bundle.embed import runnable
-from converters.bundle.exchange import exchange, stage
-from converters.fetch import Fetched
-from converters.formats import WRITTEN
+import converters.formats.tfjs
+from converters.files.fetch import Fetched
+from converters.formats.bundle.bundle import Bundle, dumps, writing
+from converters.formats.bundle.embed import runnable
+from converters.formats.bundle.exchange import exchange, stage
+from converters.formats.registry import WRITTEN
+from converters.formats.tfjs.reader import content_of
 from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from converters.runtimes.js import KERNELS
-from converters.tfjs.reader import content_of
 from exporter import __version__
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
@@ -25,7 +25,7 @@ from signatures.errors import BundleError, RuntimeUnavailableError, naming
 from signatures.records import dataclass
 
 PAGE = Path(__file__).resolve().parent / "page"
-POLICY_MODULE = Path(converters.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
+POLICY_MODULE = Path(converters.formats.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
 #: All drawings; a page has that of its scene.
 _VIEWS = "views/index.mjs"
 #: The file by which a folder is known as ours.

@@ -72,7 +72,7 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
 
 def _model(bundle: Bundle) -> str:
     if bundle.made_for is not None:
-        from converters.targets.profiles import profile
+        from converters.consumers.profiles import profile
 
         wanted = profile(bundle.made_for)
         form = next(f for f in wanted.formats if f"{bundle.name}.{f}" in bundle.files)

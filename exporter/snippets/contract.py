@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from string import Template
 
-from converters.bundle import bundle
-from converters.formats import WRITTEN
-from converters.frozen_graph.reader import read_graph
+from converters.formats.bundle import bundle
+from converters.formats.frozen_graph.reader import read_graph
+from converters.formats.registry import WRITTEN
 from signatures.errors import naming
 from signatures.records import dataclass
 from signatures.roles import Role

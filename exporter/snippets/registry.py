@@ -7,8 +7,8 @@ from functools import partial
 from string import Template
 from typing import Any
 
-from converters.format import Code, Format
-from converters.formats import WRITTEN
+from converters.formats.format import Code, Format
+from converters.formats.registry import WRITTEN
 from exporter.snippets import agent, csharp, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle, quoted
 from signatures.errors import BundleError, UsageError
@@ -100,7 +100,7 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
 
 def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
     """The target of a word of ``--for``, a profile's too; raises BundleError where the bundle is not for that one."""
-    from converters.targets.profiles import PROFILES
+    from converters.consumers.profiles import PROFILES
 
     wanted = next((p for p in PROFILES if name in (p.name, *p.aliases) and name not in {t.name for t in TARGETS}), None)
     if wanted is None:

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.bundle.embed import runnable
-from converters.formats import WRITTEN
-from converters.frozen_graph.reader import read_graph
+from converters.files.children.process import RunFailedError
+from converters.formats.bundle.embed import runnable
+from converters.formats.frozen_graph.reader import read_graph
+from converters.formats.intermediate_tensors import InnerTensors
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.ops.table import traits
 from converters.graph.run import run_graph
-from converters.inner import InnerTensors
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError
 from exporter.verify.difference import Difference, compare
 from exporter.verify.findings import Bisection
 from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar
 
-from converters.runtimes.process import RunFailedError
+from converters.files.children.process import RunFailedError
 from exporter.verify.difference import by_decade
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.fetch import read_bytes
-from converters.zips import ZIP_ERRORS, entry_of, opened
+from converters.files.fetch import read_bytes
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
 from exporter.verify.npy import read_array
 from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass

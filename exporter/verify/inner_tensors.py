@@ -1,4 +1,4 @@
-"""The inner tensors of who takes part in a verification, called as the graph calls them (converters/inner.py)."""
+"""The inner tensors of who takes part in a verification, called as the graph calls them (converters/formats/intermediate_tensors.py)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from converters.formats import WRITTEN
-from converters.frozen_graph.reader import from_graph_def
+from converters.formats.frozen_graph.reader import from_graph_def
+from converters.formats.intermediate_tensors import InnerTensors, Loaded, View, hidden
+from converters.formats.registry import WRITTEN
+from converters.formats.saved_model.reader import read_saved_model
+from converters.formats.saved_model.source import FILE, frozen_model, values_beside
 from converters.graph.nodes import Graph, ref, split_ref
-from converters.inner import InnerTensors, Loaded, View, hidden
 from converters.runtimes.pool import RuntimePool
-from converters.saved_model.reader import read_saved_model
-from converters.saved_model.source import FILE, frozen_model, values_beside
 from exporter.verify.participants import Participant
 
 

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.passes.noise import laid_out
-from converters.runtimes.process import LoadedModel, RunFailedError
+from converters.compiler.passes.noise import laid_out
+from converters.files.children.process import LoadedModel, RunFailedError
 from signatures.memories import divided, joined
 from signatures.roles import Role
 from signatures.spec import PolicySignature, SourceMap, TensorSpec

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from converters.formats import WRITTEN
+from converters.files.children.process import LoadedModel, RunFailedError
+from converters.formats.registry import WRITTEN
+from converters.formats.source import OriginalRun
 from converters.graph.nodes import Graph
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel, RunFailedError
-from converters.source import OriginalRun
 from exporter.verify.findings import Finding
 from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap

@@ -7,11 +7,11 @@ from contextlib import AbstractContextManager, suppress
 
 import numpy as np
 
-from converters.formats import WRITTEN
+from converters.files.children.process import LoadedModel, RunFailedError
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel, RunFailedError
 from exporter.verify.findings import Failure, failure
 from exporter.verify.original import Original
 from exporter.verify.participants import PolicyUnderTest

@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from converters.files.children.process import LoadedModel, RunFailedError
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
-from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.runtimes.registry import RUNTIMES
 from exporter.verify.difference import row_steps
 from exporter.verify.participants import Feeds

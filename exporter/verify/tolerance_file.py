@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from converters.formats import WRITTEN
+from converters.formats.registry import WRITTEN
 from converters.runtimes.registry import RUNTIMES
 from exporter.options_file import read_options
 from exporter.verify.tolerances import Tolerance, ToleranceRule

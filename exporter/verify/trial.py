@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.formats import narrows
+from converters.formats.registry import narrows
 from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+from converters.files.children.process import LoadedModel, RunFailedError
 from converters.runtimes.pool import INDEPENDENT, RuntimePool
-from converters.runtimes.process import LoadedModel, RunFailedError
 from converters.runtimes.registry import RuntimeInfo
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from converters.bundle.embed import runnable
+from converters.formats.bundle.embed import runnable
 from converters.graph.nodes import Graph, ref
 from converters.graph.ops.table import traits
 from converters.graph.shapes import infer_types

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
 from exporter import export_model
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
-from converters.policy import Policy
-from converters.targets.unity.checker import check_file
-from converters.targets.unity.consumers import CONSUMERS
-from converters.targets.unity.settings import Brain, sensors_of
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.settings import Brain, sensors_of
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
+from converters.policy.policy import Policy
 from signatures.roles import Role
 
 _MEMORY = "Models from com.unity.ml-agents 1.x that use recurrent neural networks are not supported"

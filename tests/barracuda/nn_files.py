@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from converters.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel, Trailer
+from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel, Trailer
 
 Array = np.ndarray
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.barracuda.format import NnModel
-from converters.barracuda.lower import base_name
-from converters.policy import Policy
+from converters.formats.barracuda.format import NnModel
+from converters.formats.barracuda.lower import base_name
+from converters.policy.policy import Policy
 from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import TensorSpec
 from tests.barracuda.reference import evaluate

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.barracuda.format import Layer, NnModel
+from converters.formats.barracuda.format import Layer, NnModel
 
 Array = np.ndarray
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.barracuda.answers import NnPolicy, answered, contract_of
-from converters.barracuda.format import parse
-from converters.barracuda.writer import encode
-from converters.format import WriteOptions
-from converters.formats import DEFAULTS, WRITTEN
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.formats.barracuda.answers import NnPolicy, answered, contract_of
+from converters.formats.barracuda.format import parse
+from converters.formats.barracuda.writer import encode
+from converters.formats.format import WriteOptions
+from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.export.again import verify_folder

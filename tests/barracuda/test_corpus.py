@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.barracuda.format import parse
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
+from converters.formats.barracuda.format import parse
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.graph.run import run_graph
 from exporter.export.sources import read_source
 from signatures.roles import Role

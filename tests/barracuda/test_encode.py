@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.barracuda.format import NnModel, Trailer, parse
-from converters.barracuda.writer import encode
+from converters.formats.barracuda.format import NnModel, Trailer, parse
+from converters.formats.barracuda.writer import encode
 from tests.barracuda.conftest import SHARED
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.test_format import PAIRS, assert_same, models

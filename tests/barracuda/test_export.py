@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from exporter.reports.summary import failure_lines

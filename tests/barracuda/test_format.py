@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.barracuda.format import VERSIONS, Dataset, Layer, NnInput, NnMemory, NnModel, Trailer, parse
-from converters.barracuda.graph import to_graph
+from converters.formats.barracuda.format import VERSIONS, Dataset, Layer, NnInput, NnMemory, NnModel, Trailer, parse
+from converters.formats.barracuda.graph import to_graph
 from signatures.errors import DamagedFileError, ExportModelError
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import public_files

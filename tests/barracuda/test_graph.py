@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.barracuda.format import NnModel, Trailer, parse
-from converters.barracuda.graph import to_graph
-from converters.barracuda.source import read
-from converters.fetch import Fetched
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
+from converters.compiler.options import CompileOptions
+from converters.compiler.passes.normalise import normalise
+from converters.files.fetch import Fetched
+from converters.formats.barracuda.format import NnModel, Trailer, parse
+from converters.formats.barracuda.graph import to_graph
+from converters.formats.barracuda.source import read
+from converters.formats.source import ReadOptions
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.ops.samplers import reseed
-from converters.graph.options import CompileOptions
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
-from converters.policy import Policy
-from converters.source import ReadOptions
+from converters.policy.policy import Policy
 from signatures.errors import DamagedFileError, SignatureError
 from signatures.roles import Role
 from tests.barracuda.nn_files import Maker, write_nn

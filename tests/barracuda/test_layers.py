@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.barracuda.format import parse
-from converters.barracuda.graph import to_graph
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
+from converters.formats.barracuda.format import parse
+from converters.formats.barracuda.graph import to_graph
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import static_shape
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.reference import evaluate

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from converters.barracuda.lower import policy_model
+from converters.formats.barracuda.lower import policy_model
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from converters.barracuda.format import Trailer, parse
-from converters.barracuda.graph import to_graph
-from converters.barracuda.vocabulary import LayerType, layer_label
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
+from converters.formats.barracuda.format import Trailer, parse
+from converters.formats.barracuda.graph import to_graph
+from converters.formats.barracuda.vocabulary import LayerType, layer_label
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, UnsupportedOpError
 from tests.barracuda.nn_files import Maker, write_nn
 

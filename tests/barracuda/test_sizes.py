@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from converters.barracuda.lower import policy_model
-from converters.frozen_graph.reader import read_graph
-from converters.graph.compile import compile_graph
-from converters.policy import Policy
+from converters.compiler.compile import compile_graph
+from converters.formats.barracuda.lower import policy_model
+from converters.formats.frozen_graph.reader import read_graph
+from converters.policy.policy import Policy
 from signatures.errors import UnsupportedOpError
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 

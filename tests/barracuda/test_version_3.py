@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.barracuda.format import parse
-from converters.barracuda.vocabulary import LayerType
-from converters.targets.profiles import profile
+from converters.consumers.profiles import profile
+from converters.formats.barracuda.format import parse
+from converters.formats.barracuda.vocabulary import LayerType
 from signatures.roles import Role
 from tests.barracuda.conftest import params
 from tests.corpus.conftest import genuine_cases

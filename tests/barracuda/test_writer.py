@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.barracuda.format import NnModel, parse
-from converters.barracuda.lower import base_name
-from converters.barracuda.vocabulary import LayerType
-from converters.barracuda.writer import write
-from converters.format import WriteOptions
+from converters.compiler.options import CompileOptions
+from converters.formats.barracuda.format import NnModel, parse
+from converters.formats.barracuda.lower import base_name
+from converters.formats.barracuda.vocabulary import LayerType
+from converters.formats.barracuda.writer import write
+from converters.formats.format import WriteOptions
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from signatures.contract import EMBEDDED
 from signatures.errors import SignatureError, UnsupportedOpError

@@ -101,7 +101,7 @@ def made(policy: str, peers: Peers, scratch: Path) -> tuple[Side, Side]:
 
 
 def _placeholders(source: Path) -> list[str]:
-    from converters import schema
+    from converters.files import tensorflow_messages as schema
 
     message = schema.GraphDef()
     message.ParseFromString(source.read_bytes())

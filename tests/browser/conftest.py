@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from converters.files.children.process import RuntimeProcess
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import available_runtimes
 
 TFJS = ("tfjs-cpu@chromium", "tfjs-wasm@chromium", "tfjs-webgl")

@@ -87,7 +87,7 @@ def test_a_bundle_is_verified_again_in_a_browser_and_a_wrong_weight_is_found(
     assert any(len(c.drift) == PARITY.steps for c in report.comparisons if c.runtime in wanted)
 
     spoil(result.folder / "tfjs")
-    monkeypatch.setattr("converters.bundle.bundle.Bundle.verify_hashes", lambda bundle, wanted=None: None)
+    monkeypatch.setattr("converters.formats.bundle.bundle.Bundle.verify_hashes", lambda bundle, wanted=None: None)
     report = verify_folder(result.folder, runtimes=wanted, options=PARITY)
     assert report.passed is False
     assert {c.runtime for c in report.comparisons if not c.passed} == set(wanted)

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.files.children.process import RunFailedError, RuntimeProcess
 from converters.runtimes.javascript import RUNTIMES
 from converters.runtimes.javascript.node import JS_SOURCE, js_home, node_executable
-from converters.runtimes.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
 from tests.runtimes.graph_models import batch, twins, twins_by_numpy
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats import WRITTEN
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.formats.registry import WRITTEN
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.difference import compare, floored

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.files import tensorflow_messages as schema
 from exporter.export.sources import read_source
 from signatures.roles import Role
 from tests.chains.hops import FORMS, Hop, exported, told, walk

@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from converters import schema
-from converters.checkpoint.tensor_bundle import Checkpoint, slice_key
+from converters.files import tensorflow_messages as schema
+from converters.formats.checkpoint.tensor_bundle import Checkpoint, slice_key
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 from tests.checkpoint.writing import bundle, literal, table
 from tests.conftest import examples

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.fetch import Fetched
-from converters.recognise import recognised
-from converters.source import ReadOptions
+from converters.files.fetch import Fetched
+from converters.formats.recognise import recognised
+from converters.formats.source import ReadOptions
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import path as fixture

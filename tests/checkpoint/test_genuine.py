@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
+from converters.files import tensorflow_messages as schema
+from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
-from converters.policy import Policy
-from converters.source import ReadOptions
+from converters.policy.policy import Policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import Source, read_source
 from signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from converters.checkpoint import table as module
-from converters.checkpoint.crc32c import crc32c, masked
-from converters.checkpoint.snappy import SnappyError, decompress
-from converters.checkpoint.table import MAGIC, read_table
+from converters.formats.checkpoint import table as module
+from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.snappy import SnappyError, decompress
+from converters.formats.checkpoint.table import MAGIC, read_table
 from signatures.errors import DamagedFileError, ExportModelError
 from tests.checkpoint.writing import block, literal, table, varint
 from tests.conftest import examples
@@ -52,7 +52,7 @@ def test_crc32c_in_lanes_is_the_same(extra: int, pattern: bytes) -> None:
 
 
 def _by_pieces(data: bytes) -> int:
-    import converters.checkpoint.crc32c as own
+    import converters.formats.checkpoint.crc32c as own
 
     return own._scalar(0xFFFFFFFF, data) ^ 0xFFFFFFFF
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from converters import schema
-from converters.checkpoint.crc32c import crc32c, masked
-from converters.checkpoint.table import MAGIC
-from converters.checkpoint.tensor_bundle import Extents, slice_key
-from converters.frozen_graph.tensors import from_array
+from converters.files import tensorflow_messages as schema
+from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.table import MAGIC
+from converters.formats.checkpoint.tensor_bundle import Extents, slice_key
+from converters.formats.frozen_graph.tensors import from_array
 
 Pairs = Sequence[tuple[bytes, bytes]]
 

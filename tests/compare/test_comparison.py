@@ -13,10 +13,10 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters import schema
-from converters.format import Ports
-from converters.formats import WRITTEN
-from converters.frozen_graph.tensors import from_array, to_array
+from converters.files import tensorflow_messages as schema
+from converters.formats.format import Ports
+from converters.formats.frozen_graph.tensors import from_array, to_array
+from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import RuntimePool
 from exporter.compare.comparison import _labels, compare_artefacts
 from exporter.export.pipeline import ExportOptions, export
@@ -238,7 +238,7 @@ def endless(model: onnx.ModelProto) -> None:
 def test_a_candidate_that_loops_for_ever_is_stopped(
     bundles: Bundles, tmp_path: Path, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("converters.runtimes.patience.FIRST", 3.0)
+    monkeypatch.setattr("converters.files.children.time_limits.FIRST", 3.0)
     made = edited(bundles("continuous") / "continuous.onnx", tmp_path / "endless.onnx", endless)
     report = compare_artefacts(bundles("continuous"), [made], runtimes="onnxruntime", pool=pool)
     assert "did not come to an end" in only_failure(report).reason

@@ -9,8 +9,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from converters.format import Port
-from converters.read import ports_of
+from converters.formats.format import Port
+from converters.formats.read import ports_of
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
@@ -93,7 +93,7 @@ def test_damaged_files_are_named(tmp_path: Path, bundle: Path) -> None:
 
 
 def test_a_saved_model_without_a_signature_cannot_be_called(tmp_path: Path, bundle: Path) -> None:
-    from converters import schema
+    from converters.files import tensorflow_messages as schema
 
     message = schema.parse(schema.SavedModel, (bundle / "saved_model" / "saved_model.pb").read_bytes(), "SavedModel")
     message.meta_graphs[0].signature_def.clear()

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
-from converters.policy import Policy
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
+from converters.formats.source import ReadOptions
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.source import ReadOptions
 from exporter.export.sources import read_source
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Role

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.compiler.options import CompileOptions
 from converters.graph.nodes import node_of
-from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from exporter.verify.difference import compare
 from exporter.verify.tolerances import Tolerance, tolerance_for

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.format import WriteOptions
-from converters.formats import DEFAULTS, WRITTEN
-from converters.policy import Policy
+from converters.files.children.process import LoadedModel
+from converters.formats.format import WriteOptions
+from converters.formats.registry import DEFAULTS, WRITTEN
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel
 from exporter.verify.difference import compare
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.roles import Role

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.barracuda.vocabulary import Activation, LayerType
+from converters.formats.barracuda.vocabulary import Activation, LayerType
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.barracuda.nn_files import Maker, write_nn

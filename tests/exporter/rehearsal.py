@@ -11,13 +11,13 @@ from typing import Any
 import numpy.typing as npt
 import pytest
 
-from converters.frozen_graph.reader import read_graph
+from converters.compiler.passes.normalise import normalise
+from converters.files.children.process import RunFailedError
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.runtimes import pool as runtimes
-from converters.runtimes.process import RunFailedError
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export import pipeline
 from exporter.export.pipeline import ExportResult

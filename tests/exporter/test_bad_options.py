@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.pieces import Pieces
+from converters.files.chunks import Pieces
 from exporter import export_model as export_by_python
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import Tolerance

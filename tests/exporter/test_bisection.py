@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from converters.bundle.embed import runnable
-from converters.frozen_graph.reader import read_graph
+from converters.compiler.options import CompileOptions
+from converters.files.children.process import RunFailedError
+from converters.formats.bundle.embed import runnable
+from converters.formats.frozen_graph.reader import read_graph
+from converters.formats.intermediate_tensors import InnerTensors, View
+from converters.formats.onnx.tensor_map import TensorMap, loads
 from converters.graph.nodes import Graph, Node
-from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from converters.inner import InnerTensors, View
-from converters.onnx.tensor_map import TensorMap, loads
-from converters.policy import Policy
-from converters.runtimes.process import RunFailedError
+from converters.policy.policy import Policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify import bisection as bisect
 from exporter.verify.bisection import _Search

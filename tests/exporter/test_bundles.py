@@ -12,11 +12,11 @@ from typing import Any
 import onnx
 import pytest
 
-from converters.bundle import bundle
-from converters.bundle.bundle import Bundle
-from converters.frozen_graph.reader import from_graph_def, read_graph
+from converters.files.tensorflow_messages import SavedModel, parse
+from converters.formats.bundle import bundle
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph
-from converters.schema import SavedModel, parse
 from exporter import __version__
 from fixtures import FIXTURES
 from fixtures import path as fixture

@@ -13,7 +13,7 @@ import click
 import pytest
 
 import exporter
-from converters.formats import DEFAULTS
+from converters.formats.registry import DEFAULTS
 from exporter.cli.app import app
 from exporter.cli.console import Console
 from exporter.cli.group import GROUPS, Command

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats import WRITTEN
+from converters.formats.registry import WRITTEN
 from converters.runtimes.base import Progress
 from converters.runtimes.javascript.node import install_packages
 from converters.runtimes.registry import RUNTIMES, Runtime
@@ -80,7 +80,7 @@ def test_inspection_says_which_format_cannot_take_a_policy(monkeypatch: pytest.M
     def refusing(*_: object) -> None:
         raise TypeError("no")
 
-    monkeypatch.setattr("converters.tfjs.writer.write", refusing)
+    monkeypatch.setattr("converters.formats.tfjs.writer.write", refusing)
     found = export_model("inspect", BALL, "--json").json["policies"][0]["targets"]
     assert found["onnx"] == {"ok": True, "reason": None}
     assert found["tfjs"] == {"ok": False, "reason": "the graph cannot be understood"}

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import exporter
-from converters.formats import ROOMS
+from converters.formats.registry import ROOMS
 from exporter.cli.app import app
 from tests.commands import ROOT, python
 
@@ -54,7 +54,7 @@ def name_of(path: Path) -> str:
 
 def test_the_modules_are_found() -> None:
     names = {name_of(m) for m in MODULES}
-    assert {"signatures/roles.py", "converters/formats.py", "exporter/cli/main.py"} <= names
+    assert {"signatures/roles.py", "converters/formats/registry.py", "exporter/cli/main.py"} <= names
 
 
 @functools.cache
@@ -86,7 +86,7 @@ def test_no_runtime_is_imported_with_a_module() -> None:
 
 
 def test_only_the_children_and_what_acts_import_a_runtime() -> None:
-    theirs = [ROOT / room for room in ("converters/runtimes", "exporter/acting")]
+    theirs = [ROOT / room for room in ("converters/runtimes", "converters/formats/live", "exporter/acting")]
     modules = [m for m in MODULES if not any(m.is_relative_to(room) for room in theirs)]
     assert importing(modules, lambda m: set(imported(tree_of(m))) & RUNTIMES) == {}
 
@@ -94,7 +94,7 @@ def test_only_the_children_and_what_acts_import_a_runtime() -> None:
 def own_imports(path: Path, names: set[str]) -> set[str]:
     """The modules of this project that a module imports, lazily too; those for type checking alone do not count.
 
-    A block for type checking with an ``else`` names what is deferred (``converters.format``).
+    A block for type checking with an ``else`` names what is deferred (``converters.formats.format``).
     """
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for found in ast.walk(tree):
@@ -145,16 +145,30 @@ def test_help_starts_without_anything_heavy() -> None:
 #: What a plain export to the usual formats has no use for, and what it takes instead.
 NOT_LOADED = (
     *HEAVY,
-    # the package: messages are written with converters/onnx/messages.py, and its checker is verification's
+    # the package: messages are written with converters/formats/onnx/messages.py, and its checker is verification's
     *("onnx", "ml_dtypes", "typing_extensions"),
-    # how messages are described in Python: converters/messages.py describes them in bytes
+    # how messages are described in Python: converters/files/protobuf_messages.py describes them in bytes
     *("google.protobuf.descriptor_pb2", "google.protobuf.json_format", "google.protobuf.descriptor_pool"),
     *("google.protobuf.message_factory", "google.protobuf.text_format"),
     *("rich", "email", "http", "ssl", "_hashlib", "socket", "asyncio", "multiprocessing", "subprocess", "tarfile"),
     *("numpy.ma", "numpy.random", "numpy.testing", "numpy.fft", "numpy.polynomial", "numpy.f2py", "numpy.ctypeslib"),
-    *("converters.barracuda.writer", "converters.barracuda.reader", "converters.targets", "converters.live"),
-    *("converters.torch_checkpoint.source", "converters.keras.source", "converters.stable_baselines3.source"),
-    *("converters.runtimes", "converters.onnx.reader", "converters.onnx.importer", "converters.tensorboard"),
+    *(
+        "converters.formats.barracuda.writer",
+        "converters.formats.barracuda.reader",
+        "converters.consumers",
+        "converters.formats.live",
+    ),
+    *(
+        "converters.formats.torch_checkpoint.source",
+        "converters.formats.keras.source",
+        "converters.formats.stable_baselines3.source",
+    ),
+    *(
+        "converters.runtimes",
+        "converters.formats.onnx.reader",
+        "converters.formats.onnx.importer",
+        "converters.formats.tensorboard",
+    ),
     *("exporter.verify.verification", "exporter.verify.findings", "exporter.verify.report", "exporter.verify.trial"),
     *("exporter.reports", "exporter.serve", "exporter.acting", "exporter.compare", "exporter.inspect", "exporter.demo"),
     # other commands, and what only a page of links or completion asks for
@@ -173,7 +187,7 @@ def test_a_plain_export_imports_what_it_uses(tmp_path: Path) -> None:
     )
     ran = python("-c", script, ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
     loaded = set(ran.out.splitlines()[-1].split())
-    assert "converters.onnx.writer" in loaded
+    assert "converters.formats.onnx.writer" in loaded
     assert {m for m in loaded for name in NOT_LOADED if m == name or m.startswith(f"{name}.")} == set()
 
 
@@ -188,8 +202,8 @@ def test_a_verified_bundle_is_vetted_without_what_costs_most(tmp_path: Path) -> 
     *said, last = python("-c", script, tmp_path / "continuous").out.splitlines()
     loaded = set(last.split())
     assert said[-1].startswith("PASSED")
-    assert "converters.onnx.vetted" in loaded
-    assert {"onnx", "importlib.metadata", "email", "converters.onnx.reader"}.isdisjoint(loaded)
+    assert "converters.formats.onnx.vetted" in loaded
+    assert {"onnx", "importlib.metadata", "email", "converters.formats.onnx.reader"}.isdisjoint(loaded)
 
 
 def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
@@ -208,7 +222,7 @@ def test_every_name_that_is_resolved_later_is_there() -> None:
     assert rooms == {*app.commands}
     for name in exporter.__all__:
         assert getattr(exporter, name) is not None
-    named = [ask for room in ROOMS for ask in asked_later(ROOT / "converters" / room / "__init__.py")]
+    named = [ask for room in ROOMS for ask in asked_later(ROOT / "converters/formats" / room / "__init__.py")]
     assert len(named) > 30
     missing = [ask for ask in named if not callable(getattr(importlib.import_module(ask[0]), ask[1], None))]
     assert missing == []

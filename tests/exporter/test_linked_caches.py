@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.fetch import inside
+from converters.files.fetch import inside
 from exporter import load_policy
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused

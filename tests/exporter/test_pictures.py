@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters import schema
-from converters.frozen_graph.encode import as_read
-from converters.frozen_graph.reader import read_graph
+from converters.files import tensorflow_messages as schema
+from converters.formats.frozen_graph.encode import as_read
+from converters.formats.frozen_graph.reader import read_graph
+from converters.formats.tensorboard import FILE_NAME, event_file
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.tensorboard import FILE_NAME, event_file
 from exporter import export_model as export
 from exporter.export.sources import read_source
 from fixtures import path as fixture

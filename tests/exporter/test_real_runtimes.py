@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.format import WriteOptions
-from converters.formats import DEFAULTS, WRITTEN
+from converters.files.chunks import Pieces
+from converters.formats.format import WriteOptions
+from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.graph.nodes import Graph
-from converters.pieces import Pieces
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.commands import export_model
@@ -136,7 +136,7 @@ def test_a_wrong_weight_behind_the_memory_is_found(tmp_path: Path, monkeypatch: 
 
 
 def test_an_artefact_that_its_runtime_cannot_load_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("converters.onnx.writer")
+    module = importlib.import_module("converters.formats.onnx.writer")
     monkeypatch.setattr(module, "write", lambda policy, options: {f"{policy.name}.onnx": Pieces(b"\x08\x08\x12\x01x")})
     ran = export_model(fixture("continuous"), "-o", tmp_path, "--samples", "1")
     assert (ran.status, ran.err) == (1, "")

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from converters import folders
-from converters.bundle import bundle, exchange
-from converters.bundle.bundle import Bundle
+from converters.files import folders
+from converters.formats.bundle import bundle, exchange
+from converters.formats.bundle.bundle import Bundle
 from fixtures import path as fixture
 from signatures.contract import safe_name
 from signatures.errors import BundleError, UsageError
@@ -26,8 +26,8 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSI
 SUICIDE = """
 import os, shutil, signal, sys
 from pathlib import Path
-from converters.bundle import exchange as swap
-from converters.pieces import Pieces
+from converters.formats.bundle import exchange as swap
+from converters.files.chunks import Pieces
 from exporter.cli.main import main
 
 point, *arguments = sys.argv[1:]
@@ -199,7 +199,7 @@ def test_other_systems_do_not_try_to(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_libc_without_the_call_is_no_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.bundle.exchange.ctypes.CDLL", lambda *a, **k: object())
+    monkeypatch.setattr("converters.formats.bundle.exchange.ctypes.CDLL", lambda *a, **k: object())
     assert not exchange._exchanged(tmp_path, tmp_path)
 
 

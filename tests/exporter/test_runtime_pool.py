@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats import DEFAULTS, WRITTEN
+from converters.files.children import process as processes
+from converters.files.children.process import RunFailedError, RuntimeProcess
+from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.runtimes import pool as pools
-from converters.runtimes import process as processes
 from converters.runtimes.javascript import node as javascript
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
@@ -166,7 +166,7 @@ def test_a_runtime_that_ends_at_once_is_unavailable() -> None:
 WAITS = """
 import pathlib, sys, time
 sys.path.insert(0, sys.argv[2])
-from converters.runtimes.child import claim_stdout, serve
+from converters.files.children.child import claim_stdout, serve
 out = claim_stdout()
 while not pathlib.Path(sys.argv[1]).exists():
     time.sleep(0.01)

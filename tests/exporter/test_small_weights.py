@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.format import WriteOptions
-from converters.formats import DEFAULTS, WRITTEN
+from converters.compiler.passes.weights import LEAST, Storage, are_steps, compact, rounded
+from converters.formats.format import WriteOptions
+from converters.formats.registry import DEFAULTS, WRITTEN
+from converters.formats.tfjs.int8 import joined, stepped
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.weights import LEAST, Storage, are_steps, compact, rounded
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
-from converters.tfjs.int8 import joined, stepped
 from exporter import export_model, verify_bundle
 from exporter.export.sources import read_source
 from exporter.reports.entry import of_result

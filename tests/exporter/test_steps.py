@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
+from converters.files import tensorflow_messages as schema
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.api import export_model as exported

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
 from converters.graph.run import run_graph
 from exporter.reports.entry import Entry
 from exporter.reports.markdown import markdown_text

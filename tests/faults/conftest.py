@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
+from converters.files import tensorflow_messages as schema
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.handmade import dense, graph_bytes, node, placeholder

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters import schema
-from converters.formats import DEFAULTS
-from converters.frozen_graph.tensors import from_array, to_array
+from converters.files import tensorflow_messages as schema
+from converters.files.children.process import LoadedModel
+from converters.formats.frozen_graph.tensors import from_array, to_array
+from converters.formats.registry import DEFAULTS
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export

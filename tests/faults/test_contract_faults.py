@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from converters.formats import DEFAULTS, WRITTEN
+from converters.formats.registry import DEFAULTS, WRITTEN
 from exporter.export import sources
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export

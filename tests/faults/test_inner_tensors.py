@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from converters.bundle.embed import runnable
+from converters.compiler.passes.lean import lean
+from converters.formats.bundle.embed import runnable
 from converters.graph.nodes import node_of
-from converters.graph.passes.lean import lean
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from converters.formats import WRITTEN
+from converters.formats.registry import WRITTEN
 from exporter.export.again import verify_folder
 from exporter.reports.summary import failure_lines
 from exporter.verify.findings import Finding

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
 
-from converters import schema
-from converters.barracuda.format import _Parser
-from converters.checkpoint.table import read_table
+from converters.files import tensorflow_messages as schema
+from converters.formats.barracuda.format import _Parser
+from converters.formats.checkpoint.table import read_table
 from signatures.digest import sha256_hex
 from tests.checkpoint.writing import literal, table
 from tests.fuzz import mutation

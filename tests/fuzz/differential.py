@@ -1,6 +1,6 @@
 """``python -m tests.fuzz.differential``: mutants as our messages read them, and as Google's own do: they must agree.
 
-``converters/onnx/messages.py`` and ``converters/schema.py`` know the fields that are needed, by their numbers. Whatever
+``converters/formats/onnx/messages.py`` and ``converters/files/tensorflow_messages.py`` know the fields that are needed, by their numbers. Whatever
 they read of a damaged file has to be what onnx and TensorFlow read of it, or a runtime would run another model than was
 looked at. Both refuse, or all fields that ours know have the same values.
 """
@@ -17,8 +17,8 @@ from typing import Any
 
 from google.protobuf.message import DecodeError
 
-from converters import schema
-from converters.onnx.messages import ModelProto
+from converters.files import tensorflow_messages as schema
+from converters.formats.onnx.messages import ModelProto
 from tests.fuzz.seeds import READERS, mutant
 
 _MESSAGE = 11

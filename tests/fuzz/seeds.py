@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from converters import schema
-from converters.formats import WRITTEN
+from converters.files import tensorflow_messages as schema
+from converters.formats.registry import WRITTEN
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import FOLDER, path
 from signatures.errors import ExportModelError

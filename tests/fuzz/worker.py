@@ -20,12 +20,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from converters.bundle.bundle import Bundle
-from converters.formats import WRITTEN
-from converters.keras.config import config_of, refuse_code
-from converters.keras.source import layered
-from converters.keras.weights import Groups
-from converters.read import ports_of
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.keras.config import config_of, refuse_code
+from converters.formats.keras.source import layered
+from converters.formats.keras.weights import Groups
+from converters.formats.read import ports_of
+from converters.formats.registry import WRITTEN
 from exporter import load_policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.inspect.inspection import inspect_source, inspection_text

@@ -14,17 +14,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters import schema
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
-from converters.frozen_graph.encode import encode
+from converters.files import tensorflow_messages as schema
+from converters.files.children.process import LoadedModel
+from converters.formats.format import WriteOptions
+from converters.formats.frozen_graph.encode import encode
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node
 from converters.graph.run import run_graph
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import BATCH, TensorType, static_shape
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import available_runtimes
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role

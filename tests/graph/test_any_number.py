@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from converters.compiler.options import CompileOptions
+from converters.compiler.passes.vmap_trial import check_rows
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
-from converters.graph.options import CompileOptions
-from converters.graph.passes.row_trial import check_rows
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export

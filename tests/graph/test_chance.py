@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
+from converters.compiler.options import CompileOptions
 from converters.graph.nodes import Graph, Node
-from converters.graph.options import CompileOptions
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from signatures.errors import SignatureError
 from signatures.roles import Role
 from tests.graph.making import const, graph, node, placeholder

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import read_graph
-from converters.graph.compilation import Compilation, Condition
-from converters.graph.compile import PASSES, compilations, compile_graph
+from converters.compiler.compilation import Compilation, Condition
+from converters.compiler.compile import PASSES, compilations, compile_graph
+from converters.compiler.options import CompileOptions
+from converters.compiler.passes import conditions as has
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node
-from converters.graph.options import CompileOptions
-from converters.graph.passes import conditions as has
-from converters.understand.facts import SourceFacts
+from converters.policy.facts import SourceFacts
 from exporter.export.sources import read_source
 from fixtures import FIXTURES
 from fixtures import path as fixture

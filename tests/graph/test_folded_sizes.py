@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import read_graph
-from converters.graph.allowance import MAX_MADE
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph
 from converters.graph.shapes import infer_types
+from converters.graph.size_limits import MAX_MADE
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 
 X = "vector_observation"

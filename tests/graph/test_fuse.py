@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.compiler.passes.fuse import fuse
 from converters.graph.nodes import Graph
-from converters.graph.passes.fuse import fuse
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import value
 from tests.graph.samples import floats

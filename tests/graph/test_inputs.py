@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from converters.compiler.passes.inputs import batch_size_rank, complete_shapes, set_values, settle_inputs
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.inputs import batch_size_rank, complete_shapes, set_values, settle_inputs
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32
 from signatures.errors import UsageError

@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
+from converters.compiler.passes.lean import lean
 from converters.graph.nodes import Graph, Node
-from converters.graph.passes.lean import lean
 from converters.graph.run import run_graph
 from converters.graph.types import INT32
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 from tests.graph.harness import Runtimes, difference

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from converters.compiler.passes.noise import lift_noise, samplers, without_noise
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.noise import lift_noise, samplers, without_noise
 from converters.graph.types import FLOAT32
 from signatures.errors import UnsupportedOpError
 from tests.graph.making import const, graph, node, ops, placeholder

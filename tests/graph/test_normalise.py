@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import from_graph_def
+from converters.compiler.passes.normalise import as_placeholder, normalise
+from converters.formats.frozen_graph.reader import from_graph_def
 from converters.graph.nodes import Graph, Node, TensorShape, topological
 from converters.graph.ops.table import TABLE
-from converters.graph.passes.normalise import as_placeholder, normalise
 from converters.graph.run import run_graph
 from converters.graph.types import BOOL, FLOAT32, INT64
 from signatures.errors import GraphError, UnsupportedOpError

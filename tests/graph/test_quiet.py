@@ -19,11 +19,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
+from converters.compiler.passes.fold import fold
+from converters.files.tensorflow_messages import GraphDef, serialise
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node
-from converters.graph.passes.fold import fold
 from converters.graph.run import run_graph
-from converters.schema import GraphDef, serialise
 from fixtures import path as fixture
 from signatures.errors import ExportModelError
 from tests import conftest

@@ -6,12 +6,12 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.format import WriteOptions
+from converters.compiler.passes.broadcast_constants import broadcast_rows
+from converters.formats.format import WriteOptions
+from converters.formats.onnx.writer import write
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.repeated import broadcast_rows
 from converters.graph.run import run_graph
 from converters.graph.types import BOOL, FLOAT32, INT32
-from converters.onnx.writer import write
 from tests.graph.harness import policy_of
 
 pytest.importorskip("onnxruntime")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from converters.compiler.passes.vmap import for_every_row
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.rows import for_every_row
 from converters.graph.run import run_graph
 from signatures.errors import UnsupportedOpError
 from tests.graph.samples import SAMPLES, Sample

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.frozen_graph.reader import read_graph
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.ops.samplers import SAMPLERS
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source

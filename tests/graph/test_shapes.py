@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from converters.compiler.passes.normalise import normalise
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.normalise import normalise
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32
 from exporter.export.sources import read_source

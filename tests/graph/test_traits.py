@@ -21,11 +21,11 @@ OUTSIDE = table.VARIABLES | table.ASSIGNS | table.RESTORES | table.READS | table
 NAMES = {*TABLE, *SPELLINGS, *CONTROL_FLOW, *FORBIDDEN, *OUTSIDE}
 #: Where names are a source's or a consumer's own words, which only sound like TensorFlow's: folder or file → whose.
 VOCABULARIES = {
-    "converters/barracuda": "Barracuda's layers",
-    "converters/keras/layers": "Keras' layers and operations",
-    "converters/onnx": "ONNX's ops",
-    "converters/targets": "the ops that Unity's importers take",
-    "converters/tfjs/unfuse.py": "the fused ops of TensorFlow.js",
+    "converters/formats/barracuda": "Barracuda's layers",
+    "converters/formats/keras/layers": "Keras' layers and operations",
+    "converters/formats/onnx": "ONNX's ops",
+    "converters/consumers": "the ops that Unity's importers take",
+    "converters/formats/tfjs/unfuse.py": "the fused ops of TensorFlow.js",
 }
 
 

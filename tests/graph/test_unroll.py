@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import from_graph_def, read_graph
+from converters.compiler.passes.fold import fold
+from converters.compiler.passes.inputs import set_values
+from converters.compiler.passes.normalise import normalise
+from converters.compiler.passes.unroll import MAX_TURNS, unroll
+from converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import CONTROL_FLOW
-from converters.graph.passes.fold import fold
-from converters.graph.passes.inputs import set_values
-from converters.graph.passes.normalise import normalise
-from converters.graph.passes.unroll import MAX_TURNS, unroll
 from converters.graph.run import run_graph
 from fixtures import path
 from fixtures.goldens import read_npz
@@ -227,7 +227,7 @@ def test_an_array_that_is_handed_on_again_and_again_is_refused(monkeypatch: pyte
         flow = f"w{i}"
     nodes.append(node("read", "TensorArrayReadV3", "array", "i0", flow, dtype=F32))
     assert straight(nodes, "read").nodes
-    monkeypatch.setattr("converters.graph.passes.unroll.MAX_HANDED_ON", 44)
+    monkeypatch.setattr("converters.compiler.passes.unroll.MAX_HANDED_ON", 44)
     with pytest.raises(NotAPolicyError, match="hand on more than 44"):
         straight(nodes, "read")
 

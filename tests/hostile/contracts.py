@@ -22,7 +22,7 @@ import pytest
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from converters import schema
+from converters.files import tensorflow_messages as schema
 from converters.runtimes.pool import RuntimePool
 from exporter.acting.policy import load_policy
 from exporter.serve import site

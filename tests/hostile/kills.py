@@ -21,7 +21,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from converters.bundle.bundle import Bundle
+from converters.formats.bundle.bundle import Bundle
 from fixtures import path as fixture
 from tests.commands import ROOT, default_signals
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from converters import schema
-from converters.barracuda.format import Layer, NnInput, NnModel
+from converters.files import tensorflow_messages as schema
+from converters.formats.barracuda.format import Layer, NnInput, NnModel
 from tests.barracuda.nn_files import write_nn
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy

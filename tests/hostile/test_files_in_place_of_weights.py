@@ -16,9 +16,9 @@ import numpy as np
 import onnx
 import pytest
 
-from converters import fetch
-from converters.checkpoint.tensor_bundle import Checkpoint
-from converters.fetch import Fetched, read_bytes
+from converters.files import fetch
+from converters.files.fetch import Fetched, read_bytes
+from converters.formats.checkpoint.tensor_bundle import Checkpoint
 from signatures.errors import SourceError
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from converters.keras.config import MAX_CONFIG, config_of, refuse_code
-from converters.source import ReadOptions
+from converters.formats.keras.config import MAX_CONFIG, config_of, refuse_code
+from converters.formats.source import ReadOptions
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, NotAPolicyError
 

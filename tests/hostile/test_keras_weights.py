@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.fetch import Fetched
-from converters.keras.source import read
-from converters.source import ReadOptions
+from converters.files.fetch import Fetched
+from converters.formats.keras.source import read
+from converters.formats.source import ReadOptions
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 h5py = pytest.importorskip("h5py")

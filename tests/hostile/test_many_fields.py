@@ -13,13 +13,14 @@ from google.protobuf.message import DecodeError
 from google.protobuf.unknown_fields import UnknownFieldSet
 from onnx import TensorProto
 
-from converters import counting, schema
-from converters.counting import MAX_FIELDS, fields_of
-from converters.frozen_graph.tensors import to_array
-from converters.messages import message_classes
-from converters.onnx.halves import widen
-from converters.onnx.messages import ModelProto
-from converters.onnx.proto import array_of, decoded
+from converters.files import message_limits as counting
+from converters.files import tensorflow_messages as schema
+from converters.files.message_limits import MAX_FIELDS, fields_of
+from converters.files.protobuf_messages import message_classes
+from converters.formats.frozen_graph.tensors import to_array
+from converters.formats.onnx.half_precision import widen
+from converters.formats.onnx.messages import ModelProto
+from converters.formats.onnx.proto import array_of, decoded
 from exporter.export.sources import read_source
 from signatures.bounded import MAX_VALUES, loads
 from signatures.contract import json_of

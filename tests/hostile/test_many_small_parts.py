@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.content import json_in
-from converters.pieces import Pieces
-from converters.schema import field
-from converters.tfjs.artifact import vetted
+from converters.files.chunks import Pieces
+from converters.files.file_probe import json_in
+from converters.files.tensorflow_messages import field
+from converters.formats.tfjs.artifact import vetted
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 from tests.fuzz.changes import zipped

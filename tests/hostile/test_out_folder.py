@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.tensorboard import FILE_NAME
+from converters.formats.tensorboard import FILE_NAME
 from exporter.fleet import ledger
 from fixtures import path as fixture
 from tests.commands import export_model

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from converters.keras.config import config_inside, config_of
-from converters.stable_baselines3.source import _entries
-from converters.torch_checkpoint.archive import Archive
+from converters.files.torch_archive import Archive
+from converters.formats.keras.config import config_inside, config_of
+from converters.formats.stable_baselines3.source import _entries
 from exporter.verify.golden import read_golden
 from signatures.errors import DamagedFileError, ExportModelError
 from tests.hostile.test_golden_archives import SIGNATURE, header

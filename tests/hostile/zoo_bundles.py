@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from converters import schema
+from converters.files import tensorflow_messages as schema
 from signatures.digest import sha256_hex
 from tests.hostile.making import (
     case,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats import DEFAULTS
+from converters.formats.registry import DEFAULTS
 from exporter import __version__
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path
@@ -107,7 +107,7 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     js, templates = "converters/runtimes/javascript/js", "exporter/snippets/templates"
     assert data >= {f"{js}/package.json", f"{js}/package-lock.json", f"{js}/runner.mjs", f"{js}/browser.mjs"}
     assert data >= {"exporter/serve/page/index.html", "exporter/reports/parity.schema.json"}
-    assert data >= {f"{templates}/agent.cs.tmpl", "converters/tfjs/js/policy.mjs"}
+    assert data >= {f"{templates}/agent.cs.tmpl", "converters/formats/tfjs/js/policy.mjs"}
     assert {n for n in names if Path(n).suffix in DATA} == data
     strays = [
         n

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.fetch import Fetched
-from converters.keras.config import config_of
-from converters.keras.layers.table import LAYERS
-from converters.keras.network import UnknownLayerError
-from converters.keras.source import read
-from converters.source import ReadOptions
+from converters.files.fetch import Fetched
+from converters.formats.keras.config import config_of
+from converters.formats.keras.layers.table import LAYERS
+from converters.formats.keras.network import UnknownLayerError
+from converters.formats.keras.source import read
+from converters.formats.source import ReadOptions
 from tests.keras_reader.agreement import assert_agrees
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("keras_reader")]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.read import fetched, read_models
+from converters.formats.read import fetched, read_models
+from converters.formats.source import ReadOptions
 from converters.runtimes.javascript.node import js_home, node_executable
-from converters.source import ReadOptions
 from exporter.export.sources import read_source
 from tests.keras_reader.agreement import assert_agrees
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import read_graph
-from converters.graph.options import CompileOptions
-from converters.policy import Policy
+from converters.compiler.options import CompileOptions
+from converters.files.children.process import RunFailedError
+from converters.formats.frozen_graph.reader import read_graph
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError
 from converters.runtimes.tensorflow1.release import RELEASES
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.findings import Finding

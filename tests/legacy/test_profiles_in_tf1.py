@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from converters.frozen_graph.reader import read_graph
-from converters.policy import Policy
+from converters.consumers.profile import Profile
+from converters.consumers.profiles import TFSHARP
+from converters.formats.frozen_graph.reader import read_graph
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.tensorflow1 import RELEASES
-from converters.targets.profile import Profile
-from converters.targets.profiles import TFSHARP
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from signatures.errors import ProfileError

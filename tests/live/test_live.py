@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model
 from exporter.export.sources import read_source

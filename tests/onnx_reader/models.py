@@ -14,15 +14,15 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters import schema
-from converters.fetch import Fetched
-from converters.frozen_graph.encode import encode
+from converters.compiler.passes.normalise import normalise
+from converters.files import tensorflow_messages as schema
+from converters.files.children.process import LoadedModel
+from converters.files.fetch import Fetched
+from converters.formats.frozen_graph.encode import encode
+from converters.formats.onnx.reader import OnnxModel, read_onnx
 from converters.graph.nodes import Graph, Node
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
-from converters.onnx.reader import OnnxModel, read_onnx
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel
 from converters.runtimes.registry import available_runtimes
 
 Array = npt.NDArray[Any]

@@ -22,13 +22,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.files.children.process import RunFailedError
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 from signatures.roles import Role

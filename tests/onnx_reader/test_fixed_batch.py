@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.formats.onnx.importer.fixed_batch import FixedBatch
 from converters.graph.types import BATCH, Symbols
-from converters.onnx.importer.fixed_batch import FixedBatch
 from exporter.export.pipeline import ExportOptions, export
 from exporter.reports.summary import failure_lines
 from tests.onnx_reader.models import Bench, floats, model, node

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines

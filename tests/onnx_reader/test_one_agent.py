@@ -118,7 +118,7 @@ def test_half_and_double_precision_are_computed_in_float32(kind: int, bench: Ben
 
 
 def test_halves_are_read_as_the_numbers_that_they_are() -> None:
-    from converters.onnx.halves import widen
+    from converters.formats.onnx.half_precision import widen
 
     values = np.array([1.5, -2.25, 65504.0, 6e-8], np.float16)
     message = model([node("Add", ["x", "c"])], {"x": (np.float16, ["batch", 4])}, ("y",), {"c": values})

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.frozen_graph.writer import frozen
+from converters.files.children.process import RuntimeProcess
+from converters.formats.frozen_graph.writer import frozen
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RuntimeProcess
 from exporter.export.sources import read_source
 from exporter.verify.difference import compare, floored
 from exporter.verify.tolerances import Tolerance

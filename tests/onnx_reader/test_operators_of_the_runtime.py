@@ -14,7 +14,7 @@ import onnx
 import pytest
 from onnx import helper
 
-from converters.onnx.vetted import COMPUTING, contained
+from converters.formats.onnx.vetted import COMPUTING, contained
 from signatures.errors import UnsupportedOpError
 from tests.onnx_reader.models import floats, model, node
 

@@ -10,8 +10,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from converters.graph.run import run_graph
-from converters.policy import Policy
-from converters.understand.memories import looks_like_state, stem_of
+from converters.policy.memories import looks_like_state, stem_of
+from converters.policy.policy import Policy
 from exporter import export_model, load_policy
 from exporter.export.sources import read_source
 from signatures.errors import SignatureError

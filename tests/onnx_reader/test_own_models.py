@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.format import WriteOptions
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.formats.format import WriteOptions
+from converters.formats.onnx.writer import write
 from converters.graph.run import run_graph
-from converters.onnx.writer import write
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines

@@ -12,8 +12,8 @@ import onnx
 import pytest
 from onnx import TensorProto, numpy_helper
 
-from converters.fetch import Fetched
-from converters.onnx.reader import read_onnx
+from converters.files.fetch import Fetched
+from converters.formats.onnx.reader import read_onnx
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.onnx_reader.models import Array, constant, declared, floats, helper, model, node, read, save

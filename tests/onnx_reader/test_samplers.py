@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.formats.onnx import edit
+from converters.formats.onnx.vetted import contained
 from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
-from converters.onnx import edit
-from converters.onnx.vetted import contained
 from exporter.verify.statistics import fit
 from tests.onnx_reader.models import Array, Bench, constant, floats, imported_graph, model, node, read
 

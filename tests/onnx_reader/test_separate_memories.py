@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.formats.onnx.memories import separate_memories
 from converters.graph.run import run_graph
-from converters.onnx.memories import separate_memories
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.api import verify_bundle
 from exporter.export.pipeline import ExportOptions, ExportResult, export

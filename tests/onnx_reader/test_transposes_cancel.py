@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.compiler.passes.transposes import cancel_transposes
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.transposes import cancel_transposes
 from converters.graph.run import run_graph
 from tests.onnx_reader.models import Array, floats
 

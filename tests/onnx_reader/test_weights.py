@@ -10,10 +10,10 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.fetch import Fetched
-from converters.onnx import proto
-from converters.onnx.reader import read_onnx
-from converters.onnx.vetted import contained, vetted
+from converters.files.fetch import Fetched
+from converters.formats.onnx import proto
+from converters.formats.onnx.reader import read_onnx
+from converters.formats.onnx.vetted import contained, vetted
 from signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import constant, floats, model, node
 

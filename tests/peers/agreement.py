@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from exporter.verify.difference import compare, ties
 from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for

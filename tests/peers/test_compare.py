@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.frozen_graph.encode import encode
+from converters.formats.frozen_graph.encode import encode
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.runtimes.pool import RuntimePool
 from exporter.compare.comparison import compare_artefacts

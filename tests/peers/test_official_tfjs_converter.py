@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.files.children.process import RuntimeProcess
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, disagreements

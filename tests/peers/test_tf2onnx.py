@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
+from converters.files.children.process import LoadedModel, RuntimeProcess
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import LoadedModel, RuntimeProcess
 from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, Run, disagreements

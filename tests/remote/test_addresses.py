@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from converters import fetch
-from converters.fetch import address_of
+from converters.files import fetch
+from converters.files.fetch import address_of
 from exporter import compare_artefacts, export_model, inspect_model, verify_bundle
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from converters.compiler.options import CompileOptions
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.samplers import SAMPLERS
-from converters.graph.options import CompileOptions
 from exporter.export.sources import read_source
 from exporter.reports.layers import Block, blocks_of
 from exporter.reports.layout import layout

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from jsonschema import Draft202012Validator
 
-from converters.bundle.bundle import dumps
+from converters.formats.bundle.bundle import dumps
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters import schema
-from converters.frozen_graph.reader import read_graph
+from converters.files import tensorflow_messages as schema
+from converters.formats.frozen_graph.reader import read_graph
 from signatures.errors import DamagedFileError
 from tests.commands import export_model
 from tests.handmade import (

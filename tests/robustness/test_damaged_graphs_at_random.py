@@ -19,11 +19,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from converters import schema
-from converters.bundle.bundle import Bundle
-from converters.formats import FORMATS
-from converters.graph.options import CompileOptions
-from converters.recognise import REFUSED, UNKNOWN, recognise
+from converters.compiler.options import CompileOptions
+from converters.files import tensorflow_messages as schema
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.recognise import REFUSED, UNKNOWN, recognise
+from converters.formats.registry import FORMATS
 from exporter.export.pipeline import ExportOptions, export
 from exporter.inspect.inspection import inspect_source
 from fixtures import FIXTURES

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import read_graph
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.nodes import TensorShape
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.commands import export_model
@@ -276,7 +276,7 @@ def test_a_fault_of_a_writer_names_the_file_too(tmp_path: Path, monkeypatch: pyt
     def failing(*_: object) -> None:
         raise TypeError("x")
 
-    monkeypatch.setattr("converters.onnx.writer.write", failing)
+    monkeypatch.setattr("converters.formats.onnx.writer.write", failing)
     refused(continuous_policy(), tmp_path, "cannot be understood", "TypeError")
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
+from converters.files import tensorflow_messages as schema
+from converters.formats.recognise import recognise
 from converters.graph.nodes import TensorShape
-from converters.recognise import recognise
 from exporter import inspect_model
 from fixtures import FIXTURES
 from fixtures import path as fixture

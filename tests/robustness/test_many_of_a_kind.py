@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters import schema
-from converters.barracuda import format as nn
-from converters.barracuda import lower_base
-from converters.barracuda.writer import policy_model
-from converters.frozen_graph.reader import read_graph
-from converters.graph import compile
-from converters.saved_model import signature
+from converters.compiler import compile
+from converters.files import tensorflow_messages as schema
+from converters.formats.barracuda import format as nn
+from converters.formats.barracuda import lower_base
+from converters.formats.barracuda.writer import policy_model
+from converters.formats.frozen_graph.reader import read_graph
+from converters.formats.saved_model import signature
 from exporter.export.sources import read_source
 from signatures.errors import MAX_LINE, DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.barracuda.nn_files import write_nn

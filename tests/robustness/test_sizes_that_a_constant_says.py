@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import read_graph
-from converters.graph.compile import compile_graph
-from converters.graph.options import CompileOptions
+from converters.compiler.compile import compile_graph
+from converters.compiler.options import CompileOptions
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.run import run_graph
 from signatures.errors import ExportModelError, GraphError
 from tests.commands import export_model, files_in, is_refused

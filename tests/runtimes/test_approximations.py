@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.formats import WRITTEN
+from converters.formats.registry import WRITTEN
 from converters.graph.ops.approximations import APPROXIMATIONS, RANGES
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes

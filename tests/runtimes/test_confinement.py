@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats import WRITTEN
-from converters.runtimes import memory
-from converters.runtimes.confinement import in_force
-from converters.runtimes.memory import FREE
+from converters.files.children import memory_limits as memory
+from converters.files.children.confinement import in_force
+from converters.files.children.memory_limits import FREE
+from converters.files.children.process import RunFailedError, RuntimeProcess
+from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError, RuntimeProcess
 from converters.runtimes.python import child_command, confined
 from exporter.export.pipeline import ExportOptions, export
 from signatures.errors import RuntimeUnavailableError
@@ -92,7 +92,7 @@ def test_no_core_and_no_endless_file() -> None:
 
 HUNGRY = """
 import numpy as np, sys
-from converters.runtimes.child import claim_stdout, serve
+from converters.files.children.child import claim_stdout, serve
 class Model:
     def run(self, feeds, fetch, request):
         size = int(feeds["x"][0])
@@ -115,7 +115,7 @@ def test_memory_is_bounded_by_what_it_is_given(tmp_path: Path) -> None:
 
 CYCLIC = """
 import numpy as np, weakref
-from converters.runtimes.child import claim_stdout, serve
+from converters.files.children.child import claim_stdout, serve
 loaded = weakref.WeakSet()
 class Model:
     def __init__(self):
@@ -162,7 +162,7 @@ def test_tensorflow_has_what_a_large_saved_model_takes(
 
 
 def test_its_folder_is_gone_when_it_is() -> None:
-    code = "from converters.runtimes.child import *; import os; out = claim_stdout(); "
+    code = "from converters.files.children.child import *; import os; out = claim_stdout(); "
     code += "serve('a', os.environ['TMPDIR'], None, (), out)"
     with RuntimeProcess(
         "a", [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(Path.cwd())!r}); {code}"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.process import RunFailedError, RuntimeProcess
+from converters.files.children.process import RunFailedError, RuntimeProcess
 from signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT, default_signals
 from tests.runtimes.graph_models import info, node, placeholder, write_model
@@ -21,7 +21,7 @@ from tests.runtimes.pipe import NEEDS_NODE
 BUSY = f"""
 import os, sys
 sys.path.insert(0, {str(ROOT)!r})
-from converters.runtimes.child import claim_stdout, serve
+from converters.files.children.child import claim_stdout, serve
 out = claim_stdout()
 def load(header):
     open(header["path"], "w").write(str(os.getpid()))
@@ -33,7 +33,7 @@ serve("busy", "1", load, (), out)
 PARENT = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
-from converters.runtimes.process import RuntimeProcess
+from converters.files.children.process import RuntimeProcess
 RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}], confined=False).load(sys.argv[1])
 """
 #: A parent whose child multiplies matrices that take TensorFlow.js minutes.
@@ -41,7 +41,7 @@ MULTIPLYING = f"""
 import sys, threading
 import numpy as np
 sys.path.insert(0, {str(ROOT)!r})
-from converters.runtimes.process import RuntimeProcess
+from converters.files.children.process import RuntimeProcess
 from converters.runtimes.registry import RUNTIMES
 def multiply():
     process = RuntimeProcess("tfjs-cpu", next(r for r in RUNTIMES if r.name == "tfjs-cpu").command())

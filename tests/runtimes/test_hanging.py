@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes import patience, process
+from converters.files.children import process
+from converters.files.children import time_limits as patience
+from converters.files.children.process import RunFailedError, RuntimeProcess
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError, RuntimeProcess
 
 _PROGRAM = """
 import sys, time
-from converters.runtimes.wire import read_frame, write_frame
+from converters.files.children.frames import read_frame, write_frame
 out = sys.stdout.buffer
 while True:
     header, _ = read_frame(sys.stdin.buffer)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from converters.files.children.process import RuntimeProcess
 from converters.runtimes.installed import STAMP, check
 from converters.runtimes.javascript.node import JS_SOURCE, js_home
-from converters.runtimes.process import RuntimeProcess
 from converters.runtimes.registry import RUNTIMES
 from converters.runtimes.tensorflow1.release import LIBRARIES, RELEASES
 from signatures.digest import sha256_hex

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.files.children.process import RunFailedError
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError
 from tests.runtimes.graph_models import batch, edit, info, node, twins, twins_by_numpy, write_model
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="Node is not on PATH")

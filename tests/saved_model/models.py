@@ -9,7 +9,7 @@ import numpy as np
 
 from converters.graph.nodes import node_of
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 
 #: What the keys of the models' signatures are called in a policy.
 CANONICAL = {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from converters.formats.saved_model.writer import DETERMINISTIC, signatures_of
 from converters.graph.ops.samplers import SAMPLERS
-from converters.policy import Policy
-from converters.saved_model.writer import DETERMINISTIC, signatures_of
+from converters.policy.policy import Policy
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 from tests.graph.making import graph, node, placeholder

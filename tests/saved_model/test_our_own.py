@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters import schema
-from converters.format import WriteOptions
-from converters.formats import WRITTEN
+from converters.files import tensorflow_messages as schema
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.graph.run import run_graph
-from converters.policy import Policy
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import read_source
@@ -104,7 +104,7 @@ def test_chains_of_formats_end_where_they_began(name: str, first: str, second: s
 
 
 def test_other_options_still_apply(tmp_path: Path) -> None:
-    from converters.graph.options import CompileOptions
+    from converters.compiler.options import CompileOptions
 
     (start,) = exported("continuous", tmp_path / "0")
     options = CompileOptions(deterministic=True)

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters import schema
-from converters.frozen_graph.reader import from_graph_def, read_graph
+from converters.compiler.passes.normalise import normalise
+from converters.files import tensorflow_messages as schema
+from converters.formats.frozen_graph.reader import from_graph_def, read_graph
+from converters.formats.saved_model.lengths import without_counted
+from converters.formats.saved_model.reader import read_saved_model
+from converters.formats.saved_model.signature import ModelSignature, Tensor, expose
+from converters.formats.saved_model.signature import exposed as with_facts
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
-from converters.saved_model.lengths import without_counted
-from converters.saved_model.reader import read_saved_model
-from converters.saved_model.signature import ModelSignature, Tensor, expose
-from converters.saved_model.signature import exposed as with_facts
-from converters.understand.facts import SourceFacts
+from converters.policy.facts import SourceFacts
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import path as fixture

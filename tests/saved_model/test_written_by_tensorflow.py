@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.checkpoint.tensor_bundle import Checkpoint
+from converters.formats.checkpoint.tensor_bundle import Checkpoint
+from converters.formats.source import ReadOptions
 from converters.runtimes.pool import RuntimePool
-from converters.source import ReadOptions
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines

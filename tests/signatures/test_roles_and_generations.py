@@ -6,7 +6,7 @@ import hashlib
 
 import pytest
 
-from converters.understand.generations import generation, torch_generation
+from converters.policy.generations import generation, torch_generation
 from signatures.digest import sha256_hex
 from signatures.errors import (
     BundleError,

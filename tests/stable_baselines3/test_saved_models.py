@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
-from converters.policy import Policy
-from converters.source import ReadOptions
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
 from fixtures.sb3_zip import FOLDER, ROWS, WHOLE

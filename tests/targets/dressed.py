@@ -13,21 +13,21 @@ import numpy as np
 import onnx
 import onnxruntime
 
-from converters.barracuda.format import NnModel, parse
-from converters.barracuda.vocabulary import LayerType
-from converters.format import WriteOptions
-from converters.formats import written
-from converters.graph.options import CompileOptions
+from converters.compiler.options import CompileOptions
+from converters.consumers.importable import importable
+from converters.consumers.profile import Profile
+from converters.consumers.unity.checker import UnityVerdict, check_file
+from converters.consumers.unity.consumers import consumer
+from converters.consumers.unity.settings import Brain, sensors_of
+from converters.formats.barracuda.format import NnModel, parse
+from converters.formats.barracuda.vocabulary import LayerType
+from converters.formats.format import WriteOptions
+from converters.formats.onnx import messages
+from converters.formats.onnx.edit import lifted
+from converters.formats.registry import written
+from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
-from converters.onnx import messages
-from converters.onnx.edit import lifted
-from converters.policy import Policy
-from converters.source import ReadOptions
-from converters.targets.importable import importable
-from converters.targets.profile import Profile
-from converters.targets.unity.checker import UnityVerdict, check_file
-from converters.targets.unity.consumers import consumer
-from converters.targets.unity.settings import Brain, sensors_of
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from signatures.roles import Role
 from signatures.spec import TensorSpec

@@ -17,14 +17,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.barracuda.writer import encode
-from converters.policy import Policy
+from converters.consumers.profile import Profile
+from converters.consumers.profiles import PROFILES
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import consumer
+from converters.formats.barracuda.writer import encode
+from converters.formats.source import ReadOptions
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
-from converters.source import ReadOptions
-from converters.targets.profile import Profile
-from converters.targets.profiles import PROFILES
-from converters.targets.unity.checker import check_file
-from converters.targets.unity.consumers import consumer
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 from tests.barracuda.test_writer import assert_answers

@@ -12,11 +12,11 @@ from pathlib import Path
 import onnx
 import pytest
 
-from converters.format import WriteOptions
-from converters.onnx.writer import write
-from converters.policy import Policy
-from converters.targets.unity.constructs import Model, constructs
-from converters.targets.unity.readings import IMPORTERS, MEASURED, Reading, misreadings
+from converters.consumers.unity.constructs import Model, constructs
+from converters.consumers.unity.readings import IMPORTERS, MEASURED, Reading, misreadings
+from converters.formats.format import WriteOptions
+from converters.formats.onnx.writer import write
+from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from signatures.errors import UnsupportedOpError
 from tests import known

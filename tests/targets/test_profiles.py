@@ -10,13 +10,13 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.barracuda.format import parse
+from converters.consumers.profile import Profile
+from converters.consumers.profiles import PROFILES, profile
+from converters.formats.barracuda.format import parse
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH
-from converters.policy import Policy
-from converters.targets.profile import Profile
-from converters.targets.profiles import PROFILES, profile
+from converters.policy.policy import Policy
 from exporter import export_model
 from exporter.verify.checks.consumer import consumers
 from signatures.contract import EMBEDDED

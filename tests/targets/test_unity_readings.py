@@ -10,8 +10,8 @@ from typing import Any
 import onnx
 import pytest
 
-from converters.targets.unity.constructs import constructs
-from converters.targets.unity.readings import IMPORTERS, MEASURED, RULES, Reading, misreadings
+from converters.consumers.unity.constructs import constructs
+from converters.consumers.unity.readings import IMPORTERS, MEASURED, RULES, Reading, misreadings
 
 RULES_FOLDER = Path(__file__).resolve().parents[3] / "shared" / "unity" / "onnx_rules"
 

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.fetch import Fetched
+from converters.files.fetch import Fetched
+from converters.formats.tfjs.reader import read_model
+from converters.formats.tfjs.unfuse import unfuse
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
-from converters.tfjs.reader import read_model
-from converters.tfjs.unfuse import unfuse
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import FIXTURES
@@ -235,7 +235,7 @@ SLOPES = np.array([0.1, 0.2, 0.3], np.float32)
     ],
 )
 def test_fused_ops_are_taken_apart(steps: tuple[str, ...], extra: dict[str, np.ndarray], wanted: np.ndarray) -> None:
-    from converters.graph.passes.normalise import normalise
+    from converters.compiler.passes.normalise import normalise
 
     attrs = {"leakyrelu_alpha": 0.3} if "LeakyRelu" in steps else {}
     made = unfuse(fused("_FusedMatMul", steps, extra, **attrs))

@@ -18,8 +18,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from converters.torch_checkpoint.archive import Archive
-from converters.torch_checkpoint.unpickle import Tensor, unpickle
+from converters.files.torch_archive import Archive
+from converters.files.unpickle import Tensor, unpickle
 from exporter.export.sources import read_source
 from fixtures.torch_checkpoint import FOLDER
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.bundle.bundle import Bundle
-from converters.fetch import Fetched
-from converters.recognise import recognised
-from converters.source import ReadOptions
+from converters.files.fetch import Fetched
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.recognise import recognised
+from converters.formats.source import ReadOptions
 from exporter import inspect_model
 from exporter.export.sources import read_source
 from fixtures.torch_checkpoint import FOLDER

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
-from converters.source import ReadOptions
 from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
 from fixtures.state_dicts import FOLDER, ROWS

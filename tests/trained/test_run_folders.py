@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.frozen_graph.reader import read_graph
+from converters.formats.frozen_graph.reader import read_graph
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model, inspect_model
 from exporter.demo import BALL

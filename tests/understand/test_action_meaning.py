@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
 from converters.graph.nodes import Graph, Node
-from converters.understand.action import action_meaning
+from converters.policy.action import action_meaning
 from signatures.errors import SignatureError
 from signatures.roles import Role
 from tests.signatures.nodes import FLOAT, constant, graph, op, placeholder

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.compiler.passes.outputs import LOG_PROBS, add_companions
 from converters.graph.nodes import Graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import INT64
-from converters.understand.action import ActionMeaning
-from converters.understand.brains import Head
-from converters.understand.outputs import LOG_PROBS, add_companions
+from converters.policy.action import ActionMeaning
+from converters.policy.brains import Head
 from signatures.roles import Role
 from tests.graph.harness import Array
 from tests.graph.making import const, graph, node, ops, placeholder

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.understand.brains import find_brains
-from converters.understand.inputs import classify_inputs, placeholder_rank, role_by_name
+from converters.policy.brains import find_brains
+from converters.policy.inputs import classify_inputs, placeholder_rank, role_by_name
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.roles import Role
 from tests.signatures.nodes import FLOAT, INT, Dims, constant, graph, op, placeholder

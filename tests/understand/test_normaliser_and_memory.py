@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.frozen_graph.reader import read_graph
-from converters.graph.compile import compile_graph
+from converters.compiler.compile import compile_graph
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph, Node
-from converters.understand.memories import memory_layout
-from converters.understand.observations import normaliser
+from converters.policy.memories import memory_layout
+from converters.policy.observations import normaliser
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.samples import f32
 

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.targets.unity.checker import check_file
-from converters.targets.unity.consumers import CONSUMERS
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import CONSUMERS
 from signatures.errors import ExportModelError
 from tests.commands import ROOT
 from tests.conftest import examples

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from onnx import TensorProto, helper
 
-from converters.targets.unity.checker import check_file
-from converters.targets.unity.consumers import CONSUMERS
-from converters.targets.unity.importing import refusal
-from converters.targets.unity.onnx_file import read_onnx_file
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.importing import refusal
+from converters.consumers.unity.onnx_file import read_onnx_file
 from tests.unity.conftest import lines
 from tests.unity.policies import Draft
 

@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
-from converters.targets.unity.checker import check_file
-from converters.targets.unity.consumers import CONSUMERS
-from converters.targets.unity.settings import Brain, sensors_of
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.settings import Brain, sensors_of
 from exporter.cli.app import app
 from signatures.errors import UsageError
 from tests.commands import export_model, is_refused

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.barracuda.format import NnModel, parse
-from converters.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
-from converters.barracuda.layer_builder import node_name
+from converters.formats.barracuda.format import NnModel, parse
+from converters.formats.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
+from converters.formats.barracuda.layer_builder import node_name
 from converters.graph.nodes import Graph, Node
 from converters.graph.run import run_graph
 from exporter.export.sources import read_source

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from converters.targets.unity.checker import check_file
-from converters.targets.unity.consumers import CONSUMERS
-from converters.targets.unity.settings import Brain, sensors_of
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.settings import Brain, sensors_of
 from exporter.cli.app import app
 from exporter.inspect.behavior_parameters import behavior_parameters
 from exporter.snippets.contract import read_bundle

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from converters.targets.unity.checker import MODES, UnityVerdict, check_file
-from converters.targets.unity.consumers import CONSUMERS
-from converters.targets.unity.findings import Thrown
-from converters.targets.unity.settings import Brain
+from converters.consumers.unity.checker import MODES, UnityVerdict, check_file
+from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.findings import Thrown
+from converters.consumers.unity.settings import Brain
 from tests.unity.conftest import lines
 
 pytestmark = pytest.mark.corpus

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper
 
-from converters.targets.unity.checker import ModeVerdict, UnityVerdict, check_file
-from converters.targets.unity.consumers import CONSUMERS
-from converters.targets.unity.rules import culture_key
-from converters.targets.unity.settings import Brain, sensors_of
+from converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
+from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.rules import culture_key
+from converters.consumers.unity.settings import Brain, sensors_of
 from signatures.errors import SourceError, UsageError
 from tests.unity.policies import Draft
 
@@ -258,7 +258,7 @@ def test_other_files_are_refused_by_us(tmp_path: Path) -> None:
 def test_behavior_parameters_are_checked(entry: dict[str, Any], tmp_path: Path) -> None:
     import json
 
-    from converters.targets.unity.settings import read_brain
+    from converters.consumers.unity.settings import read_brain
 
     path = tmp_path / "brain.json"
     path.write_text(json.dumps(entry))

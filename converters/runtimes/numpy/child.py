@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.bundle.embed import read_runnable, runnable
+from converters.files.children.child import claim_stdout, serve
+from converters.files.children.frames import Tensors
+from converters.formats.bundle.embed import read_runnable, runnable
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
-from converters.runtimes.child import claim_stdout, serve
-from converters.runtimes.wire import Tensors
 from signatures.errors import ExportModelError
 
 
@@ -38,7 +38,7 @@ def _load(header: Mapping[str, Any]) -> _Model:
     reseed(int(header.get("seed", 0)))
     path, key = Path(header["path"]), header.get("format", "bytes")
     if key == "nn":
-        from converters.barracuda.answers import NnPolicy
+        from converters.formats.barracuda.answers import NnPolicy
 
         return _Model(NnPolicy(path.read_bytes()).run)
     return _Model(partial(run_graph, read_runnable(path.read_bytes()) if key == "bytes" else _read_back(path, key)))
@@ -46,10 +46,10 @@ def _load(header: Mapping[str, Any]) -> _Model:
 
 def _read_back(path: Path, key: str) -> Graph:
     """The graph of an artefact in a format that no other runtime runs, as its own reader gives it."""
-    from converters.fetch import Fetched
-    from converters.formats import WRITTEN
-    from converters.graph.compile import compile_graph
-    from converters.source import ReadOptions
+    from converters.compiler.compile import compile_graph
+    from converters.files.fetch import Fetched
+    from converters.formats.registry import WRITTEN
+    from converters.formats.source import ReadOptions
 
     read = WRITTEN[key].read
     assert read is not None, f"{key} is not read"

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.runtimes.child import Model, claim_stdout, serve
-from converters.runtimes.wire import Tensors
+from converters.files.children.child import Model, claim_stdout, serve
+from converters.files.children.frames import Tensors
 
 
 def main() -> None:
@@ -51,16 +51,16 @@ def main() -> None:
             values = self.session.run(list(fetch), feeds)
             return dict(zip(fetch, values, strict=True))
 
-    from converters.detached import Detached
-    from converters.onnx.messages import files_of
+    from converters.files.external_data import Detached
+    from converters.formats.onnx.messages import files_of
 
     class Source:
         """A foreign model: a session for each set of values that is asked for."""
 
         def __init__(self, path: str, draws: Sequence[str]) -> None:
-            from converters.onnx import edit
-            from converters.onnx.halves import widen
-            from converters.onnx.vetted import contained
+            from converters.formats.onnx import edit
+            from converters.formats.onnx.half_precision import widen
+            from converters.formats.onnx.vetted import contained
 
             self.cut = edit.cut
             self.detached = Detached()

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from converters.files.children.child import Model, claim_stdout, serve
+from converters.files.children.frames import Tensors
+from converters.formats.live.freeze import FrozenFunction, frozen_function
 from converters.graph.ops.table import VARIABLES
-from converters.runtimes.child import Model, claim_stdout, serve
-from converters.runtimes.tensorflow.freeze import FrozenFunction, frozen_function
-from converters.runtimes.wire import Tensors
 from signatures.errors import ExportModelError
 
 
@@ -98,7 +98,7 @@ def main() -> None:
         if kind == "values":
             return given(path, header["archive"], header["names"])
         if kind == "keras":
-            from converters.keras.config import config_inside, refuse_code
+            from converters.formats.keras.config import config_inside, refuse_code
 
             refuse_code(config_inside(path), built=True)
             return _Frozen(frozen_function(path, "keras"))

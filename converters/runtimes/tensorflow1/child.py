@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from converters.runtimes.child import claim_stdout, serve
+from converters.files.children.child import claim_stdout, serve
 from converters.runtimes.tensorflow1.library import LegacyError, LegacySession, library_version, load_library
 
 

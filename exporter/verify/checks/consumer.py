@@ -19,9 +19,9 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
     """
     if name is None:
         return
-    from converters.targets.profiles import profile
-    from converters.targets.unity.checker import check_file
-    from converters.targets.unity.consumers import consumer
+    from converters.consumers.profiles import profile
+    from converters.consumers.unity.checker import check_file
+    from converters.consumers.unity.consumers import consumer
 
     wanted = profile(name)
     for release in wanted.checkers:

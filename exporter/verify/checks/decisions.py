@@ -13,9 +13,9 @@ from functools import partial
 
 import numpy as np
 
-from converters.graph.passes.weights import Storage
+from converters.compiler.passes.weights import Storage
+from converters.files.children.process import RunFailedError
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.process import RunFailedError
 from exporter.verify.findings import Decisions, Finding, failure
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, PolicyUnderTest

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.formats import narrows
+from converters.formats.registry import narrows
 from exporter.verify.difference import Difference, added, wrong
 from exporter.verify.findings import Bisection, Finding, Numbers, Shape
 from exporter.verify.participants import Feeds, Participant

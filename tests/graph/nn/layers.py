@@ -10,9 +10,9 @@ import numpy.typing as npt
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from converters.compiler.passes.normalise import normalise
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape
-from converters.graph.passes.normalise import normalise
 from converters.graph.run import run_graph
 from converters.graph.types import BATCH
 from tests import conftest

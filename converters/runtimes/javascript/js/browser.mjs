@@ -1,5 +1,5 @@
 /**
- * Runs models in Chromium for a parent process, over the frames of converters/runtimes/wire.py on stdin and stdout.
+ * Runs models in Chromium for a parent process, over the frames of converters/files/children/frames.py on stdin and stdout.
  *
  *     node browser.mjs --runtime NAME --modules DIR --chromium FILE [--known]
  *

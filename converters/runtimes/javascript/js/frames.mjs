@@ -1,5 +1,5 @@
 /**
- * Frames on a pair of streams, as converters/runtimes/wire.py writes them.
+ * Frames on a pair of streams, as converters/files/children/frames.py writes them.
  *
  * A frame, both ways: a little-endian uint32, the length of a header; the header, JSON in UTF-8; then the bytes of the
  * tensors that `header.tensors` = [{"name", "dtype", "shape"}] lists, one after the other, little-endian, in C order.

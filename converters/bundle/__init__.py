@@ -1,7 +1,0 @@
-"""Bundles, and the contract that every artefact of them embeds."""
-
-from converters.format import Format
-
-#: Its artefacts are read in its place (converters/read.py).
-BUNDLE = Format(key="bundle", label="a bundle of export-model", marker="policy.json")
-FORMATS = (BUNDLE,)

@@ -1,0 +1,205 @@
+"""Several memories become one: ``recurrent_in`` [B, n] is split into them, ``recurrent_out`` [B, n] joins them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
+
+from converters.compiler.options import CompileOptions
+from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, split_ref
+from converters.graph.shapes import infer_types
+from converters.graph.types import FLOAT32, static_shape
+from converters.policy.facts import SourceFacts
+from converters.policy.inputs import role_by_name
+from converters.policy.memories import paired_memories
+from signatures.errors import SignatureError
+from signatures.memories import SeparateMemory, SourcePart
+from signatures.records import dataclass
+from signatures.roles import CANONICAL, Role
+
+
+@dataclass(frozen=True)
+class Joined:
+    """A graph with one memory, what is then said of it, and the source's tensors that it stands for, by role."""
+
+    graph: Graph
+    options: CompileOptions
+    facts: SourceFacts
+    parts: Mapping[Role, tuple[SourcePart, ...]] = field(default_factory=dict)
+
+
+def join_memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> Joined:
+    """Join the memories that the format tells of, or that the user names: inputs and outputs in the source's order.
+
+    Raises SignatureError where the named ones do not belong together.
+    """
+    memories = _memories(graph, options, facts)
+    if not memories:
+        return Joined(graph, options, facts)
+    origins = {m.input: _origin(graph, m.input) for m in memories} | {
+        m.output: _origin(graph, m.output) for m in memories
+    }
+    joined, taken, given = _rewritten(graph, memories, origins)
+    inputs, outputs = {m.input for m in memories}, {m.output for m in memories}
+    wanted = {n: r for n, r in options.outputs.items() if normal_ref(n) not in outputs}
+    if Role.ACTION in wanted.values():  # naming the action says that the rest is left out; a memory belongs to it
+        wanted[given] = Role.MEMORY_OUT
+    declared = {n: r for n, r in facts.outputs.items() if n not in outputs}
+    return Joined(
+        joined,
+        replace(options, inputs={n: r for n, r in options.inputs.items() if node_of(n) not in inputs}, outputs=wanted),
+        replace(
+            facts,
+            roles={**facts.roles, taken: Role.MEMORY_IN},
+            outputs={**declared, given: Role.MEMORY_OUT},
+            memory_layout=tuple(m.part for m in memories) if all(m.part for m in memories) else (),
+        ),
+        {
+            Role.MEMORY_IN: tuple(SourcePart(origins[m.input], m.taken) for m in memories),
+            Role.MEMORY_OUT: tuple(SourcePart(origins[m.output], m.given) for m in memories),
+        },
+    )
+
+
+def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
+    given_in = {node_of(n): r for n, r in options.inputs.items()}
+    given_out = {normal_ref(n): r for n, r in options.outputs.items()}
+    told = tuple(
+        m
+        for m in (_paired(graph, facts) if facts.memories is None else facts.memories)
+        if m.input not in options.values
+        and given_in.get(m.input) in (None, Role.MEMORY_IN)
+        and given_out.get(m.output) in (None, Role.MEMORY_OUT)
+    )
+    inputs = [n.name for n in graph.nodes if given_in.get(n.name) is Role.MEMORY_IN]
+    named = [n for n, role in given_out.items() if role is Role.MEMORY_OUT]
+    outputs = [n for n in facts.outputs if n in named] + [n for n in named if n not in facts.outputs]
+    if {*inputs} <= {m.input for m in told} and {*outputs} <= {m.output for m in told}:
+        return told
+    # A format that declares no outputs has several brains in one graph, each with a memory of its own.
+    if not facts.outputs or (max(len(inputs), len(outputs)) < 2 and all(_has_rows_first(graph[n]) for n in inputs)):
+        return ()
+    return _named(graph, inputs, outputs)
+
+
+def _paired(graph: Graph, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
+    """The memories that names and shapes tell, of inputs that nothing else is known of."""
+    named = (n for n in graph.nodes if n.op == "Placeholder" and n.name not in facts.roles)
+    unknown = [n.name for n in named if role_by_name(n.name.rsplit("/", 1)[-1], n) is None]
+    outputs = [n for n, role in facts.outputs.items() if role is None]
+    return paired_memories(unknown, outputs, lambda: infer_types(graph, partial=True))
+
+
+def _named(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[SeparateMemory, ...]:
+    """The memories that the user names, the first output fed back to the first input."""
+    if len(inputs) != len(outputs):
+        raise SignatureError(
+            f"{len(inputs)} inputs are memories ({', '.join(inputs) or 'none'}), and {len(outputs)} outputs "
+            f"({', '.join(outputs) or 'none'})",
+            why="each memory is fed back from an output of its own",
+            fix="name as many of both: --input NAME=memory_in, --output NAME=memory_out",
+        )
+    types = infer_types(graph, partial=True)
+    memories = []
+    for name, tensor in zip(inputs, outputs, strict=True):
+        shapes: list[tuple[int | None, ...]] = []
+        for reference in (name, tensor):
+            kind = types.get(reference)
+            shape = None if kind is None else static_shape(kind.shape)
+            if kind is None or shape is None or kind.dtype != FLOAT32 or shape.count(None) != 1:
+                raise SignatureError(
+                    f"{reference!r} cannot be a part of the memory",
+                    why="a memory is float32 with one free axis, the batch; it is "
+                    + ("not in the graph" if kind is None else f"{kind.dtype.name} {list(shape or ())}"),
+                    fix="export the model with the batch axis of its memories free (dynamic_axes)",
+                )
+            shapes.append(shape)
+        memories.append(SeparateMemory(name, tensor, shapes[0], shapes[1]))
+        sizes = [_size(shape) for shape in shapes]
+        if sizes[0] != sizes[1]:
+            raise SignatureError(
+                f"the memory {name!r} takes {sizes[0]} numbers a row, and {tensor!r} gives {sizes[1]}",
+                why="memories are put together in the order of the file: the first output is fed to the first input",
+                fix="give the role memory_in, memory_out to those alone that belong together",
+            )
+    return tuple(memories)
+
+
+def _rewritten(graph: Graph, memories: Sequence[SeparateMemory], origins: Mapping[str, str]) -> tuple[Graph, str, str]:
+    """(the graph with one memory, its placeholder, the node that gives it)."""
+    editor = Editor(graph)
+    taken = editor.add_name(CANONICAL[Role.MEMORY_IN])
+    attrs = {"dtype": FLOAT32, "shape": TensorShape((None, sum(_size(m.taken) for m in memories)))}
+    editor.keep(Node(taken, "Placeholder", attrs=attrs, origin=_all([origins[m.input] for m in memories])))
+    begin = 0
+    for memory in memories:
+        end = begin + _size(memory.taken)
+        editor.redirect(memory.input, _split(editor, taken, memory, (begin, end), origins[memory.input], len(memories)))
+        begin = end
+    gone = {m.input for m in memories}
+    for node in graph.nodes:
+        if node.name not in gone:
+            editor.keep(node)
+    columns = [_columns(editor, memory) for memory in memories]
+    name, origin = CANONICAL[Role.MEMORY_OUT], _all([origins[m.output] for m in memories])
+    if len(columns) == 1:
+        given = editor.add("Identity", columns, name, origin)
+    else:
+        axis = editor.ints(1, f"{name}/axis")
+        given = editor.add("ConcatV2", [*columns, axis], name, origin)
+    return editor.graph(), taken, given
+
+
+def _split(editor: Editor, taken: str, memory: SeparateMemory, bounds: tuple[int, int], origin: str, count: int) -> str:
+    """A memory's columns of ``recurrent_in``, in the shape that the source takes it in."""
+    part, name, shape = taken, memory.input, memory.taken
+    if count > 1:
+        numbers = {"begin": [0, bounds[0]], "end": [0, bounds[1]], "steps": [1, 1]}
+        operands = [editor.ints(v, f"{name}/{k}") for k, v in numbers.items()]
+        part = editor.add("StridedSlice", [taken, *operands], f"{name}/columns", begin_mask=1, end_mask=1)
+    axis = shape.index(None)
+    rest = [d for d in shape if d is not None]
+    before = math.prod(rest[:axis])
+    if len(shape) > 2:
+        dims = [-1 if d is None else d for d in shape] if before == 1 else [-1, *rest]
+        part = editor.add("Reshape", [part, editor.ints(dims, f"{name}/shape")], f"{name}/rows")
+    if before != 1:
+        order = [*range(1, axis + 1), 0, *range(axis + 1, len(shape))]
+        part = editor.add("Transpose", [part, editor.ints(order, f"{name}/order")], f"{name}/part")
+    return editor.add("Identity", [part], f"{name}/given", origin)
+
+
+def _columns(editor: Editor, memory: SeparateMemory) -> str:
+    """A memory as the source gives it, [B, n]."""
+    part, name, shape = memory.output, f"{split_ref(memory.output)[0]}/fed_back", memory.given
+    axis = shape.index(None)
+    rest = [d for d in shape if d is not None]
+    if math.prod(rest[:axis]) != 1:
+        order = [axis, *(i for i in range(len(shape)) if i != axis)]
+        part = editor.add("Transpose", [part, editor.ints(order, f"{name}/order")], f"{name}/rows")
+    if shape[1:] == (_size(shape),):
+        return part
+    dims = editor.ints([-1, _size(shape)], f"{name}/shape")
+    return editor.add("Reshape", [part, dims], f"{name}/columns")
+
+
+def _has_rows_first(node: Node) -> bool:
+    """Whether a placeholder's batch is its first axis, as a memory's is."""
+    return not node.dims or node.dims[0] is None
+
+
+def _size(shape: Sequence[int | None]) -> int:
+    return math.prod(d for d in shape if d is not None)
+
+
+def _origin(graph: Graph, reference: str) -> str:
+    """The source's name for a tensor."""
+    name, index = split_ref(reference)
+    origin = graph[name].origin
+    return origin if index == 0 and isinstance(origin, str) else f"{name}:{index}"
+
+
+def _all(origins: Sequence[str]) -> str | tuple[str, ...]:
+    return origins[0] if len(origins) == 1 else tuple(origins)

@@ -1,0 +1,182 @@
+"""The outputs beside ``action``: the action without chance, the log-probabilities of a drawn one, further ones.
+
+Precondition: straight, folded graph; noise lifted or kept. Postcondition: ``deterministic_action`` exists for every
+policy (continuous: the action at zero noise; discrete: int64 [B, branches], the argmax of each branch), and
+``action_log_probs`` (float32 [B, ΣB]) for a sampled one. Outputs that a format declares and that mean nothing to us are
+kept where they have a row per agent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from converters.compiler.compilation import Compilation
+from converters.compiler.passes.noise import without_noise
+from converters.compiler.passes.normalise import normalise
+from converters.graph.editor import Editor
+from converters.graph.nodes import Graph, normal_ref
+from converters.graph.ops.table import traits
+from converters.graph.shapes import infer_types
+from converters.graph.types import FLOAT32, INT32, INT64, static_shape
+from converters.policy.action import ActionMeaning
+from converters.policy.brains import Head
+from signatures.errors import GraphError, SignatureError, UnsupportedOpError
+from signatures.roles import OBSERVATIONS, Role
+
+LOG_PROBS = "action_log_probs"
+
+
+def derive_outputs(c: Compilation) -> Compilation:
+    """Every action's companions. Raises SignatureError where an output without chance is drawn after all."""
+    graph, fetches = c.graph, dict(c.fetches)
+    truncated = [n.name for n in graph.nodes if traits(n).sampler == "truncated normal"]
+    types = infer_types(graph) if truncated else {}
+    noise = {**c.draws, **c.fed, **{n: static_shape(types[n].shape) or () for n in truncated}}
+    for head in c.brain.heads:
+        graph, fetches = add_companions(graph, fetches, head, c.meanings[head.name], noise)
+    for head in c.brain.heads:
+        _check_no_chance(graph, fetches[head.deterministic], head.deterministic)
+        if c.meanings[head.name].role is Role.DETERMINISTIC:
+            _check_no_chance(graph, fetches[head.name], head.name)
+    return replace(c, graph=graph, fetches=fetches)
+
+
+def _check_no_chance(graph: Graph, reference: str, name: str) -> None:
+    upstream = graph.ancestors([reference])
+    samplers = [n for n in graph.nodes if n.name in upstream and traits(n).sampler]
+    if samplers:
+        raise SignatureError(
+            f"{name} would be another one in every run: it depends on {samplers[0].name!r} ({samplers[0].op})",
+            why="there is no value of such a draw that stands for no chance, as 0 does for N(0, 1)",
+            fix="give the tensor before the draw as the action: --output NAME=action",
+        )
+
+
+def without_chance(c: Compilation) -> Compilation:
+    """``--deterministic``: the actions are the ones without chance. A discrete one is then made here."""
+    if not c.options.deterministic:
+        return c
+    fetches, meanings, sources = dict(c.fetches), dict(c.meanings), dict(c.sources)
+    for head in c.brain.heads:
+        meaning = meanings[head.name]
+        if meaning.role is Role.DETERMINISTIC:
+            continue
+        fetches[head.name] = fetches[head.deterministic]
+        if meaning.role is not Role.CONTINUOUS:
+            meanings[head.name] = ActionMeaning(Role.DETERMINISTIC, meaning.branches)
+            sources[head.name] = None
+    fetches.pop(LOG_PROBS, None)
+    return replace(c, fetches=fetches, meanings=meanings, sources=sources)
+
+
+def add_companions(
+    graph: Graph,
+    fetches: Mapping[str, str],
+    head: Head,
+    meaning: ActionMeaning,
+    noise: Mapping[str, tuple[int | None, ...]],
+) -> tuple[Graph, dict[str, str]]:
+    """The graph with an action's companions, and the fetches with their tensors added.
+
+    A companion that the source has itself is left as it is.
+    """
+    added, name = dict(fetches), head.deterministic
+    if meaning.role is Role.CONTINUOUS:
+        if name not in fetches:
+            graph, (added[name],) = without_noise(graph, [fetches[head.name]], noise, name)
+        return graph, added
+    scores = list(meaning.branches)
+    action = fetches[head.name]
+    if name not in fetches:
+        graph, quiet = without_noise(graph, scores or [action], noise, name)
+        scores, action = (quiet, action) if scores else (scores, quiet[0])
+    editor = Editor(graph)
+    for node in graph.nodes:
+        editor.keep(node)
+    if meaning.role is Role.SAMPLED and LOG_PROBS not in fetches:
+        parts = [editor.add("LogSoftmax", [b], f"{LOG_PROBS}/branch_{i}") for i, b in enumerate(meaning.branches)]
+        added[LOG_PROBS] = _joined(editor, parts, LOG_PROBS)
+    if name not in fetches:
+        if scores:
+            added[name] = _argmax(editor, graph, scores, name)
+        else:
+            added[name] = _as_columns(editor, graph, action, name)
+    return editor.graph(), added
+
+
+def _joined(editor: Editor, parts: Sequence[str], name: str) -> str:
+    if len(parts) == 1:
+        return parts[0]
+    axis = editor.ints(1, f"{name}/axis")
+    return editor.add("ConcatV2", [*parts, axis], f"{name}/concat")
+
+
+def _argmax(editor: Editor, graph: Graph, branches: Sequence[str], name: str) -> str:
+    columns, types = [], infer_types(graph)
+    for i, branch in enumerate(branches):
+        prefix = f"{name}/branch_{i}"
+        shape = types[branch].shape or ()
+        if len(shape) > 2 and isinstance(shape[-1], int):  # [B, 1, n]
+            row = editor.const(np.array([-1, shape[-1]], INT32), f"{prefix}/row_shape")
+            branch = editor.add("Reshape", [branch, row], f"{prefix}/row")
+        axis = editor.ints(1, f"{prefix}/axis")
+        best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
+        columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))
+    return _joined(editor, columns, name)
+
+
+def _as_columns(editor: Editor, graph: Graph, action: str, name: str) -> str:
+    """An integer action whose scores are not in the graph: itself, as int64 [B, n]."""
+    kind = infer_types(graph)[action]
+    value = action
+    if kind.dtype != INT64:
+        value = editor.add("Cast", [value], f"{name}/int64", DstT=INT64)
+    if kind.rank == 1:
+        value = editor.add("Reshape", [value, _column_shape(editor, name)], f"{name}/column")
+    return value
+
+
+def _column_shape(editor: Editor, prefix: str) -> str:
+    return editor.ints([-1, 1], f"{prefix}/column_shape")
+
+
+def leave_out_without_rows(c: Compilation) -> Compilation:
+    """Outputs of unknown meaning whose first axis is not the agents' go; the signature notes them by name.
+
+    Raises SignatureError where one may be a memory: a policy that forgets is another policy.
+    """
+    others = [base for base, role, _ in c.brain.outputs if role is Role.OTHER and base in c.fetches]
+    _check_memories(c)
+    if not others:
+        return c
+    types = infer_types(c.graph)
+    shapes = {name: types[c.fetches[name]].shape for name in others}
+    gone = [name for name, shape in shapes.items() if shape is not None and not isinstance((*shape, 0)[0], str)]
+    kept = {name: reference for name, reference in c.fetches.items() if name not in gone}
+    return replace(c, fetches=kept, brain=replace(c.brain, left_out=(*c.brain.left_out, *gone)))
+
+
+def _check_memories(c: Compilation) -> None:
+    """An output that is made of an input and has its shape is fed back to it, for all that is known: where another
+    input is the observation, and nobody said what the output is. One that is left out is looked at in the source.
+    """
+    fed = [n for n, r in c.roles.items() if r in OBSERVATIONS or r is Role.PARAMETER]
+    named = {normal_ref(n) for n in c.options.outputs} | {r for _, role, r in c.brain.outputs if role is not Role.OTHER}
+    for name in (n for n, role in c.facts.outputs.items() if role is None and len(fed) > 1 and n not in named):
+        try:
+            graph = normalise(c.original.pruned([name]), [name])
+            types = infer_types(graph, partial=True)
+        except (UnsupportedOpError, GraphError):  # it cannot be converted at all
+            continue
+        shape = static_shape(types[name].shape)
+        alike = [n for n in fed if n in graph and static_shape(types[n].shape) == shape and types[n].dtype == FLOAT32]
+        if alike and shape and None in shape and types[name].dtype == FLOAT32:
+            taken = alike[0] if len(alike) == 1 else "NAME"
+            raise SignatureError(
+                f"the output {name!r} may be a memory: it is made of an input of its shape ({', '.join(alike)})",
+                why="without its memory the policy would act otherwise, and no name says what it is",
+                fix=f"--input {taken}=memory_in --output {name}=memory_out, or --output {name}=other if it is none",
+            )

@@ -1,0 +1,164 @@
+"""A policy taken over into a consumer's names: new inputs in front of its graph, new outputs behind it.
+
+The graph itself stays as it is. In front of it each input of the consumer is brought to what the graph takes (an image
+turned, a float cast, a row of memory reshaped); behind it the actions are brought to what the consumer reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NoReturn
+
+import numpy as np
+
+from converters.compiler.passes.fold import fold
+from converters.compiler.passes.naming import name_tensors
+from converters.compiler.passes.signature import LIFTED
+from converters.compiler.passes.simplify import collapse_views, drop_identities
+from converters.compiler.passes.transposes import cancel_transposes
+from converters.consumers.profile import refused
+from converters.graph.builder import Builder
+from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref
+from converters.graph.types import FLOAT32, static_shape
+from converters.policy.policy import Policy
+from signatures.roles import Role
+from signatures.spec import Memory, SourceMap, TensorSpec
+
+
+@dataclass
+class Dressing:
+    """A policy on its way into the names of ``profile``.
+
+    ``tensors`` maps the policy's own inputs, later its own outputs too, to tensors of the new graph.
+    """
+
+    policy: Policy
+    profile: str
+    builder: Builder = field(init=False)
+    inputs: list[TensorSpec] = field(default_factory=list)
+    outputs: list[TensorSpec] = field(default_factory=list)
+    tensors: dict[str, str] = field(default_factory=dict)
+    feeds: dict[str, str] = field(default_factory=dict)
+    fetches: dict[str, str] = field(default_factory=dict)
+    constants: dict[str, np.ndarray] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    branches: tuple[int, ...] = ()
+    #: input → what is done to a camera's image before it is fed
+    images: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.builder = Builder(NameScope(n.name for n in self.policy.graph.nodes))
+
+    def refuse(self, what: str, *, why: str, fix: str) -> NoReturn:
+        """Raise the ProfileError of what this profile cannot hold."""
+        refused(self.policy, self.profile, what, why=why, fix=fix)
+
+    # ------------------------------------------------------------------ in front of the graph
+
+    def take(self, name: str, spec: TensorSpec, shape: tuple[int | None, ...], dtype: np.dtype[Any] = FLOAT32) -> str:
+        """A new input of the consumer that stands for the policy's input ``spec``."""
+        origin = spec.source if isinstance(spec.source, str) else None
+        made = self.builder.named_input(self.builder.names.fresh(f"{self.profile}/{name}"), dtype, shape, origin)
+        self.feeds[name] = made
+        self.inputs.append(replace(spec, name=name, dtype=dtype.name, shape=shape))
+        return made
+
+    def give_in(self, spec: TensorSpec, tensor: str) -> None:
+        """Let ``tensor`` be what the graph takes as its input ``spec``: cast and reshaped to it."""
+        tensor = self.builder.cast(tensor, np.dtype(spec.dtype))
+        if self.builder.rank(tensor) != len(spec.shape):
+            dims = [-1 if d is None else d for d in spec.shape]
+            tensor = self.builder.add("Reshape", [tensor, self.builder.ints(dims, "shape")], f"{spec.name}/as_taken")
+        self.tensors[self.policy.feeds[spec.name]] = tensor
+
+    def take_over(self, draws: Callable[[TensorSpec], str]) -> None:
+        """Append the policy's graph behind the inputs; ``draws`` makes what stands for an input of noise.
+
+        What does not hang on noise comes first, so that a draw can be of the shape of something computed.
+        """
+        graph = self.policy.graph
+        noise = {self.policy.feeds[s.name]: s for s in self.policy.signature.noise}
+        self.notes.extend(f"{spec.name} is drawn inside the model, at every step anew" for spec in noise.values())
+        behind: set[str] = set(noise)
+        later = []
+        for node in graph.nodes:
+            if node.op == "Placeholder":
+                continue
+            if behind.intersection(split_ref(r)[0] for r in node.inputs):
+                behind.add(node.name)
+                later.append(node)
+            else:
+                self._keep(node)
+        for placeholder, spec in noise.items():
+            self.tensors[placeholder] = draws(spec)
+        for node in later:
+            self._keep(node)
+
+    def _keep(self, node: Node) -> None:
+        self.builder.append(node.with_inputs(self.moved(r) for r in node.inputs))
+
+    def moved(self, reference: str) -> str:
+        """Where a tensor of the policy's graph is now."""
+        name, index = split_ref(reference)
+        return self.tensors.get(ref(name, index), reference)
+
+    def own(self, output: str) -> str:
+        """The tensor that is the policy's output of this name."""
+        return self.moved(self.policy.fetches[output])
+
+    # ------------------------------------------------------------------ behind it
+
+    def give(self, name: str, tensor: str, role: Role, source: str | tuple[str, ...] | None = None) -> None:
+        """Let ``tensor`` be an output of the consumer's."""
+        pinned = self.builder.add("Identity", [tensor], f"{self.profile}/{name}")
+        kind = self.builder.type_of(tensor)
+        self.fetches[name] = pinned
+        self.outputs.append(TensorSpec(name, role, kind.dtype.name, static_shape(kind.shape) or (None,), source))
+
+    def finished(self, memory: Memory | None, beside: Sequence[Node] = ()) -> Policy:
+        """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up."""
+        graph = self.builder.graph().pruned(self.fetches.values())
+        work, fetches = drop_identities(fold(graph).pruned(self.fetches.values()), self.fetches)
+        work, fetches = cancel_transposes(*collapse_views(work, fetches))
+        feeds = {name: node for name, node in self.feeds.items() if node in work}
+        work = name_tensors(work, feeds, fetches, (*self.constants, *(n.name for n in beside)))
+        signature = replace(
+            self.policy.signature,
+            inputs=tuple(s for s in self.inputs if s.name in feeds),
+            outputs=tuple(self.outputs),
+            memory=memory,
+            branches=self.branches,
+            preprocess=self.images,
+            constants={
+                **{n.name: _plain(n.value) for n in beside if n.value is not None},
+                **{k: _plain(v) for k, v in self.constants.items()},
+            },
+            notes=(*(n for n in self.policy.signature.notes if not LIFTED.fullmatch(n)), *self.notes),
+            labels={},
+        )
+        names = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
+        return Policy(
+            self.policy.name,
+            Graph((*work.nodes, *beside)),
+            signature,
+            {n: n for n in names[0]},
+            {n: n for n in names[1]},
+            SourceMap(
+                noise={s.name: s.shape for s in self.policy.signature.noise},
+                noise_kept=bool(self.policy.signature.noise),
+            ),
+            dict(self.constants),
+        )
+
+
+def _plain(value: np.ndarray) -> int | list[int]:
+    numbers = [int(v) for v in value.reshape(-1)]
+    return numbers if value.ndim > 1 else numbers[0]
+
+
+def row(builder: Builder, tensor: str, width: int) -> str:
+    """A tensor as [B, width]."""
+    if builder.shape(tensor)[1:] == (width,):
+        return tensor
+    return builder.add("Reshape", [tensor, builder.ints([-1, width], "row")])

@@ -1,0 +1,37 @@
+"""What a profile is: one consumer, and how a policy is made into what that one looks up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NoReturn
+
+from converters.policy.policy import Policy
+from signatures.errors import ProfileError
+from signatures.records import dataclass
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Profile:
+    """A consumer of policies: ``--for NAME``.
+
+    ``formats`` are those that it loads, the usual one first. ``dress`` gives the policy under the names, dtypes and
+    layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
+    ``converters/consumers/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
+    releases of ``converters/consumers/unity/consumers.py`` that must accept it. ``opset`` is the ONNX opset.
+    ``own_names`` are formats whose writer gives a policy the consumer's names by itself (``.nn`` of API version 2).
+    """
+
+    name: str
+    aliases: tuple[str, ...] = ()
+    purpose: str
+    formats: tuple[str, ...]
+    dress: Callable[[Policy], Policy]
+    own_names: frozenset[str] = frozenset()
+    opset: int = 15
+    importers: tuple[str, ...] = ()
+    checkers: tuple[str, ...] = ()
+
+
+def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:
+    """Raise the ProfileError of a policy that a profile cannot hold."""
+    raise ProfileError(f"{policy.name!r} cannot be made for {profile}: {what}", why=why, fix=fix)

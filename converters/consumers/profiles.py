@@ -1,0 +1,84 @@
+"""The list of profiles: every consumer that a policy can be made for."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from converters.consumers.mlagents import version2, version3
+from converters.consumers.mlagents.tensorflowsharp import Generation, dress
+from converters.consumers.profile import Profile
+from signatures.errors import UsageError, meant
+
+#: What CoreBrainInternal.cs gave as pictures until 0.4.0b.
+_GREY = "0.4.0 and 0.4.0a give grey ones from 0 to 255, not to 1: use 0.4.0b for those"
+_COLOURS = "0.3.0 gives colours from 0 to 255, not to 1, and 0.3.1 grey ones: use 0.3.1 for colours, 0.4.0b for grey"
+_GENERATIONS = (
+    (Generation("tfsharp-0.6", masks=True, branches=True, version=1), "ML-Agents 0.6 (plugin of TensorFlow 1.7)"),
+    (Generation("tfsharp-0.5", masks=True, branches=True), "ML-Agents 0.5 (plugin of TensorFlow 1.7)"),
+    (Generation("tfsharp-0.4", pictures=_GREY), "ML-Agents 0.4 (plugin of TensorFlow 1.7)"),
+    (Generation("tfsharp-0.3", pictures=_COLOURS), "ML-Agents 0.3 (plugin of TensorFlow 1.4)"),
+    (
+        Generation("tfsharp-0.2", vector="state", visual="observation_", previous=False, memory_constant=False),
+        "ML-Agents 0.1 and 0.2 (plugin of TensorFlow 1.1 or 1.2)",
+    ),
+)
+#: ML-Agents 0.1 to 0.6 on the TensorFlowSharp plugin: a ``.bytes`` for each generation.
+TFSHARP = tuple(
+    Profile(name=g.name, purpose=purpose, formats=("bytes",), dress=partial(dress, generation=g))
+    for g, purpose in _GENERATIONS
+)
+#: The newest first; ``--for help`` shows them in this order.
+PROFILES: tuple[Profile, ...] = (
+    Profile(
+        name="unity6",
+        aliases=("sentis", "inference-engine"),
+        purpose="ML-Agents 3.0 and 4.0 in Unity 2023 and Unity 6 (Sentis 2.1, Inference Engine 2.2 to 2.4)",
+        formats=("onnx",),
+        dress=partial(version3.dress, profile="unity6"),
+        importers=("Sentis 2.1.3", "Inference Engine 2.2.2", "Inference Engine 2.4.0"),
+        checkers=("R22", "R23", "R23-2.4"),
+    ),
+    Profile(
+        name="barracuda-3",
+        aliases=("barracuda",),
+        purpose="ML-Agents 2.3 (release 20) in Unity 2020 to 2022 (Barracuda 3.0)",
+        formats=("onnx", "nn"),
+        dress=partial(version3.dress, profile="barracuda-3"),
+        opset=12,
+        importers=("Barracuda 3.0.0",),
+        checkers=("R20",),
+    ),
+    Profile(
+        name="barracuda-1.4",
+        purpose="ML-Agents 2.0 to 2.2 (releases 17 to 19) in Unity 2019 to 2021 (Barracuda 1.4 to 2.3)",
+        formats=("onnx", "nn"),
+        dress=partial(version3.dress, profile="barracuda-1.4"),
+        opset=12,
+        importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),
+        checkers=("R20",),
+    ),
+    Profile(
+        name="barracuda-1.0",
+        purpose="ML-Agents 1.0 to 1.9 (releases 1 to 16) in Unity 2018 to 2020 (Barracuda 1.0 to 1.3); "
+        "memory in .nn alone",
+        formats=("onnx", "nn"),
+        own_names=frozenset({"nn"}),
+        dress=partial(version2.dress, profile="barracuda-1.0"),
+        opset=11,
+        importers=("Barracuda 1.1.2", "Barracuda 1.4.0"),
+        checkers=("R20",),
+    ),
+    *TFSHARP,
+)
+
+
+def profile(name: str) -> Profile:
+    """The profile of a word of ``--for``. Raises UsageError."""
+    for known in PROFILES:
+        if name.lower() in (known.name, *known.aliases):
+            return known
+    close = meant(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
+    raise UsageError(
+        f"--for {name}: there is no such profile",
+        fix=f"{close}the profiles are {', '.join(p.name for p in PROFILES)}",
+    )

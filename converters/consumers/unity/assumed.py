@@ -1,0 +1,79 @@
+"""The agent that a file seems made for, where nobody says which: its sensors and actions from inputs and constants."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Sequence
+
+from converters.consumers.unity.findings import UnityThrows
+from converters.consumers.unity.model import (
+    DISCRETE_SHAPE,
+    FIRST_VERSION,
+    RECURRENT_IN,
+    VERSION,
+    CheckedModel,
+    InputView,
+    truncated,
+)
+from converters.consumers.unity.onnx_file import OnnxFile
+from converters.consumers.unity.rules import EPSILON, MASKS, PREVIOUS, SEQUENCE, VECTOR
+from converters.consumers.unity.settings import Brain, sensors_of
+from converters.formats.barracuda.format import NnModel, four_axes
+
+_NOT_SENSED = frozenset({MASKS, PREVIOUS, EPSILON, SEQUENCE, RECURRENT_IN})
+#: Cameras have up to so many channels.
+_COLOURS = 4
+_NUMBERED = re.compile("(?:visual_observation|obs)_([0-9]{1,6})")
+
+
+def assumed_brain(model: CheckedModel, ranks: Sequence[int]) -> Brain:
+    """Behavior Parameters that fit the file; ``ranks`` are the numbers of axes of its inputs, the batch included.
+
+    Sensors are in the order of their numbers, a ``vector_observation`` last, as Unity sorts sensors by name.
+    """
+    sensed = []
+    vector = 0
+    for position, (view, rank) in enumerate(zip(model.inputs, ranks, strict=True)):
+        if view.name in _NOT_SENSED or not 2 <= rank <= 4:
+            continue
+        shapes = {2: (view.channels,), 3: (view.channels, view.width), 4: _picture(view)}
+        numbered = _NUMBERED.fullmatch(view.name)
+        vector = view.channels if view.name == VECTOR else vector
+        order = (0, int(numbered[1])) if numbered else (2 if view.name == VECTOR else 1, position)
+        sensed.append((order, shapes[rank]))
+    continuous, branches = _actions(model)
+    sensors = sensors_of([shape for _, shape in sorted(sensed)])
+    return Brain(continuous, branches, vector, 1, sensors)
+
+
+def _picture(view: InputView) -> tuple[int, ...]:
+    """C, H, W of a camera; where the last length is that of colours and the first is not, the file is NHWC."""
+    if view.width <= _COLOURS < view.channels:
+        return view.width, view.channels, view.height
+    return view.channels, view.height, view.width
+
+
+def onnx_ranks(file: OnnxFile, model: CheckedModel) -> list[int]:
+    """The numbers of axes of the inputs that the runtime kept."""
+    ranks = {name: len(i.dims or ()) for i in file.inputs for name in (i.name, i.name.removesuffix(":0"))}
+    return [ranks.get(view.name, 0) for view in model.inputs]
+
+
+def nn_ranks(model: NnModel) -> list[int]:
+    """A ``.nn`` has four axes everywhere; a vector is one with height and width 1."""
+    shapes = [four_axes(i.shape, f"input {i.name!r}") for i in model.inputs]
+    return [2 if shape[1:3] == (1, 1) else 4 for shape in shapes]
+
+
+def _actions(model: CheckedModel) -> tuple[int, tuple[int, ...]]:
+    continuous = together = 0
+    with contextlib.suppress(UnityThrows):
+        continuous = max(model.continuous_size, 0)
+    with contextlib.suppress(UnityThrows):
+        together = max(model.discrete_size, 0)
+    version, branches = model.constant(VERSION), model.constant(DISCRETE_SHAPE)
+    single = version is not None and bool(version.size) and truncated(version[0]) == FIRST_VERSION
+    if not single and branches is not None:
+        return continuous, tuple(max(truncated(n), 0) for n in branches)
+    return continuous, (together,) if together else ()

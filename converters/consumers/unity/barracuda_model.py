@@ -1,0 +1,154 @@
+"""What Barracuda 3.0.0 holds after importing an ONNX or loading a ``.nn``: shapes in N, H, W, C, everything float.
+
+An ONNX input of rank 2, 3, 4 is [N,C], [N,C,W], [N,C,H,W]; a free length is 0. One of rank 4 is kept as [N,H,W,C] where
+the file brings it to NCHW itself, by a Transpose (or a Reshape of one channel) that a Conv reads. The state of an
+LSTM becomes a memory that the runtime manages; where it is cut from an input directly, that input is gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Any
+
+import numpy as np
+
+from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
+from converters.consumers.unity.model import MEMORY_SIZE, VERSION, CheckedModel, InputView, truncated
+from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
+from converters.formats.barracuda.format import NnModel, four_axes
+from signatures.records import dataclass
+
+_TO_NCHW = (0, 3, 1, 2)
+_INITIAL_H = 5
+
+
+@dataclass(frozen=True)
+class BarracudaModel(CheckedModel):
+    """A model in Barracuda; ``constants`` are those that can be found by name."""
+
+    inputs: tuple[InputView, ...]
+    outputs: tuple[str, ...]
+    memories: tuple[str, ...]
+    constants: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def constant(self, name: str) -> np.ndarray | None:
+        """A constant by its whole name, whatever its type was."""
+        return self.constants.get(name)
+
+    def _first(self, name: str) -> int:
+        """The first number of a constant that is read without a look whether it is there."""
+        found = self.constants.get(name)
+        if found is None:
+            raise UnityThrows(null_reference(f"constant {name}", f"give the file a constant {name}"))
+        if not found.size:
+            raise UnityThrows(
+                Thrown(
+                    "IndexOutOfRangeException",
+                    "Index was outside the bounds of the array.",
+                    f"constant {name}",
+                    f"give {name} a value; it is empty",
+                )
+            )
+        return truncated(found[0])
+
+    _deprecated = _first_of_shape = _first
+    _shape = constant
+
+    @property
+    def version(self) -> int:
+        """The API version; a NullReferenceException where the file has none."""
+        return self._first(VERSION)
+
+    @property
+    def memory_size(self) -> int:
+        """The memory's size; a NullReferenceException where the file has none."""
+        return self._first(MEMORY_SIZE)
+
+    def fetched(self, deterministic: bool) -> tuple[str, ...]:
+        """The outputs that a player fetches; finding them reads the version too."""
+        self._first(VERSION)
+        return super().fetched(deterministic)
+
+
+def of_onnx(file: OnnxFile) -> BarracudaModel:
+    """The model that the ONNX importer makes; ``importing.refusal`` has said before that it takes the file."""
+    memories, taken = _memories(file)
+    inputs = [_input(file, i.name, i.dims or ()) for i in file.inputs if i.name not in taken]
+    found = {name: file.value(name) for name in file.outputs}
+    constants = {trimmed(n): v.astype(np.float64).ravel() for n, v in found.items() if v is not None}
+    return BarracudaModel(tuple(inputs), tuple(trimmed(n) for n in file.outputs), memories, constants)
+
+
+def of_nn(model: NnModel) -> BarracudaModel:
+    """The model that a ``.nn`` holds: constants are datasets of that name, wherever they lie."""
+    inputs = []
+    for given in model.inputs:
+        _, height, width, channels = four_axes(given.shape, f"input {given.name!r}")
+        inputs.append(InputView(given.name, height, width, channels, channels))
+    constants: dict[str, np.ndarray] = {}
+    for layer in model.layers:
+        for dataset in layer.datasets:
+            end = dataset.offset + dataset.length
+            constants.setdefault(dataset.name, model.weights[dataset.offset : end].astype(np.float64))
+    return BarracudaModel(tuple(inputs), model.outputs, tuple(m.input for m in model.memories), constants)
+
+
+def trimmed(name: str) -> str:
+    """A name without the ``:0`` that TensorFlow's exporters leave."""
+    return name.removesuffix(":0")
+
+
+def _input(file: OnnxFile, name: str, dims: Dims) -> InputView:
+    lengths = [d or 0 for d in dims]
+    height = width = channels = 1
+    if len(lengths) == 4 and _kept_nhwc(file, name):
+        height, width, channels = lengths[1:]
+    elif len(lengths) >= 2:
+        channels = lengths[1]
+        width = lengths[-1] if len(lengths) > 2 else 1
+        height = lengths[-2] if len(lengths) > 3 else 1
+    return InputView(trimmed(name), height, width, channels, channels)
+
+
+def _kept_nhwc(file: OnnxFile, name: str) -> bool:
+    for node in file.readers(name):
+        made = node.output[0] if node.output else ""
+        if any(reader.op_type == "Conv" and reader.input[:1] == [made] for reader in file.readers(made)):
+            perm = attributes(node).get("perm")
+            if node.op_type == "Transpose" and perm is not None and tuple(perm.ints) == _TO_NCHW:
+                return True
+            if node.op_type == "Reshape" and _moves_one_channel(file, name, made):
+                return True
+    return False
+
+
+def _moves_one_channel(file: OnnxFile, name: str, made: str) -> bool:
+    """[N,H,W,1] to [N,1,H,W], which moves no number."""
+    before, after = file.shapes.get(name), file.shapes.get(made)
+    if before is None or after is None or len(before) != 4 or len(after) != 4:
+        return False
+    return before[3] == after[1] == 1 and before[1:3] == after[2:]
+
+
+def _memories(file: OnnxFile) -> tuple[tuple[str, ...], set[str]]:
+    """(memories, inputs that became one of them): an LSTM's state that is cut from an input directly takes its name."""
+    found: list[str] = []
+    taken: set[str] = set()
+    declared = {i.name for i in file.inputs}
+    for node in file.model.graph.node:
+        if node.op_type != "LSTM" or len(node.input) <= _INITIAL_H or not node.input[_INITIAL_H]:
+            continue
+        source = _cut_from(file, node.input[_INITIAL_H])
+        if source in declared:
+            taken.add(source)
+            base = trimmed(source)
+            found += [f"{base}_c", f"{base}_h"]
+        else:
+            found += [f"{node.output[0]}_wm_h", f"{node.output[0]}_wm_c"]
+    return tuple(found), taken
+
+
+def _cut_from(file: OnnxFile, name: str) -> str:
+    producer: Any = file.producers.get(name)
+    return str(producer.input[0]) if producer is not None and producer.op_type == "Slice" and producer.input else ""

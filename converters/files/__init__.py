@@ -1,0 +1,1 @@
+"""Bytes from files: fetched, probed, bounded, parsed; this room knows no graph."""

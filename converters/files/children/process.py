@@ -1,0 +1,365 @@
+"""A runtime's process, seen from this side."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import IO, Any, BinaryIO, cast
+
+import numpy as np
+
+from converters.files.children.frames import FramingError, Tensors, read_frame, write_frame
+from converters.files.children.memory_limits import Memory
+from converters.files.children.time_limits import allowed, computed
+from converters.files.folders import OwnFolder, scratch_folder, size_of
+from converters.runtimes.python import confined
+from signatures.errors import ExportModelError, RuntimeUnavailableError
+
+#: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
+TIMEOUT = 300.0
+#: Seconds after which it is looked at again whether one has taken too long.
+_LOOK = 1.0
+
+#: Bytes that several runs are fed in one request: answers are held until the last of them, and one that takes longer
+#: than ``TIMEOUT`` is taken for dead.
+_REQUEST = 4 << 20
+
+#: Of numpy's matrix products: what they give does not depend on the machine's processors, and many sources are
+#: exported by a process for each of these.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+
+
+class RunFailedError(ExportModelError):
+    """A runtime refused a model or failed while running it. This is what verification reports, not a crash of it."""
+
+    exit_status = 1
+
+
+class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
+    """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
+
+    def __init__(
+        self, name: str, command: Sequence[str], *, confined: bool = True, endless: set[str] | None = None
+    ) -> None:
+        """``confined``: it may not write outside a folder of its own, nor reach a network (confinement.py).
+
+        ``endless``: files that this or another runtime was stopped with, which are not loaded again; one that has no
+        end before its first answer is added. None where the models are no stranger's, or slow by themselves (Keras).
+        """
+        self.name = name
+        self.command = list(command)
+        self.confined = confined
+        self.version: str | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._errors: IO[bytes] | None = None
+        self._scratch: OwnFolder | None = None
+        #: it has been asked and has not answered
+        self._busy = False
+        #: when it was asked
+        self._asked = 0.0
+        self._closed = threading.Event()
+        self._memory: Memory | None = None
+        self._loaded = 0
+        self._endless = endless
+        #: the model that has not answered yet, the processor time at which the process is stopped, how much that gives
+        self._first: tuple[str, float, float] | None = None
+
+    def launch(self) -> None:
+        """Start the process if it is not running, and do not wait for it: it gets ready beside what is done next.
+
+        Raises RuntimeUnavailableError where there is no such program.
+        """
+        if self._process is not None:
+            return
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
+        self._scratch = scratch_folder()
+        # What is not confined (a browser) has its own folders where the user's are, and sweeps them by itself.
+        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(self._scratch.path)) if self.confined else {}
+        try:
+            command = confined(self.command, str(self._scratch.path)) if self.confined else self.command
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                env={**os.environ, **_ONE_THREAD, **places},
+            )
+        except OSError as error:
+            self.close()
+            raise RuntimeUnavailableError(
+                f"the runtime {self.name} did not start", why=str(error), fix="export-model runtimes shows what is here"
+            ) from error
+        self._closed = threading.Event()
+        threading.Thread(target=self._watch, args=(self._process, self._closed), daemon=True).start()
+        # Sent ahead: some runtimes start with the first request. One that ends at once is noticed by ``start``.
+        with contextlib.suppress(BrokenPipeError):
+            write_frame(self._streams[0], {"cmd": "hello"})
+
+    def start(self) -> str:
+        """Start the process if it is not running, and wait until it is ready; returns the runtime's version.
+
+        Raises RuntimeUnavailableError when it does not start.
+        """
+        if self.version is not None:
+            return self.version
+        self.launch()
+        try:
+            answer, _ = self._exchange(None)
+        except RunFailedError as error:
+            self.close()  # its one "hello" is answered: asked again, it would be silent
+            raise RuntimeUnavailableError(
+                f"the runtime {self.name} did not start",
+                why=error.why or error.what,
+                fix="export-model runtimes shows what is here and how to install what is not",
+            ) from error
+        self.version = str(answer["version"])
+        if self._process is not None and self.confined:
+            self._memory = Memory(self._process.pid)
+        return self.version
+
+    def load(self, path: str, *, answered: bool = False, **options: Any) -> LoadedModel:
+        """Load a model; raises RunFailedError with the runtime's own message, or where it computes for ever.
+
+        ``answered``: it did so once, and has the time of any request.
+        """
+        self.start()
+        if path in (self._endless or ()):
+            raise RunFailedError(f"not run in {self.name}", why="a runtime was stopped while it computed this file")
+        self._loaded += 1
+        identity = f"m{self._loaded}"
+        size, memory = size_of(Path(path)), self._memory
+        if memory is not None:
+            memory.allow(size)
+        try:
+            with contextlib.nullcontext() if answered else self.first(path, size):
+                self.request({"cmd": "load", "id": identity, "path": path, **options})
+        except RunFailedError:
+            if memory is not None:
+                memory.release(size)
+            raise
+        return LoadedModel(self, identity, size, path, answered=answered)
+
+    @contextlib.contextmanager
+    def first(self, path: str, size: int) -> Iterator[None]:
+        """What is asked inside has little processor time (patience.py): a model is loaded, or answers once."""
+        process = self._process
+        before = None if process is None or self._endless is None else computed(process.pid)
+        self._first = None if before is None else (path, before + allowed(size), allowed(size))
+        try:
+            yield
+        finally:
+            self._first = None
+
+    def unload(self, identity: str, size: int) -> None:
+        """Free a model of that many bytes."""
+        self.request({"cmd": "unload", "id": identity})
+        if self._memory is not None:
+            self._memory.release(size)
+
+    def request(
+        self, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None
+    ) -> tuple[dict[str, Any], Tensors]:
+        """Send a frame and wait for the answer.
+
+        Raises RunFailedError where the answer is an error, the process died, or hangs.
+        """
+        if self._memory is not None:
+            self._memory.allow_for_request(sum(a.nbytes for a in (tensors or {}).values()))
+        return self._exchange(lambda stream: write_frame(stream, header, tensors))
+
+    @property
+    def _streams(self) -> tuple[BinaryIO, BinaryIO]:
+        process = self._process
+        if process is None or process.stdin is None or process.stdout is None:
+            raise RunFailedError(f"{self.name} is not running")
+        return cast(BinaryIO, process.stdin), cast(BinaryIO, process.stdout)
+
+    def _exchange(self, send: Callable[[BinaryIO], None] | None) -> tuple[dict[str, Any], Tensors]:
+        """Send a frame, unless it was sent ahead, and wait for an answer."""
+        to, back = self._streams
+        process = self._process
+        assert process is not None
+        try:
+            self._asked, self._busy = time.monotonic(), True
+            if send is not None:
+                send(to)
+            answer, results = read_frame(back)
+            self._busy = False
+        except (OSError, EOFError, FramingError) as error:
+            status = _ended(process)
+            said = self._last_errors()
+            self.close()
+            if self._first is not None and self._first[0] in (self._endless or ()):
+                raise RunFailedError(
+                    f"{self.name} was stopped: it did not come to an end",
+                    why=f"to load this file, or answer its first input, {self._first[2]:.0f} s of computing are enough",
+                    fix="the file may loop for ever; no other runtime is given it",
+                ) from error
+            raise RunFailedError(
+                f"{self.name} ended while it was working (status {status})",
+                why=said or (str(error) if isinstance(error, FramingError) else "it printed nothing"),
+                fix="a native runtime aborts on some malformed graphs; the model is not safe to use there",
+            ) from error
+        if answer.get("broken"):  # a WebAssembly trap: the heap is not to be trusted any more
+            self.close()
+        if not answer.get("ok"):
+            raise RunFailedError(f"{self.name} failed", why=str(answer.get("error", "no message")))
+        return answer, results
+
+    def _watch(self, process: subprocess.Popen[bytes], closed: threading.Event) -> None:
+        """End a process whose answer takes too long. One thread for all requests: there are dozens for each policy."""
+        while not closed.wait(min(_LOOK, TIMEOUT)):
+            if not self._busy:
+                continue
+            first, endless = self._first, self._endless
+            if first is not None and endless is not None and (computed(process.pid) or 0) > first[1]:
+                endless.add(first[0])
+                process.kill()
+                return
+            if time.monotonic() - self._asked > TIMEOUT:
+                process.kill()
+                return
+
+    def _last_errors(self) -> str:
+        if self._errors is None:
+            return ""
+        self._errors.seek(0)
+        lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
+        return "\n".join(lines[-8:])
+
+    def hang_up(self) -> None:
+        """Tell the process to end, and do not wait: several end side by side before each is closed."""
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+
+    def close(self) -> None:
+        """End the process; one that is not ready yet, or computes (an interrupt came), is not waited for."""
+        self.hang_up()
+        self._closed.set()
+        process, ready = self._process, self.version is not None and not self._busy
+        self._process, self.version, self._busy = None, None, False
+        if process is not None:
+            if not ready:
+                process.terminate()  # not kill: one that has started a browser ends that first
+            if process.stdout is not None:
+                process.stdout.close()
+            _ended(process, 10 if self.confined else 60)  # what is not confined has a browser to end
+        if self._errors is not None:
+            self._errors.close()
+            self._errors = None
+        if self._scratch is not None:
+            self._scratch.close()
+            self._scratch = None
+        self._memory = None
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def _requests(inputs: Sequence[Mapping[str, np.ndarray]], *, alone: bool) -> Iterator[tuple[int, int]]:
+    """From where to where ``inputs`` go into one request: as many as ``_REQUEST`` bytes hold, one at least.
+
+    ``alone``: the first of them goes by itself.
+    """
+    first = size = 0
+    for number, feeds in enumerate(inputs):
+        size += sum(array.nbytes for array in feeds.values())
+        if (size > _REQUEST and number > first) or (alone and number == 1):
+            yield first, number
+            first, size = number, sum(array.nbytes for array in feeds.values())
+    if inputs:
+        yield first, len(inputs)
+
+
+def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
+    """The status of a process that should be ending; one that lives on after ``patience`` seconds is killed."""
+    try:
+        return process.wait(patience)
+    except subprocess.TimeoutExpired:  # it closed its stdout, or speaks no frames any more
+        process.kill()
+        return process.wait()
+
+
+class LoadedModel(AbstractContextManager["LoadedModel"]):
+    """A model in a runtime's process."""
+
+    def __init__(self, process: RuntimeProcess, identity: str, size: int, path: str, *, answered: bool) -> None:
+        self._process, self._identity, self._size, self._path = process, identity, size, path
+        self._answered = answered
+
+    def run(self, feeds: Mapping[str, np.ndarray], fetch: Sequence[str], **request: Any) -> Tensors:
+        """The outputs in ``fetch`` by name; raises RunFailedError. ``request`` is for what one runtime alone can do."""
+        return self._run({"fetch": list(fetch), **request}, feeds, fetch)
+
+    def run_all(
+        self,
+        inputs: Sequence[Mapping[str, np.ndarray]],
+        fetch: Sequence[str],
+        requests: Sequence[Mapping[str, Any]] = (),
+    ) -> list[Tensors]:
+        """The same outputs for several inputs, in few requests; ``requests``: for each what ``run`` takes besides."""
+        wanted = {"fetch": list(fetch)}
+        headers = [{**wanted, **request} for request in requests] or [wanted] * len(inputs)
+        return self._run_all(inputs, headers, fetch)
+
+    def predict(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str]) -> Tensors:
+        """All outputs, by the call that users of the runtime make (TensorFlow.js: ``model.predict``)."""
+        return self._run({}, feeds, outputs)
+
+    def predict_all(self, inputs: Sequence[Mapping[str, np.ndarray]], outputs: Sequence[str]) -> list[Tensors]:
+        """As ``predict``, for several inputs."""
+        return self._run_all(inputs, [{}] * len(inputs), outputs)
+
+    def _run(self, header: Mapping[str, Any], feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
+        _, results = self._asked({"cmd": "run", "id": self._identity, **header}, dict(feeds))
+        return self._checked(results, fetch)
+
+    def _asked(self, header: Mapping[str, Any], tensors: Tensors) -> tuple[dict[str, Any], Tensors]:
+        if self._answered:
+            return self._process.request(header, tensors)
+        with self._process.first(self._path, self._size):
+            answer = self._process.request(header, tensors)
+        self._answered = True
+        return answer
+
+    def _run_all(
+        self, inputs: Sequence[Mapping[str, np.ndarray]], headers: Sequence[Mapping[str, Any]], fetch: Sequence[str]
+    ) -> list[Tensors]:
+        found: list[Tensors] = []
+        for first, last in _requests(inputs, alone=not self._answered):
+            keys: dict[int, str] = {}  # what several runs are fed is sent once
+            tensors: Tensors = {}
+            runs = []
+            for feeds, header in zip(inputs[first:last], headers[first:last], strict=True):
+                for array in feeds.values():
+                    tensors[keys.setdefault(id(array), str(len(keys)))] = array
+                runs.append({**header, "feeds": {name: keys[id(array)] for name, array in feeds.items()}})
+            _, results = self._asked({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
+            answers: list[Tensors] = [{} for _ in runs]
+            for key, array in results.items():
+                number, _, name = key.partition("/")
+                answers[int(number)][name] = array
+            found += [self._checked(each, fetch) for each in answers]
+        return found
+
+    def _checked(self, results: Tensors, fetch: Sequence[str]) -> Tensors:
+        missing = [name for name in fetch if name not in results]
+        if missing:
+            raise RunFailedError(f"{self._process.name} gave no output {missing[0]!r}")
+        return results
+
+    def unload(self) -> None:
+        """Free it; a runtime that has died has freed it already."""
+        with contextlib.suppress(RunFailedError):
+            self._process.unload(self._identity, self._size)
+
+    def __exit__(self, *error: object) -> None:
+        self.unload()

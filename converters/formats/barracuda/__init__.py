@@ -1,0 +1,39 @@
+"""Barracuda's ``.nn`` models: read, and written (version 16) for Unity's ML-Agents of 0.7 to release 20."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.files.file_probe import Content
+    from converters.formats.barracuda import answers as _answers
+    from converters.formats.barracuda import source as _source
+    from converters.formats.barracuda import writer as _writer
+else:
+    _answers, _source, _writer = deferred(__name__, "answers", "source", "writer")
+
+
+#: Versions of the format, an int64 at its beginning.
+_VERSIONS = range(15, 21)
+
+
+def _sniff(file: Content) -> bool:
+    return len(file.data) >= 8 and struct.unpack_from("<q", file.data)[0] in _VERSIONS
+
+
+FORMATS = (
+    Format(
+        key="nn",
+        label="a Barracuda .nn model",
+        sniff=_sniff,
+        read=_source.read,
+        write=_writer.write,
+        main="{name}.nn",
+        held=_writer.held,
+        runtimes=("numpy",),
+        answers=_answers.answered,
+    ),
+)

@@ -1,0 +1,90 @@
+"""The layers that a policy became as a file: only what is needed, under the names that the consumer looks up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
+from converters.formats.barracuda.lower_base import Draft, NnBuilder
+from converters.formats.barracuda.vocabulary import Activation, LayerType
+
+#: Every Barracuda from 1.0 to 3.0 reads it, and none of the later ones is read by all.
+VERSION = 16
+
+
+def assembled(
+    b: NnBuilder,
+    inputs: Sequence[NnInput],
+    outputs: Sequence[str],
+    constants: Mapping[str, np.ndarray],
+    memories: Sequence[NnMemory] = (),
+) -> NnModel:
+    """The model of the layers so far; ``constants`` are what ML-Agents reads before it runs the model."""
+    for name, numbers in constants.items():
+        b.constant(np.asarray(numbers, np.float32).reshape(1, 1, 1, -1), name)
+    ends = {*outputs, *(m.output for m in memories)}
+    drafts = _needed(b.drafts, ends | set(constants))
+    drafts = _renamed(drafts, ends)
+    drafts.sort(key=lambda d: d.type != LayerType.LOAD)  # constants first; sorting keeps the order otherwise
+    layers, weights, offset = [], [], 0
+    for draft in drafts:
+        datasets = []
+        for name, array in draft.data:
+            datasets.append(Dataset(name, tuple(array.shape), offset, 4, array.size))
+            weights.append(array.reshape(-1))
+            offset += array.size
+        layers.append(
+            Layer(
+                draft.name, int(draft.type), int(draft.activation), draft.pad, draft.stride, draft.pool, draft.axis,
+                draft.alpha, draft.beta, draft.inputs, tuple(datasets),
+            )
+        )  # fmt: skip
+    return NnModel(
+        VERSION,
+        tuple(inputs),  # those too that no layer reads (of a policy with a single action): Unity looks for them
+        tuple(outputs),
+        tuple(memories),
+        tuple(layers),
+        np.concatenate(weights) if weights else np.zeros(0, np.float32),
+    )
+
+
+def _needed(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
+    """The layers that something in ``roots`` depends on, in their order."""
+    needed = set(roots)
+    kept = []
+    for draft in reversed(drafts):
+        if draft.name in needed:
+            needed.update(draft.inputs)
+            kept.append(draft)
+    return kept[::-1]
+
+
+def _renamed(drafts: Sequence[Draft], ends: set[str]) -> list[Draft]:
+    """Linear activations at the end give their name to the layer before them, where nothing else reads that."""
+    readers: dict[str, int] = {}
+    for draft in drafts:
+        for name in draft.inputs:
+            readers[name] = readers.get(name, 0) + 1
+    made = {d.name: d for d in drafts}
+    names: dict[str, str] = {}
+    for draft in drafts:
+        if draft.name not in ends or draft.type != LayerType.ACTIVATION or draft.activation != Activation.NONE:
+            continue
+        before = made.get(draft.inputs[0])
+        if (
+            before is not None
+            and before.type != LayerType.LOAD
+            and before.name not in ends
+            and before.name not in names
+        ):
+            names[before.name] = draft.name
+    swallowed = set(names.values())
+    return [
+        replace(d, name=names.get(d.name, d.name), inputs=tuple(names.get(i, i) for i in d.inputs))
+        for d in drafts
+        if d.name not in swallowed
+    ]

@@ -1,0 +1,387 @@
+"""Ops that compute number by number: arithmetic, activations, comparisons, choices, casts.
+
+What a real Barracuda gets wrong or does not have is written in what all of them run (1.0 to 3.0): the first operand of
+a subtraction, division or minimum always has the result's lengths (the folds over several operands, and over a first
+operand that is repeated, are wrong in early versions), and an activation that is younger than 1.0 is spelled out (an
+old worker copies what it does not know).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from converters.formats.barracuda.lower_base import NnBuilder
+from converters.formats.barracuda.lower_values import Axes, Value, usual_axes
+from converters.formats.barracuda.vocabulary import COMPARISONS, ONE_OP, Activation, C, H, LayerType, W
+from converters.graph.types import Dim
+
+#: Times this, every difference that float32 tells apart from 0 near 1 is beyond ±1.
+_STEEP = 1e30
+_LARGEST = float(np.finfo(np.float32).max)
+
+#: Those that a Barracuda of 1.0 has not, or rounds another way, are spelled out.
+_YOUNG = ("Softplus", "Softsign", "Round", "Cos", "Sin", "Tan", "Erf")
+_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if op not in _YOUNG} | {"Elu": Activation.ELU}
+_TWO: Mapping[str, LayerType] = {
+    "Add": LayerType.ADD,
+    "BiasAdd": LayerType.ADD,
+    "Mul": LayerType.MUL,
+    "LogicalAnd": LayerType.MUL,
+    "Minimum": LayerType.MIN,
+    "Maximum": LayerType.MAX,
+    "LogicalOr": LayerType.MAX,
+}
+_COMPARED = {op: LayerType(kind) for kind, op in COMPARISONS.items()} | {"NotEqual": LayerType.EQUAL}
+_MIRRORED: Mapping[LayerType, LayerType] = {
+    LayerType.GREATER: LayerType.LESS,
+    LayerType.GREATER_EQUAL: LayerType.LESS_EQUAL,
+    LayerType.LESS: LayerType.GREATER,
+    LayerType.LESS_EQUAL: LayerType.GREATER_EQUAL,
+    LayerType.EQUAL: LayerType.EQUAL,
+}
+
+
+# ------------------------------------------------------------------ one operand
+
+
+def activation(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """An op that every Barracuda has as an activation."""
+    return _mapped(b, args[0], lambda x: b.activation(_ACTIVATIONS[b.node.op], x))
+
+
+def applied(b: NnBuilder, value: Value, name: str) -> Value:
+    """The activation that another op has fused into it."""
+    return _mapped(b, value, lambda x: b.activation(_ACTIVATIONS[name], x, label=name))
+
+
+def _mapped(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Value:
+    """A tensor computed number by number from another; its axes stay where they are."""
+    return b.made(make(b.stored(value)), value.shape, value.axes)
+
+
+def _step(b: NnBuilder, x: str) -> str:
+    """1 where ``x`` is above 0, else 0."""
+    return b.at_least(b.at_most(b.scaled(x, _STEEP, "steep"), 1), 0)
+
+
+def _sign(b: NnBuilder, x: str) -> str:
+    return b.at_least(b.at_most(b.scaled(x, _STEEP, "steep"), 1), -1)
+
+
+def _truncated(b: NnBuilder, x: str) -> str:
+    """Towards 0: the parts above and below, one of which is 0."""
+    above = b.at_least(b.activation(Activation.FLOOR, x, label="floor"), 0)
+    below = b.at_most(b.activation(Activation.CEIL, x, label="ceil"), 0)
+    return b.two(LayerType.ADD, above, below, "truncated")
+
+
+def _round(b: NnBuilder, x: str) -> str:
+    """To the nearest whole number, halves to the even one: floor, plus 1 above a half, plus 1 at a half if odd."""
+    low = b.activation(Activation.FLOOR, x, label="floor")
+    over = b.shifted(b.two(LayerType.SUB, x, low, "rest"), -0.5)
+    halved = b.activation(Activation.FLOOR, b.scaled(low, 0.5), label="half")
+    odd = b.two(LayerType.SUB, low, b.scaled(halved, 2), "odd")
+    far = b.at_most(b.scaled(b.activation(Activation.ABS, over, label="far"), _STEEP, "steep"), 1)
+    tie = b.shifted(b.scaled(far, -1), 1)
+    up = b.two(LayerType.ADD, _step(b, over), b.two(LayerType.MUL, tie, odd, "tie"), "up")
+    return b.two(LayerType.ADD, low, up, "rounded")
+
+
+def _softplus(b: NnBuilder, x: str) -> str:
+    """max(x, 0) + log(1 + e^−|x|); Barracuda has it from 1.4 on."""
+    small = b.activation(Activation.EXP, b.scaled(b.activation(Activation.ABS, x, label="abs"), -1), label="exp")
+    return b.two(LayerType.ADD, b.at_least(x, 0), b.activation(Activation.LOG, b.shifted(small, 1), label="log"))
+
+
+def _erf(b: NnBuilder, x: str) -> str:
+    """Abramowitz and Stegun 7.1.26, right to 1.5e-7; Barracuda has it from 2.3 on."""
+    size = b.activation(Activation.ABS, x, label="abs")
+    t = b.activation(Activation.RECIPROCAL, b.shifted(b.scaled(size, 0.3275911), 1), label="t")
+    series = b.scaled(t, 1.061405429, "series")
+    for factor in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
+        series = b.two(LayerType.MUL, b.shifted(series, factor), t, "series")
+    bell = b.activation(Activation.EXP, b.scaled(b.two(LayerType.MUL, size, size, "square"), -1), label="bell")
+    upper = b.shifted(b.scaled(b.two(LayerType.MUL, series, bell, "tail"), -1), 1)
+    return b.two(LayerType.MUL, upper, _sign(b, x))
+
+
+def _leaky_relu(b: NnBuilder, x: str) -> str:
+    """Barracuda takes the larger of x and alpha·x, which is another function beyond 1."""
+    alpha = float(b.node.attrs["alpha"])
+    if 0 <= alpha <= 1:
+        return b.activation(Activation.LEAKY_RELU, x, alpha=alpha)
+    return b.two(LayerType.ADD, b.at_least(x, 0), b.scaled(b.at_most(x, 0), alpha))
+
+
+_FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
+    "Square": lambda b, x: b.two(LayerType.MUL, x, x),
+    "Rsqrt": lambda b, x: b.activation(Activation.RECIPROCAL, b.activation(Activation.SQRT, x, label="sqrt")),
+    "Expm1": lambda b, x: b.shifted(b.activation(Activation.EXP, x, label="exp"), -1),
+    "Log1p": lambda b, x: b.activation(Activation.LOG, b.shifted(x, 1)),
+    "Softplus": _softplus,
+    "Softsign": lambda b, x: b.two(LayerType.DIV, x, b.shifted(b.activation(Activation.ABS, x, label="abs"), 1)),
+    "Sign": _sign,
+    "Round": _round,
+    "Erf": _erf,
+    "LogicalNot": lambda b, x: b.shifted(b.scaled(x, -1), 1),
+    "LeakyRelu": _leaky_relu,
+    "Selu": lambda b, x: b.activation(Activation.SELU, x, alpha=1.6732632423543772, beta=1.0507009873554805),
+}
+
+
+def formula(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """An op that is spelled out."""
+    return _mapped(b, args[0], lambda x: _FORMULAS[b.node.op](b, x))
+
+
+def cast(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """All numbers of a ``.nn`` are floats: only what drops digits does something."""
+    source, wanted = b.type_of(b.node.inputs[0]).dtype, np.dtype(b.node.attrs["DstT"])
+    if wanted.kind == "b" and source.kind != "b":
+        return _mapped(b, args[0], lambda x: b.at_most(b.scaled(b.activation(Activation.ABS, x), _STEEP), 1))
+    if wanted.kind in "iu" and source.kind == "f":
+        return _mapped(b, args[0], lambda x: _truncated(b, x))
+    return args[0]
+
+
+# ------------------------------------------------------------------ two operands
+
+
+class _Pair:
+    """Two operands as they broadcast: a name for each that is stored, the lengths and axes of the result."""
+
+    def __init__(self, b: NnBuilder, args: Sequence[Value], shape: tuple[Dim, ...]) -> None:
+        self.b, self.shape = b, shape
+        axes = _common_axes(args, shape)
+        if axes is None:
+            usual = usual_axes(shape)
+            if usual is None:
+                raise b.refused(f"a result of shape {list(shape)}", "the batch comes first, and three axes more")
+            args = [v if v.array is not None else b.laid(v, _own(usual, v)) for v in args]
+            axes = usual
+        self.axes: Axes = axes
+        self.dims = Value(shape, axes).dims
+        self.arrays = [None if v.array is None else b.placed(v.array, axes) for v in args]
+        self.names = [b.stored(v) if a is None else b.constant(a) for v, a in zip(args, self.arrays, strict=True)]
+        self.names = [self._wide(name, a is not None) for name, a in zip(self.names, self.arrays, strict=True)]
+
+    def _wide(self, name: str, constant: bool) -> str:
+        """A column of the batch is written out as wide as the result."""
+        _, h, w, c = self.b.dims_of(name)
+        if not constant and (h, w, c) == (1, 1, 1) and self.dims[H] == self.dims[W] == 1 < self.dims[C]:
+            return self.b.spread(name, self.dims[C])
+        return name
+
+    def full(self, position: int) -> bool:
+        """Whether an operand has all the lengths of the result."""
+        return self.b.dims_of(self.names[position]) == self.dims
+
+    def made(self, name: str) -> Value:
+        return self.b.made(name, self.shape, self.axes)
+
+
+def _own(axes: Axes, value: Value) -> Axes:
+    """The part of a result's axes that an operand has, aligned at the end; what has length 1 lies nowhere."""
+    mine = axes[len(axes) - len(value.shape) :]
+    return tuple(a if d != 1 else None for a, d in zip(mine, value.shape, strict=True))
+
+
+def _common_axes(args: Sequence[Value], shape: tuple[Dim, ...]) -> Axes | None:
+    """Where the axes of the result lie, so that no operand has to be moved; None where one must be."""
+    axes: list[int | None] = [None] * len(shape)
+    for value in args:
+        if value.array is not None:
+            continue
+        lead = len(shape) - len(value.shape)
+        for i, (place, length) in enumerate(zip(value.axes, value.shape, strict=True), start=lead):
+            if length == 1:
+                continue
+            if axes[i] not in (None, place):
+                return None
+            axes[i] = place
+    taken = [a for a in axes if a is not None]
+    if len(set(taken)) != len(taken):
+        return None
+    for i in reversed(range(len(shape))):
+        if axes[i] is None and shape[i] != 1:
+            # Only a constant is long here: it takes a place that is free, the last one if that is.
+            left = [a for a in (C, W, H) if a not in axes]
+            if isinstance(shape[i], str) or not left:
+                return None
+            axes[i] = left[0]
+    return tuple(axes)
+
+
+def _pair(b: NnBuilder, args: Sequence[Value]) -> _Pair:
+    return _Pair(b, args, b.shape_of(b.node.name))
+
+
+def both(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """Ops whose operands may change places."""
+    pair = _pair(b, args)
+    first, second = pair.names
+    if not pair.full(0) or (pair.arrays[0] is not None and pair.full(1)):
+        first, second = second, first
+    return pair.made(_two(b, pair, _TWO[b.node.op], first, second))
+
+
+def _two(b: NnBuilder, pair: _Pair, kind: LayerType, first: str, second: str, label: str = "") -> str:
+    return b.layer(kind, [first, second], pair.dims, label=label)
+
+
+def swish(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """X·sigmoid(x) as the one activation that it is in every genuine file; ``args`` is x."""
+    return _mapped(b, args[0], lambda x: b.activation(Activation.SWISH, x))
+
+
+def subtract(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A − b; −b + a where a is a constant or is repeated."""
+    return _undone(b, args, LayerType.SUB, LayerType.ADD, lambda x: b.scaled(x, -1, "negative"))
+
+
+def divide(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A / b; the reciprocal of b times a where a is a constant or is repeated."""
+    if b.type_of(b.node.inputs[0]).dtype.kind != "f":
+        raise b.refused("it divides integers", "a .nn knows floats alone")
+    reciprocal = partial(b.activation, Activation.RECIPROCAL, label="reciprocal")
+    return _undone(b, args, LayerType.DIV, LayerType.MUL, reciprocal)
+
+
+def _undone(
+    b: NnBuilder, args: Sequence[Value], kind: LayerType, other: LayerType, turned: Callable[[str], str]
+) -> Value:
+    """``kind`` of two operands, or ``other`` of the first and the second ``turned``, which may change places."""
+    pair = _pair(b, args)
+    first, second = pair.names
+    if pair.full(0) and pair.arrays[0] is None:
+        return pair.made(b.two(kind, first, second))
+    second = turned(second)
+    ordered = (second, first) if pair.full(1) else (first, second)
+    return pair.made(_two(b, pair, other, *ordered))
+
+
+def power(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A to the power of b."""
+    exponent = args[1].array
+    if exponent is not None and exponent.size == 1 and args[0].shape == b.shape_of(b.node.name):
+        number = float(exponent.reshape(()))
+        if number == 0.5:
+            return _mapped(b, args[0], lambda x: b.activation(Activation.SQRT, x))
+        if number == 2:
+            return _mapped(b, args[0], lambda x: b.two(LayerType.MUL, x, x))
+    pair = _pair(b, args)
+    if pair.full(0) and pair.arrays[0] is None:
+        return pair.made(b.two(LayerType.POW, *pair.names))
+    raise b.refused("its base is a constant or is repeated", "early versions of Barracuda compute another power")
+
+
+def floor_divide(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """The whole part of a / b, and for FloorMod what is left of a."""
+    pair = _pair(b, args)
+    if not pair.full(0) or pair.arrays[0] is not None:
+        raise b.refused("its first operand is a constant or is repeated", "early versions of Barracuda swap them")
+    first, second = pair.names
+    whole = b.activation(Activation.FLOOR, b.two(LayerType.DIV, first, second, "quotient"), label="whole")
+    if b.node.op == "FloorDiv":
+        return pair.made(whole)
+    return pair.made(b.two(LayerType.SUB, first, b.two(LayerType.MUL, whole, second, "taken")))
+
+
+def squared_difference(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """(a − b)²."""
+    difference = subtract(b, args)
+    return _mapped(b, difference, lambda x: b.two(LayerType.MUL, x, x))
+
+
+def compare(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """1 where it holds, else 0."""
+    pair, kind = _pair(b, args), _COMPARED[b.node.op]
+    first, second = pair.names
+    if not pair.full(0) or (pair.arrays[0] is not None and pair.full(1)):
+        first, second, kind = second, first, _MIRRORED[kind]
+    name = _two(b, pair, kind, first, second)
+    return pair.made(b.shifted(b.scaled(name, -1), 1) if b.node.op == "NotEqual" else name)
+
+
+def select(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A where the condition holds, else b: condition·a + (1 − condition)·b. Barracuda has no choice before 1.4.
+
+    What is computed is bounded first: infinity times 0 would be no number.
+    """
+    condition, *choices = args
+    shape = b.shape_of(b.node.name)
+    if any(v.array is not None and not np.isfinite(v.array).all() for v in choices):
+        raise b.refused("it chooses an infinite number", "Barracuda before 1.4 has no choice, only products and sums")
+    if b.node.op == "Select" and len(condition.shape) == 1 < len(shape):
+        condition = _as_rows(b, condition, len(shape))
+    first, second = (_bounded(b, v) for v in choices)
+    if condition.array is not None:
+        holds = condition.array.astype(np.float32)
+        condition, other = replace(condition, array=holds), replace(condition, array=1 - holds)
+    else:
+        other = _mapped(b, condition, lambda x: b.shifted(b.scaled(x, -1, "negative"), 1, "other"))
+    chosen = [_combined(b, LayerType.MUL, v, c, shape) for v, c in ((first, condition), (second, other))]
+    return _combined(b, LayerType.ADD, chosen[0], chosen[1], shape)
+
+
+def _bounded(b: NnBuilder, value: Value) -> Value:
+    if value.array is not None:
+        return replace(value, array=value.array.astype(np.float32))
+    return _mapped(b, value, lambda x: b.at_least(b.at_most(x, _LARGEST), -_LARGEST))
+
+
+def _as_rows(b: NnBuilder, condition: Value, rank: int) -> Value:
+    """TF 1's Select takes whole rows where the condition is a vector."""
+    shape = (*condition.shape, *[1] * (rank - 1))
+    if condition.array is not None:
+        return Value(shape, array=condition.array.reshape(-1, *[1] * (rank - 1)))
+    return replace(condition, shape=shape, axes=(*condition.axes, *[None] * (rank - 1)))
+
+
+def _combined(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape: tuple[Dim, ...]) -> Value:
+    """Two values combined inside of an op: constants at once, others by layers."""
+    if first.array is not None and second.array is not None:
+        functions = {LayerType.MUL: np.multiply, LayerType.ADD: np.add}
+        array = functions[kind](first.array, second.array)
+        return Value(shape if array.ndim == len(shape) else tuple(array.shape), array=array)
+    shape = _broadcast(first, second, shape)
+    pair = _Pair(b, [first, second], shape)
+    names = pair.names if pair.full(0) and pair.arrays[0] is None else pair.names[::-1]
+    return pair.made(_two(b, pair, kind, names[0], names[1], "chosen"))
+
+
+def _broadcast(first: Value, second: Value, shape: tuple[Dim, ...]) -> tuple[Dim, ...]:
+    """The shape of a part of a result: as long as its operands are."""
+    rank = max(len(first.shape), len(second.shape))
+    own = []
+    for i in range(1, rank + 1):
+        lengths = [v.shape[-i] for v in (first, second) if len(v.shape) >= i]
+        long = [d for d in lengths if d != 1]
+        own.append(long[0] if long else 1)
+    return tuple(reversed(own))
+
+
+def clip(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """Min, then max, as the trainers write it."""
+    x, low, high = args
+    shape = b.shape_of(b.node.name)
+    result = x
+    for kind, bound in ((LayerType.MIN, high), (LayerType.MAX, low)):
+        pair = _Pair(b, [result, bound], shape)
+        result = pair.made(_two(b, pair, kind, *(pair.names if pair.full(0) else pair.names[::-1])))
+    return result
+
+
+def add_n(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A sum of several, two at a time."""
+    total = args[0]
+    for value in args[1:]:
+        total = _combined(b, LayerType.ADD, total, value, b.shape_of(b.node.name))
+    return total
+
+
+ACTIVATIONS, FORMULAS, TWO, COMPARED = tuple(_ACTIVATIONS), tuple(_FORMULAS), tuple(_TWO), tuple(_COMPARED)

@@ -1,0 +1,286 @@
+"""Ops that sum: matrix products, convolutions, pools, reductions, softmax; and the noise of a policy.
+
+A sum over a row is a Dense layer of ones, and not Barracuda's ReduceSum: 1.1 leaves the whole model at a reduction
+over one number (a branch of one action), and a Dense is the layer that nothing goes wrong in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.formats.barracuda.lower_base import NnBuilder
+from converters.formats.barracuda.lower_elementwise import applied
+from converters.formats.barracuda.lower_values import Value
+from converters.formats.barracuda.vocabulary import Activation, C, LayerType, N
+from converters.graph.types import BATCH
+
+#: A first pad of −1 is TensorFlow's SAME.
+_SAME = (-1,)
+#: Lower than every score that a policy gives another action, and e to the power of it is 0.
+FORBIDDEN = -1e4
+
+
+# ------------------------------------------------------------------ products
+
+
+def fused(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A product or convolution with its bias, and the activations behind it."""
+    value = (matmul if b.node.op == "_FusedMatMul" else conv2d)(b, args)
+    for name in b.node.attrs["fused_ops"][1:]:
+        value = applied(b, value, name)
+    return value
+
+
+def matmul(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A row per agent times a constant matrix, plus a bias where it is fused."""
+    x, kernel = args[0], args[1].array
+    attrs = b.node.attrs
+    if kernel is None or x.array is not None or attrs.get("transpose_a") or attrs.get("adj_x") or kernel.ndim != 2:
+        raise b.refused(
+            "one of its operands has more rows than one per agent, or both are computed",
+            "version 16 of the format has products with constant matrices alone (Barracuda has others from 2.0 on)",
+        )
+    if attrs.get("transpose_b") or attrs.get("adj_y"):
+        kernel = kernel.T
+    bias = _bias(args, kernel.shape[1])
+    if len(x.shape) != 2 or x.shape[0] != BATCH:
+        return _last_axis(b, x, kernel, bias)
+    if x.flat_of is not None:
+        name, kernel = _flattened(b, x.flat_of, kernel)
+    else:
+        name = b.rows(x)
+    return b.result(b.dense(name, kernel, bias))
+
+
+def _flattened(b: NnBuilder, image: Value, kernel: np.ndarray) -> tuple[str, np.ndarray]:
+    """An image flattened as it lies in the file, and the matrix with its rows in that order."""
+    lengths = [1 if isinstance(d, str) else d for d in image.shape]
+    counted = np.arange(image.size, dtype=np.int64).reshape(lengths)
+    places = b.placed(counted, image.axes).reshape(-1).astype(np.int64)
+    name = b.stored(image)
+    flat = b.layer(LayerType.FLATTEN, [name], (b.dims_of(name)[N], 1, 1, image.size), label="flat")
+    b.made_up(kernel.size)
+    return flat, kernel[places]
+
+
+def _last_axis(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray) -> Value:
+    """A product over the last of several axes (torch's Linear on sequences): a convolution by one pixel."""
+    if BATCH not in x.shape or not x.in_order:
+        raise b.refused(f"a tensor of shape {list(x.shape)} times a matrix", "a row per agent can be multiplied")
+    value = b.in_usual_place(x)
+    n, h, w, c = value.dims
+    if c != kernel.shape[0]:
+        raise b.refused(
+            f"a tensor of shape {list(x.shape)} times a matrix", "its last axis has length 1 or is the batch"
+        )
+    name = b.layer(
+        LayerType.CONV2D, [b.stored(value)], (n, h, w, kernel.shape[1]), stride=(1, 1),
+        data=[("kernel", kernel.reshape(1, 1, *kernel.shape)), ("bias", bias.reshape(1, 1, 1, -1))],
+    )  # fmt: skip
+    shape = b.shape_of(b.node.name)
+    return b.made(name, shape, (*value.axes[:-1], None if shape[-1] == 1 else C))
+
+
+# ------------------------------------------------------------------ windows
+
+
+def conv2d(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A convolution; a dilated kernel is written with its zeros."""
+    kernel = _kernel(b, args[1])
+    return _convolved(b, args[0], kernel, _bias(args, kernel.shape[3]), LayerType.CONV2D)
+
+
+def _kernel(b: NnBuilder, value: Value) -> np.ndarray:
+    if value.array is None:
+        raise b.refused("its kernel is computed", "the kernels of a .nn are constants")
+    return value.array
+
+
+def _bias(args: Sequence[Value], length: int) -> np.ndarray:
+    """The constant that a fused product or convolution adds, else zeros."""
+    bias = args[2].array if len(args) > 2 else np.zeros(length, np.float32)
+    assert bias is not None
+    return bias
+
+
+def depthwise(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A convolution of every channel by itself; several results per channel become a full kernel with zeros."""
+    kernel = _kernel(b, args[1])
+    height, width, channels, many = kernel.shape
+    bias = np.zeros(channels * many, np.float32)
+    if many == 1:
+        return _convolved(b, args[0], kernel.transpose(0, 1, 3, 2), bias, LayerType.DEPTHWISE_CONV2D)
+    b.made_up(kernel.size * channels)
+    full = np.zeros((height, width, channels, channels * many), np.float32)
+    for channel in range(channels):
+        full[:, :, channel, channel * many : (channel + 1) * many] = kernel[:, :, channel]
+    return _convolved(b, args[0], full, bias, LayerType.CONV2D)
+
+
+def _convolved(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray, kind: LayerType) -> Value:
+    down, across = b.node.attrs.get("dilations", (1, 1, 1, 1))[1:3]
+    if (down, across) != (1, 1):
+        height, width, *rest = kernel.shape
+        shape = ((height - 1) * down + 1, (width - 1) * across + 1, *rest)
+        b.made_up(math.prod(shape))
+        grown = np.zeros(shape, np.float32)
+        grown[::down, ::across] = kernel
+        kernel = grown
+    data = [("kernel", kernel), ("bias", bias.reshape(1, 1, 1, -1))]
+    return _window(b, x, kind, data)
+
+
+def pool(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """The largest or the mean of each window."""
+    height, width = (int(k) for k in b.node.attrs["ksize"][1:3])
+    kind = LayerType.MAX_POOL2D if b.node.op == "MaxPool" else LayerType.AVG_POOL2D
+    return _window(b, args[0], kind, [], pool=(width, height))
+
+
+def _window(
+    b: NnBuilder, x: Value, kind: LayerType, data: Sequence[tuple[str, np.ndarray]], pool: tuple[int, ...] = ()
+) -> Value:
+    image = b.laid(b.settled(x), (0, 1, 2, 3))
+    shape = b.shape_of(b.node.name)
+    result = Value(shape, (0, 1, 2, 3))
+    down, across = (int(s) for s in b.node.attrs["strides"][1:3])
+    name = b.layer(
+        kind, [b.stored(image)], result.dims, data=data, stride=(across, down), pool=pool,
+        pad=_SAME if b.node.attrs["padding"] == "SAME" else (0, 0, 0, 0),
+    )  # fmt: skip
+    return b.made(name, shape, (0, 1, 2, 3))
+
+
+# ------------------------------------------------------------------ reductions
+
+
+_REDUCED = {
+    "Max": LayerType.REDUCE_MAX,
+    "Any": LayerType.REDUCE_MAX,
+    "Min": LayerType.REDUCE_MIN,
+    "All": LayerType.REDUCE_MIN,
+    "Prod": LayerType.REDUCE_PROD,
+}
+REDUCTIONS = ("Sum", "Mean", *_REDUCED)
+
+
+def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """Sum, mean, largest, smallest, product: over everything that an agent has, over the channels, or over an image."""
+    value, shape = b.settled(args[0]), b.shape_of(b.node.name)
+    axes = {int(a) % len(value.shape) for a in np.atleast_1d(b.known(1, "the axes"))}
+    long = [i for i in axes if value.shape[i] != 1]
+    if any(value.shape[i] == BATCH for i in long):
+        raise b.refused("it reduces over the batch", "an agent's action would depend on the other agents")
+    left = [i for i, d in enumerate(value.shape) if d not in (1, BATCH) and i not in axes]
+    keep = bool(b.node.attrs["keep_dims"])
+    kept = [i for i in range(len(value.shape)) if keep or i not in axes]
+    places = tuple(None if i in axes else value.axes[i] for i in kept)
+    name = b.stored(value)
+    if long:
+        name = _reduced(b, value, name, [value.axes[i] for i in long], whole=not left)
+    return b.made(name, shape, places)
+
+
+def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
+    n, h, w, c = value.dims
+    op, width = b.node.op, h * w * c
+    # All pixels of each channel: what is left of the image is one.
+    pixels = C not in places and all(length == 1 or place in places for place, length in ((1, h), (2, w)))
+    if op in ("Sum", "Mean") and whole:
+        b.made_up(width)
+        share = 1.0 if op == "Sum" else 1 / width
+        return b.dense(name, np.full((width, 1), share), np.zeros(1))
+    if op in ("Sum", "Mean") and pixels:
+        mean = b.layer(LayerType.GLOBAL_AVG_POOL2D, [name], (n, 1, 1, c), label="" if op == "Mean" else "mean")
+        return mean if op == "Mean" else b.scaled(mean, h * w)
+    if op in ("Sum", "Mean") and places == [C]:
+        kernel = np.full((1, 1, c, 1), 1.0 if op == "Sum" else 1 / c)
+        data = [("kernel", kernel), ("bias", np.zeros((1, 1, 1, 1)))]
+        return b.layer(LayerType.CONV2D, [name], (n, h, w, 1), stride=(1, 1), data=data)
+    if op in ("Sum", "Mean", "Max", "Any") and C not in places:
+        kind = LayerType.MAX_POOL2D if op in ("Max", "Any") else LayerType.AVG_POOL2D
+        down, across = (h if 1 in places else 1), (w if 2 in places else 1)
+        pooled = b.layer(
+            kind, [name], (n, h // down, w // across, c), pool=(across, down), stride=(across, down), label="pooled"
+        )
+        return b.scaled(pooled, down * across) if op == "Sum" else pooled
+    if op in _REDUCED and whole and len(places) > 1:
+        name = b.layer(LayerType.FLATTEN, [name], (n, 1, 1, width), label="flat")
+        return b.layer(_REDUCED[op], [name], (n, 1, 1, 1))
+    if op in _REDUCED and places == [C]:
+        return b.layer(_REDUCED[op], [name], (n, h, w, 1))
+    raise b.refused(f"a {op} of {list(value.shape)} over part of the image", "version 16 reduces over the channels")
+
+
+def softmax(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """Softmax and its logarithm, over a row."""
+    value = args[0]
+    kind = Activation.SOFTMAX if b.node.op == "Softmax" else Activation.LOG_SOFTMAX
+    if sum(d not in (1, BATCH) for d in value.shape) > 1 or (value.size > 1 and value.shape[-1] == 1):
+        raise b.refused(f"a tensor of shape {list(value.shape)}", "Barracuda up to 1.4 takes a whole row")
+    x = b.settled(value)
+    return b.made(b.activation(kind, b.rows(x)), x.shape, x.axes)
+
+
+def best_score(b: NnBuilder, x: str, width: int, label: str) -> str:
+    """0 at the largest number of a row, ``FORBIDDEN`` elsewhere: what a sampler draws from is then sure."""
+    if width == 1:
+        return b.scaled(x, 0, label)
+    top = b.layer(LayerType.REDUCE_MAX, [x], (b.dims_of(x)[N], 1, 1, 1), label=f"{label}/largest")
+    below = b.two(LayerType.SUB, x, b.spread(top, width), f"{label}/below")
+    return b.two(LayerType.MAX, b.scaled(below, 1e30, f"{label}/steep"), b.number(FORBIDDEN), label)
+
+
+def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """ArgMax and ArgMin: the first class of a row that scores highest, or lowest.
+
+    Of layers that every Barracuda has (ArgMax is one from 1.4 on): the place of the one that is as large as the
+    largest, and before which there is no other.
+    """
+    value = b.settled(args[0])
+    axis = int(b.known(1, "the axis").reshape(())) % len(value.shape)
+    width, row = value.size, [i for i, d in enumerate(value.shape) if d not in (1, BATCH)]
+    if BATCH not in value.shape or (width > 1 and row != [axis]):
+        raise b.refused(f"the best of {list(value.shape)} along axis {axis}", "it takes one row of scores per agent")
+    x = b.rows(value)
+    if width == 1:
+        return b.result(b.constant_rows(np.zeros(1, np.float32), "only"))
+    pairs = b.table(width, width)
+    kind = LayerType.REDUCE_MAX if b.node.op == "ArgMax" else LayerType.REDUCE_MIN
+    top = b.layer(kind, [x], (b.dims_of(x)[N], 1, 1, 1), label="top")
+    best = b.two(LayerType.EQUAL, x, b.spread(top, width), "is_best")
+    before = b.dense(best, np.triu(np.ones(pairs), 1), np.zeros(width), "before")
+    first = b.activation(Activation.RELU, b.two(LayerType.SUB, best, before, "after_none"), label="first")
+    return b.result(b.dense(first, np.arange(width).reshape(-1, 1), np.zeros(1)))
+
+
+# ------------------------------------------------------------------ chance
+
+
+def drawn_class(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """A class of each row, drawn by its log-probabilities."""
+    count = int(b.known(1, "the number of draws").reshape(()))
+    x = b.rows(b.settled(args[0]))
+    name = b.layer(LayerType.MULTINOMIAL, [x], (b.dims_of(x)[N], 1, 1, count), pool=(count,))
+    return b.made(name, b.shape_of(b.node.name), (N, None if count == 1 else C))
+
+
+def random(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """Noise of the shape of a tensor that is there, as the trainers' converter writes it; not seeded."""
+    shape = b.shape_of(b.node.name)
+    return noise(b, shape, LayerType.RANDOM_NORMAL if b.node.op == "RandomStandardNormal" else LayerType.RANDOM_UNIFORM)
+
+
+def noise(b: NnBuilder, shape: tuple[int | str, ...], kind: LayerType = LayerType.RANDOM_NORMAL) -> Value:
+    """A tensor of drawn numbers."""
+    flat = (BATCH, math.prod(d for d in shape if isinstance(d, int)))
+    if shape[:1] != (BATCH,) or len(shape) != 2:
+        raise b.refused(f"it draws a tensor of shape {list(shape)}", "a row of numbers per agent can be drawn")
+    dims = (-1, 1, 1, flat[1])
+    like = b.like(dims)
+    if like is None:
+        like = b.constant_rows(np.zeros(flat[1], np.float32), "like")
+    return b.made(b.layer(kind, [like], dims), shape, (0, None if flat[1] == 1 else C))

@@ -1,0 +1,219 @@
+"""What a format is: one object, declared in the ``__init__`` of its room, that answers every question about it.
+
+How its files are recognised, read and written, what an artefact of it takes and gives, which runtimes run it, what it
+is called everywhere (``--to``, parity.json, tolerances, budgets). The modules of its functions are ``deferred``, so
+that the list of formats (converters/formats/registry.py) costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from signatures.records import dataclass
+
+if TYPE_CHECKING:
+    from converters.compiler.passes.weights import Storage
+    from converters.files.chunks import Pieces
+    from converters.files.fetch import Fetched
+    from converters.files.file_probe import Content
+    from converters.formats.intermediate_tensors import InnerTensors, Loaded
+    from converters.formats.source import ReadOptions, SourceModel
+    from converters.policy.policy import Policy
+    from signatures.contract import FileEntry
+    from signatures.spec import PolicySignature
+
+Dims = tuple[int | None, ...]
+
+
+class _Deferred:
+    """A module whose functions are named before it is imported: it is when the first of them is called."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __getattr__(self, function: str) -> Callable[..., Any]:
+        return lambda *given: getattr(importlib.import_module(self._module), function)(*given)
+
+
+def deferred(room: str, *modules: str) -> list[Any]:
+    """Modules of a room, for what its ``Format`` is made of; the type checker is given them as they are."""
+    return [_Deferred(f"{room}.{module}") for module in modules]
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
+    file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), and how
+    weights that were rounded are kept.
+    """
+
+    contract: str
+    opset: int = 15
+    profile: str | None = None
+    checked: bool = True
+    weights: Storage = "float32"
+
+
+@dataclass(frozen=True, slots=True)
+class Artifact:
+    """One policy in one format: relative path (``/`` between parts) → what the file is made of."""
+
+    format: Format
+    name: str
+    files: Mapping[str, Pieces]
+
+    @property
+    def main(self) -> str:
+        """The path that a loader is given: a file, or the folder that all files lie in."""
+        return self.format.main_of(self.name)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files together."""
+        return sum(data.size for data in self.files.values())
+
+    def write(self, folder: Path) -> dict[str, FileEntry]:
+        """Write its files to a folder; what each became, by its path. Raises OSError."""
+        from signatures.contract import FileEntry  # it loads numpy
+
+        for parent in dict.fromkeys(relative.rpartition("/")[0] for relative in self.files):
+            (folder / parent).mkdir(parents=True, exist_ok=True)
+        return {relative: FileEntry(data.write(folder / relative), data.size) for relative, data in self.files.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """An input or output: the name that a caller uses, its dtype (numpy's name) and shape where the file tells them.
+
+    ``tensor`` is the tensor behind the name, where the format has both (the signatures of TensorFlow).
+    """
+
+    name: str
+    dtype: str | None = None
+    shape: Dims | None = None
+    tensor: str | None = None
+
+
+@dataclass(frozen=True)
+class Ports:
+    """What an artefact takes and gives, whichever tool made it; ``path`` and ``options`` are what its loader takes.
+
+    ``open`` is set where any node can be asked for (a frozen graph): ``outputs`` are then all nodes that can be.
+    """
+
+    path: Path
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    open: bool = False
+
+
+@dataclass(frozen=True)
+class Member:
+    """A source inside of another (a run folder's export, a bundle's artefact), to be read in its place.
+
+    ``name`` is the policy's where the folder says it, ``notes`` go to the policy's, ``files`` are those that said so.
+    """
+
+    path: Path
+    name: str | None = None
+    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """A snippet: how to call an artefact of a format. ``text`` has ``$path`` for what a loader is given, in quotes."""
+
+    name: str
+    title: str
+    language: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Format:
+    """A form in which policies are given, written or both. What it has not is None or empty.
+
+    - ``key`` is its one name, ``label`` what people call it, ``advice`` what to do where it cannot be read.
+    - ``sniff`` looks at a file's content. ``marker`` is the file that makes a folder one of this format; ``at`` says
+      whether a path that is no file (a folder, a checkpoint's prefix) stands for one.
+    - ``read`` gives the models of a file or folder; ``members`` instead says which sources inside are to be read.
+      ``takes`` are the options that mean something to it: ``step``, ``sensors``.
+    - ``write`` gives the files of an artefact by their path in the bundle; ``main`` is the one that a loader is given,
+      with ``{name}`` for the policy's name, ``beside`` a file that it may need next to it. A ``default`` is written
+      unless ``--to`` says otherwise.
+    - ``vetted`` copies an artefact that anyone may have made to an empty folder, as far as a runtime may be given it:
+      what the wanted nodes (of a graph that any node can be asked of) or signatures need, no op that does more than
+      compute, no file from elsewhere.
+    - ``held`` gives the contract that an artefact of ours embeds, as text or as JSON's values (None: it has none).
+    - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
+      ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
+      once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
+      source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
+      ``answers`` are the outputs of a policy that an artefact answers (None: all). ``narrow``: it can hold weights in
+      float16 or int8.
+    """
+
+    key: str
+    label: str
+    advice: str = ""
+    sniff: Callable[[Content], bool] | None = None
+    marker: str = ""
+    at: Callable[[Path], bool] | None = None
+    read: Callable[[Fetched, ReadOptions], list[SourceModel]] | None = None
+    members: Callable[[Path, ReadOptions], list[Member]] | None = None
+    takes: frozenset[str] = frozenset()
+    write: Callable[[Policy, WriteOptions], Mapping[str, Pieces]] | None = None
+    main: str = ""
+    beside: str = ""
+    default: bool = False
+    held: Callable[[Path], Any] | None = None
+    ports: Callable[[Path], Ports] | None = None
+    vetted: Callable[[Path, Sequence[str], Path], Path] | None = None
+    runtimes: tuple[str, ...] = ()
+    signatures: bool = False
+    predicts: bool = False
+    inner: Callable[[Loaded], AbstractContextManager[InnerTensors]] | None = None
+    origins: Callable[[Path], Mapping[str, str]] | None = None
+    snippets: tuple[Code, ...] = ()
+    dtypes: frozenset[str] = frozenset()
+    answers: Callable[[PolicySignature], list[str]] | None = None
+    narrow: bool = False
+
+    @property
+    def readable(self) -> bool:
+        """Whether it is a source."""
+        return self.read is not None or self.members is not None
+
+    def main_of(self, name: str) -> str:
+        """The path in a bundle that a loader is given, for the policy ``name``."""
+        return self.main.format(name=name)
+
+    def first_file_of(self, name: str) -> str:
+        """The file in a bundle without which there is no artefact of this format."""
+        return self.main_of(name) + (f"/{self.marker}" if self.marker else "")
+
+    def owns(self, path: str, name: str) -> bool:
+        """Whether a file of the bundle of the policy ``name`` is of this format's artefact."""
+        main = self.main_of(name)
+        return path in (main, self.beside.format(name=name)) or (bool(self.marker) and path.startswith(f"{main}/"))
+
+    def artifact(self, policy: Policy, options: WriteOptions) -> Artifact:
+        """The policy in this format, which has a writer. Raises GraphError and its like where it cannot be."""
+        assert self.write is not None, f"{self.key} is not written"
+        import numpy as np
+
+        with np.errstate(all="ignore"):  # weights may be any numbers
+            return Artifact(self, policy.name, self.write(policy, options))
+
+    def loader(self, signature: str = "") -> Mapping[str, Any]:
+        """What a child process is told beside the path; ``signature`` is the one to call, where it has some."""
+        if self.signatures:
+            return {"kind": self.key, "signature": signature}
+        return {"kind": "graph", "format": self.key}

@@ -1,0 +1,31 @@
+"""Frozen TensorFlow graphs (GraphDef): read from ``.bytes`` and ``.pb``, and written."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.formats.frozen_graph import artifact as _artifact
+    from converters.formats.frozen_graph import source as _source
+    from converters.formats.frozen_graph import writer as _writer
+else:
+    _artifact, _source, _writer = deferred(__name__, "artifact", "source", "writer")
+
+FORMATS = (
+    Format(
+        key="bytes",
+        label="a TensorFlow graph (GraphDef)",
+        sniff=lambda file: file.is_graph,
+        read=_source.read,
+        write=_writer.write,
+        main="{name}.bytes",
+        default=True,
+        narrow=True,
+        ports=_artifact.ports,
+        vetted=_artifact.vetted,
+        inner=_artifact.inner,
+        runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
+    ),
+)

@@ -1,0 +1,60 @@
+"""An artefact that is a frozen graph: what it takes and gives, its inner tensors, the part that a runtime may be given.
+
+Any node can be fetched, by the graph's own name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+
+from converters.files import tensorflow_messages as schema
+from converters.files.external_data import Detached
+from converters.files.fetch import read_bytes
+from converters.files.memory_mapped import Mapped
+from converters.formats.format import Port, Ports
+from converters.formats.frozen_graph.reader import from_graph_def, read_graph
+from converters.formats.frozen_graph.subgraph import subgraph
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names
+from converters.graph.nodes import node_of
+from converters.graph.ops.table import is_fed
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a file. Raises SourceError, DamagedFileError, GraphError."""
+    graph = read_graph(read_bytes(path))
+    places = [n for n in graph.nodes if is_fed(n)]
+    inputs = tuple(Port(n.name, n.attrs["dtype"].name if "dtype" in n.attrs else None, n.dims) for n in places)
+    return Ports(path, inputs, tuple(Port(n.name) for n in graph.nodes), {"kind": "graph"}, open=True)
+
+
+def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
+    """Those of a ``.bytes``."""
+    graph = schema.parse(schema.GraphDef, Mapped().read(loaded.path), "GraphDef", Detached())  # for its names
+
+    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        """TensorFlow 1.x refuses to fetch what it is fed, by the same name: it is what was fed."""
+        others = [name for name in fetch if name not in feeds]
+        values = {name: feeds[name] for name in fetch if name in feeds}
+        return {**values, **loaded.run(feeds, others)} if others else values
+
+    return contextlib.nullcontext(InnerTensors(own_names(n.name for n in graph.node), run))
+
+
+def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+    """A copy in ``folder`` of what the nodes ``wanted`` are computed from; those that are not there are left out.
+
+    Raises UnsupportedOpError where an op does more than compute, DamagedFileError, GraphError.
+    """
+    detached = Detached()
+    definition = schema.parse(schema.GraphDef, read_bytes(path), "TensorFlow graph", detached)
+    from_graph_def(definition, detached)  # its constants are bounded, its names are names
+    there = {n.name for n in definition.node}
+    copy = folder / path.name
+    part = subgraph(definition, [w for w in wanted if node_of(w) in there])
+    schema.pieces(part, detached).write(copy)
+    return copy

@@ -1,0 +1,75 @@
+"""What only a library reads, in a process of its own: HDF5 (h5py), and Keras models of more than plain layers.
+
+Keras builds what a file names, so loading one runs what it says. It is read where the caller trusts it, and then, too,
+only if it is made of Keras' own layers (converters/formats/keras/config.py): TensorFlow freezes it, in a child that has no
+network and cannot write. HDF5 files are ``.h5`` and ``model.weights.h5`` (hdf5_child.py).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+
+from converters.files.children.process import RunFailedError, RuntimeProcess
+from converters.formats.saved_model.signature import ModelSignature, signature_of
+from converters.runtimes.python import child_command, module_origin
+from signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
+from signatures.records import dataclass
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What an HDF5 file of Keras holds: (layer, name) → array, in its order, and what an ``.h5`` says of itself."""
+
+    arrays: dict[tuple[str, str], np.ndarray]
+    config: str | None = None
+    version: str | None = None
+
+
+def stored_in(path: Path) -> Stored:
+    """What an ``.h5`` or ``.keras`` holds. Raises RuntimeUnavailableError without h5py, DamagedFileError."""
+    if module_origin("h5py") is None:
+        raise RuntimeUnavailableError(
+            "is a Keras model, whose weights lie in HDF5, and h5py is not installed",
+            why="HDF5 is read by its own library",
+            fix="pip install 'export-model[keras]'",
+        )
+    try:
+        with RuntimeProcess("h5py", child_command("converters.formats.keras.hdf5_child")) as process:
+            answer = process.load(str(path.absolute())).run({}, [])
+    except RunFailedError as error:
+        raise DamagedFileError(
+            "its weights cannot be read",
+            why=(error.why or error.what)[:600],
+            fix="save the model again: model.save('policy.keras')",
+        ) from error
+    index = json.loads(answer["index"].tobytes())
+    arrays = {(layer, name): answer[str(i)] for i, (layer, name) in enumerate(index["arrays"])}
+    return Stored(arrays, index["config"], index["version"])
+
+
+def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
+    """(the GraphDef's bytes, its signature) of calling the model with ``training=False``.
+
+    Raises RuntimeUnavailableError where TensorFlow is not installed, SourceError with its message where it refuses.
+    """
+    if importlib.util.find_spec("tensorflow") is None:
+        raise RuntimeUnavailableError(
+            "is a Keras model of more than plain layers, which can only be read with TensorFlow",
+            why="its layers are turned into a graph by TensorFlow itself, and it is not installed",
+            fix="pip install 'export-model[tensorflow]'; or freeze the model where it was made, and give the GraphDef",
+        )
+    try:
+        with RuntimeProcess("tensorflow", child_command("converters.runtimes.tensorflow.child")) as process:
+            answer = process.load(str(path.absolute()), kind="keras").run({}, ["graph", "names"])
+    except RunFailedError as error:
+        raise SourceError(
+            "is a Keras model that TensorFlow cannot load",
+            why=(error.why or error.what)[:600],
+            fix="load it where it was made, and save it as a SavedModel with a signature, or freeze it to a GraphDef",
+        ) from error
+    names = json.loads(answer["names"].tobytes())
+    return answer["graph"].tobytes(), signature_of(names["inputs"], names["outputs"], names["signature"])

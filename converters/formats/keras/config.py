@@ -1,0 +1,160 @@
+"""What a Keras file says it is made of: the layers by name, and whether any of them is code.
+
+Keras builds whatever class or function its configuration names, so a file can name ``os.system`` (or a Lambda layer
+with a marshalled function in it). The configuration is data: it is read here before Keras sees it, and what is not a
+layer, an initialiser or the like of Keras itself is refused, whatever the version of Keras would do with it.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from converters.files.fetch import read_bytes
+from converters.files.file_probe import json_in
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
+from signatures.errors import DamagedFileError, NotAPolicyError
+
+#: Bytes of a configuration; Keras' largest models have one of 2 MB.
+MAX_CONFIG = 16 << 20
+_MAX_DEPTH = 64
+#: The packages whose classes a policy may be made of, by the first parts of a module's name.
+_PACKAGES = (
+    *("keras", "keras.src", "tf_keras", "tf_keras.src", "tensorflow.keras", "tensorflow.python.keras"),
+    *("keras.api", "keras.api._v2.keras", "keras.engine"),
+)
+_ROOMS = frozenset(
+    (
+        *("layers", "models", "initializers", "regularizers", "constraints", "dtype_policies", "quantizers"),
+        *("ops", "engine", "mixed_precision"),
+    )
+)
+#: What training alone uses, which Keras builds too for a model inside of another.
+_TRAINING = frozenset(("optimizers", "losses", "metrics"))
+#: Classes that run what the file gives them, load what it names, or read files.
+_CODE = frozenset(
+    (
+        *("Lambda", "TFOpLambda", "SlicingOpLambda", "TFClassMethodDispatch", "InstanceMethod", "InstanceProperty"),
+        *("TensorFlowOpLayer", "AddLoss", "AddMetric", "TFSMLayer", "TorchModuleWrapper", "JaxLayer", "FlaxLayer"),
+        *("HubLayer", "KerasLayer", "Map", "Scan", "AssociativeScan", "VectorizedMap", "WhileLoop", "ForiLoop", "Cond"),
+        *("Switch", "CustomGradient", "Function", "ClassVariable"),
+        *("StringLookup", "IntegerLookup", "IndexLookup", "TextVectorization"),
+    )
+)
+#: Marks of a serialised value that is no class: what they hold is looked into.
+_VALUES = frozenset(("__keras_tensor__", "__tensor__", "__numpy__", "__tuple__", "__ellipsis__", "__slice__"))
+
+
+def config_of(path: Path, name: str = "config.json") -> Any:
+    """The configuration in a ``.keras`` file (a zip), or another part of it in JSON. Raises DamagedFileError."""
+    try:
+        with opened(read_bytes(path)) as archive:
+            return json_in(entry_of(archive, name, MAX_CONFIG))
+    except (*ZIP_ERRORS, RecursionError) as error:
+        raise DamagedFileError(
+            "its configuration cannot be read",
+            why=f"{type(error).__name__}: {error}"[:200],
+            fix="save the model again: model.save('policy.keras')",
+        ) from error
+
+
+def config_inside(path: str) -> Any:
+    """The configuration that Keras would take from a file, in a child that has h5py. Raises DamagedFileError.
+
+    A file may be a ZIP archive and HDF5 at once (HDF5 may begin at byte 512): which it is for Keras, its name says.
+    Weights that are links to other files are refused.
+    """
+    if path.endswith(".keras") and zipfile.is_zipfile(path):
+        config = config_of(Path(path))
+        if isinstance(config, dict):
+            config.pop("compile_config", None)  # so does Keras, of the model itself, where it is not to be compiled
+        return config
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        _refuse_links(file, h5py)
+        text = file.attrs.get("model_config")
+    if text is None or len(text) > MAX_CONFIG:
+        raise no_configuration()
+    return json_in(text)
+
+
+def no_configuration() -> DamagedFileError:
+    """The error of a file that does not say what it is made of."""
+    return DamagedFileError(
+        "it has no configuration of a model",
+        why="it holds weights alone, or something else",
+        fix="save the whole model: model.save('policy.keras')",
+    )
+
+
+def _refuse_links(group: Any, h5py: Any, depth: int = 0) -> None:
+    """Raise DamagedFileError where a group of an HDF5 file holds what lies in another file."""
+    for key in group:
+        link = group.get(key, getlink=True)
+        if isinstance(link, h5py.ExternalLink) or depth > _MAX_DEPTH:
+            raise DamagedFileError(f"its {key!r} lies in another file", fix="save the model again, in one file")
+        if isinstance(link, h5py.SoftLink):
+            continue
+        value = group[key]
+        if isinstance(value, h5py.Group):
+            _refuse_links(value, h5py, depth + 1)
+        elif getattr(value, "external", None):
+            raise DamagedFileError(f"its {key!r} lies in another file", fix="save the model again, in one file")
+
+
+def stateful_layer(config: Any) -> str | None:
+    """The first layer that keeps its state in itself from call to call."""
+    inner = (entry.get("config") for entry in _objects(config))
+    named = (str(c.get("name")) for c in inner if isinstance(c, dict) and c.get("stateful") is True)
+    return next(named, None)
+
+
+def refuse_code(config: Any, *, built: bool = False) -> None:
+    """Raise NotAPolicyError where a configuration names anything but layers and settings of Keras itself.
+
+    Where Keras itself is to build it (``built``), what training uses is looked at, too.
+    """
+    rooms = _ROOMS | _TRAINING if built else _ROOMS
+    for named in _objects(config, built=built):
+        name = named.get("class_name")
+        module, registered = named.get("module"), named.get("registered_name")
+        if isinstance(name, str) and name in _VALUES:
+            continue
+        whole = ".".join(str(part) for part in (module, name) if part)
+        if not isinstance(name, str) or name in _CODE or "lambda" in name.lower() or not name[:1].isupper():
+            raise _code(whole)
+        if not (module is None or isinstance(module, str)) or (module is not None and not _of_keras(module, rooms)):
+            raise _code(whole)
+        if ">" in name or (registered is not None and (not isinstance(registered, str) or ">" in registered)):
+            raise _code(str(registered or whole))
+
+
+def _of_keras(module: str, rooms: frozenset[str]) -> bool:
+    """Whether a module is one of Keras' that hold layers and their settings."""
+    inside = (module.removeprefix(f"{package}.") for package in _PACKAGES if module.startswith(f"{package}."))
+    return module in _PACKAGES or any(rest.partition(".")[0] in rooms for rest in inside)
+
+
+def _objects(config: Any, *, built: bool = False) -> Iterator[dict[str, Any]]:
+    """Every object of a configuration that names a class, or should; what training alone uses only if it is built."""
+    stack = [config]
+    while stack:
+        value = stack.pop()
+        if isinstance(value, dict):
+            if "class_name" in value or "registered_name" in value or "__lambda__" in value:
+                yield value
+            stack.extend(v for k, v in value.items() if built or k != "compile_config")
+        elif isinstance(value, list):
+            stack.extend(value)
+
+
+def _code(name: str) -> NotAPolicyError:
+    shown = name if name.isprintable() else repr(name)
+    return NotAPolicyError(
+        f"the Keras model is made of {shown[:200]}, which is code and no layer of Keras",
+        why="Keras would run it when the model is loaded or called, and a model file is untrusted input",
+        fix="replace it by layers of Keras; or in the process that trains it: export_model(keras_model=model)",
+    )

@@ -1,0 +1,147 @@
+"""Keras models as sources: ``.keras``, ``.h5`` and TensorFlow.js layers models, a list of layers and their weights.
+
+They are read as data. What is more than the layers of ``layers/table.py`` is left to Keras itself, for ``.keras`` and
+``.h5`` whose giver the caller trusts: it is frozen by TensorFlow (children.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from converters.files import tensorflow_messages as schema
+from converters.files.fetch import Fetched
+from converters.files.file_probe import json_in
+from converters.formats.frozen_graph.reader import from_graph_def
+from converters.formats.keras.children import frozen_by_tensorflow, stored_in
+from converters.formats.keras.config import config_of, no_configuration, refuse_code, stateful_layer
+from converters.formats.keras.model import model_of
+from converters.formats.keras.network import Network, UnknownLayerError
+from converters.formats.keras.weights import Groups, Listed, Weights
+from converters.formats.saved_model.signature import declared, expose, exposed, output_names
+from converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from converters.graph.nodes import Graph
+from converters.graph.ops.base import MISFIT
+from converters.graph.ops.table import is_fed
+from converters.policy.facts import SourceFacts
+from signatures.errors import DamagedFileError, RuntimeUnavailableError
+
+_SAVE_AGAIN = "save the model again: model.save('policy.keras')"
+
+
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    """What calling the model computes, with ``training=False``.
+
+    Raises NotAPolicyError where the file is made of code, or of layers that are not read as data and is not trusted;
+    RuntimeUnavailableError without h5py; SourceError and its kinds.
+    """
+    try:
+        config, weights, version = _stored(given)
+    except RuntimeUnavailableError:
+        if options.trust_source:
+            return [_through_keras(given.path)]
+        raise
+    stateful = stateful_layer(config)
+    try:
+        model = layered((given.path,), config, weights, version)
+    except UnknownLayerError as error:
+        if not options.trust_source:
+            fix = "--trust-source (trust_source=True) has Keras itself load it, if you know where it comes from"
+            raise UnknownLayerError(error.what, why=error.why, fix=f"{fix}; or save it without that layer") from error
+        if stateful is None:
+            return [_through_keras(given.path)]
+        raise UnknownLayerError(
+            error.what,
+            why=f"Keras itself could load it, but its layer {stateful!r} keeps its state in itself: what TensorFlow "
+            "freezes of that has no memory",
+            fix="save it with the state as an input and an output (initial_state=…, return_state=True)",
+        ) from error
+    if not options.trust_source:
+        return [model]
+    if stateful is None:
+        return [_beside_keras(model, given.path)]
+    note = f"not compared with Keras' own run: its layer {stateful} keeps its state in itself"
+    return [replace(model, facts=replace(model.facts, notes=(*model.facts.notes, note)))]
+
+
+def _stored(given: Fetched) -> tuple[Any, Weights, str]:
+    """(the configuration, the weights, Keras' version) of a file. Raises NotAPolicyError where it names code."""
+    path = given.path
+    if given.data.startswith(b"PK"):
+        config = config_of(path)
+        refuse_code(config)
+        stored = stored_in(path)
+        metadata = config_of(path, "metadata.json")
+        version = str(metadata.get("keras_version", "")) if isinstance(metadata, dict) else ""
+        return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version
+    stored = stored_in(path)
+    if stored.config is None:
+        raise no_configuration()
+    config = _configuration(stored.config)
+    refuse_code(config)
+    entries = [(name, array) for (_, name), array in stored.arrays.items()]
+    return config, Listed(entries, [layer for layer, _ in stored.arrays]), stored.version or ""
+
+
+def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str) -> SourceModel:
+    """The model of a configuration with its weights. Raises UnknownLayerError, SourceError and its kinds."""
+    try:
+        net = Network(version)
+        signature = net.whole(model_of(config), weights)
+        graph, roles = expose(net.graph(), signature)
+    except UnknownLayerError as error:
+        error.fix = error.fix or "save the model without that layer, or give a SavedModel or an ONNX of it"
+        raise
+    except (*MISFIT, StopIteration, RecursionError) as error:
+        raise DamagedFileError(
+            "its layers are not in Keras' form", why=f"{type(error).__name__}: {error}"[:200], fix=_SAVE_AGAIN
+        ) from error
+    names = output_names(signature)
+    facts = SourceFacts(
+        roles=roles,
+        outputs=declared(signature),
+        memories=net.memories(names) or None,
+        notes=tuple(net.notes),
+    )
+    return SourceModel(graph, files, facts)
+
+
+def of_web_model(files: tuple[Path, ...], topology: Mapping[str, Any], weights: Weights) -> SourceModel:
+    """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``. Raises what ``layered`` raises."""
+    config = topology.get("model_config") or topology
+    version = str(topology.get("keras_version") or "tfjs-layers")
+    return layered(files, _configuration(config) if isinstance(config, str) else config, weights, version)
+
+
+def _configuration(text: str) -> Any:
+    try:
+        return json_in(text)
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError("its configuration is not JSON", why=str(error)[:200], fix=_SAVE_AGAIN) from error
+
+
+def _beside_keras(model: SourceModel, path: Path) -> SourceModel:
+    """The model with Keras' own beside it, which it is verified against; as it is where there is no TensorFlow."""
+    try:
+        data, signature = frozen_by_tensorflow(path)
+    except RuntimeUnavailableError:
+        return model
+    fed, given, nodes = {**signature.inputs}, {**signature.outputs}, []
+    for node in model.graph.nodes:
+        ends = fed if is_fed(node) else given if node.name in model.facts.outputs else {}
+        tensor = ends.pop(str(node.origin), None)
+        nodes.append(node if tensor is None else replace(node, origin=tensor.name))
+    if fed or given:  # what Keras calls its outputs does not tell them apart
+        return model
+    original = OriginalRun("tensorflow", path, definition=schema.parse(schema.GraphDef, data, "TensorFlow graph"))
+    return replace(model, graph=Graph(tuple(nodes)), original=original)
+
+
+def _through_keras(path: Path) -> SourceModel:
+    """What TensorFlow freezes of the model that Keras builds."""
+    data, signature = frozen_by_tensorflow(path)
+    definition = schema.parse(schema.GraphDef, data, "TensorFlow graph")
+    graph, facts = exposed(from_graph_def(definition), signature)
+    return SourceModel(graph, (path,), facts, None, OriginalRun("tensorflow", path, definition=definition))

@@ -1,0 +1,90 @@
+"""An artefact that is an ONNX model: what it takes and gives, the contract that it holds, its inner tensors.
+
+It gives its outputs only: for the tensors inside, a copy with further outputs is loaded beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.files.external_data import Detached
+from converters.files.fetch import read_bytes
+from converters.files.folders import scratch_folder
+from converters.files.memory_mapped import Mapped
+from converters.formats.format import Port, Ports
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
+from converters.formats.onnx.messages import files_of
+from converters.formats.onnx.proto import array_of, decoded, dtype_name, load_external
+from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
+from signatures.contract import EMBEDDED
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a file. Raises SourceError, DamagedFileError."""
+    graph = decoded(read_bytes(path), Detached()).graph
+    stored = {t.name for t in graph.initializer}
+    inputs = tuple(_port(v) for v in graph.input if v.name not in stored)
+    return Ports(path, inputs, tuple(_port(v) for v in graph.output))
+
+
+def _port(value: Any) -> Port:
+    """A length of 0 or below, and a named one, is free (as the importer reads it)."""
+    tensor = value.type.tensor_type
+    dims = tuple(int(d.dim_value) if d.dim_value > 0 else None for d in tensor.shape.dim)
+    return Port(value.name, dtype_name(tensor.elem_type), dims if tensor.HasField("shape") else None)
+
+
+def held(path: Path) -> str | None:
+    """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
+    model = decoded(read_bytes(path), Detached())
+    return next((str(p.value) for p in model.metadata_props if p.key == EMBEDDED), None)
+
+
+@contextmanager
+def inner(loaded: Loaded) -> Iterator[InnerTensors]:
+    """Those of a model, in the same runtime; its values are found by the map that the writer left in it."""
+    detached, files = Detached(), Mapped()
+    model = decoded(files.read(loaded.path), detached)
+    load_external([model.graph], loaded.path.parent, detached, files.read)
+    graph = model.graph
+    names = loads({p.key: p.value for p in model.metadata_props}.get(TENSORS_KEY, ""))
+    constants = {t.name for t in graph.initializer}
+    made = {name for node in graph.node for name in node.output}
+    fed = frozenset(v.name for v in graph.input) - constants
+
+    def view(tensor: str) -> View | None:
+        found = names.view(tensor)
+        return found if found is not None and found.name in made | constants | fed else None
+
+    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        files.let_go()  # what was fetched before, tensor for tensor
+        values = {t.name: array_of(t, detached) for t in graph.initializer if t.name in fetch}
+        values.update({name: feeds[name] for name in fetch if name in fed})
+        wanted = [name for name in fetch if name in made]
+        if wanted:
+            open_model = type(model)()
+            open_model.CopyFrom(model)
+            known = {o.name for o in graph.output}
+            for name in wanted:
+                if name not in known:
+                    open_model.graph.output.add(name=name)
+            for name, data in files_of(open_model, detached, file.name).items():
+                data.write(file.with_name(name))
+            with loaded.pool.process(loaded.runtime).load(str(file), kind="graph") as opened:
+                values.update(opened.run({n: a for n, a in feeds.items() if n in fed}, wanted))
+        return values
+
+    with scratch_folder() as folder:
+        file = folder / loaded.path.name
+        yield InnerTensors(view, run)
+
+
+def origins(path: Path) -> Mapping[str, str]:
+    """Tensor of the graph → tensor of the source, where they are called differently, as our .onnx notes it."""
+    model = decoded(read_bytes(path), Detached())
+    return loads(next((p.value for p in model.metadata_props if p.key == TENSORS_KEY), "")).sources

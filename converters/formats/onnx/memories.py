@@ -1,0 +1,144 @@
+"""The memories of an ONNX model that are inputs and outputs of their own: ``h_in``, ``c_in`` to ``h_out``, ``c_out``.
+
+rsl_rl's and Isaac Lab's exporters (_OnnxPolicyExporter: [layers, 1, hidden], opset 11, no dynamic axes), recipes for
+SB3-contrib's RecurrentPPO and for GRUs write them so. They are told by what they are, not by their names: an input that
+reaches the initial state of a recurrent layer, and the output that gives the last state of the same.
+Operands and outputs by position: onnx/docs/Operators.md (LSTM, GRU).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from converters.formats.onnx.importer.node import STANDARD
+from signatures.records import dataclass
+
+Dims = tuple[int | None, ...] | None
+
+#: op → its states: part, operand of the initial one, output of the last one
+_STATES = {"LSTM": (("h", 5, 1), ("c", 6, 2)), "GRU": (("h", 5, 1),)}
+#: Ops that pick and move elements, with how many of their operands hold them (None: all).
+_MOVES: Mapping[str, int | None] = {
+    **dict.fromkeys(("Identity", "Cast", "Slice", "Split", "Squeeze", "Unsqueeze", "Reshape", "Flatten", "Gather"), 1),
+    "Transpose": 1,
+    "Concat": None,
+}
+#: Ops by which a state is forgotten where an episode begins (SB3-contrib's ``episode_starts``).
+_RESETS: Mapping[str, int | None] = {"Mul": None, "Where": None}
+#: Recurrent layers and outputs that are looked through; a policy has a few, a damaged file may have any number.
+_MOST = 64
+
+
+@dataclass(frozen=True, slots=True)
+class OnnxMemory:
+    """An input and the output that is fed back to it, ``part`` h or c; the batch is the input's axis ``axis``."""
+
+    input: str
+    output: str
+    part: str
+    axis: int
+
+
+def separate_memories(
+    graph: Any, inputs: Mapping[str, Dims], outputs: Mapping[str, Dims], floats: frozenset[str]
+) -> tuple[tuple[OnnxMemory, ...], dict[str, int]]:
+    """(the memories of a GraphProto in the order of its inputs, input → its batch axis).
+
+    ``inputs`` and ``outputs`` have the declared shapes, ``floats`` are the inputs of float32. There are no memories
+    where it is not plain for each of them which output belongs to it; the states of several layers have a batch axis
+    all the same.
+    """
+    if max(sum(1 for n in graph.node if _states(n)), len(outputs)) > _MOST:
+        return (), {}
+    walk = _Walk(graph)
+    starts: dict[str, set[tuple[int, str]]] = {}
+    turned: set[str] = set()
+    for number, node in enumerate(graph.node):
+        for part, operand, _ in _states(node):
+            hidden = next((int(a.i) for a in node.attribute if a.name == "hidden_size"), None)
+            if operand >= len(node.input) or hidden is None:
+                continue
+            found, transposed = walk.back(node.input[operand], {**_MOVES, **_RESETS})
+            batch_first = any(a.name == "layout" and a.i for a in node.attribute)
+            for name in found & floats:
+                dims = inputs.get(name)
+                if dims is None or len(dims) not in (2, 3) or dims[-1] != hidden:
+                    continue
+                starts.setdefault(name, set()).add((number, part))
+                if transposed != batch_first:
+                    turned.add(name)
+    ends = {name: walk.states(name) for name in outputs}
+    memories, axes, plain = [], {}, True
+    for name in (n for n in inputs if n in starts):
+        states, dims = starts[name], inputs[name]
+        parts = {part for _, part in states}
+        candidates = [o for o, found in ends.items() if found == states and _fits(dims, outputs[o])]
+        axis = _batch_axis(dims, name in turned)
+        if axis is not None:
+            axes[name] = axis
+        if len(parts) != 1 or len(candidates) != 1 or axis is None:
+            plain = False
+        else:
+            memories.append(OnnxMemory(name, candidates[0], parts.pop(), axis))
+    if plain:
+        return tuple(memories), axes
+    return (), {name: axis for name, axis in axes.items() if (inputs[name] or (1,))[0] != 1}
+
+
+class _Walk:
+    """Values of a graph, followed back to where they come from."""
+
+    def __init__(self, graph: Any) -> None:
+        self.made = {value: (i, node) for i, node in enumerate(graph.node) for value in node.output if value}
+
+    def back(self, value: str, through: Mapping[str, int | None]) -> tuple[set[str], bool]:
+        """The values that ``value`` is made of by moving elements alone, and whether any was transposed."""
+        found: set[str] = set()
+        seen: set[str] = set()
+        transposed = False
+        stack = [value]
+        while stack:
+            name = stack.pop()
+            if not name or name in seen:
+                continue
+            seen.add(name)
+            _, node = self.made.get(name, (0, None))
+            if node is None or node.domain not in STANDARD or node.op_type not in through:
+                found.add(name)
+                continue
+            transposed = transposed or node.op_type == "Transpose"
+            stack.extend(list(node.input)[: through[node.op_type]])
+        return found, transposed
+
+    def states(self, value: str) -> set[tuple[int, str]]:
+        """The last states that ``value`` is made of; empty where it is made of anything else."""
+        states: set[tuple[int, str]] = set()
+        for name in self.back(value, _MOVES)[0]:
+            number, node = self.made.get(name, (0, None))
+            own = [p for p, _, k in _states(node) if k < len(node.output) and node.output[k] == name] if node else []
+            if not own:
+                return set()
+            states.add((number, own[0]))
+        return states
+
+
+def _states(node: Any) -> Sequence[tuple[str, int, int]]:
+    return _STATES.get(node.op_type, ()) if node.domain in STANDARD else ()
+
+
+def _fits(dims: Dims, other: Dims) -> bool:
+    """Whether an output may have the shape of an input, as far as the file tells."""
+    if dims is None or other is None:
+        return dims is not None
+    return len(dims) == len(other) and all(a is None or b is None or a == b for a, b in zip(dims, other, strict=True))
+
+
+def _batch_axis(dims: Dims, batch_first: bool) -> int | None:
+    """The free axis; of a shape without one, what the layer takes: [layers, B, hidden]."""
+    if dims is None:
+        return None
+    free = [i for i, d in enumerate(dims) if d is None]
+    if free:
+        return free[0] if len(free) == 1 else None
+    return 0 if batch_first or len(dims) == 2 else 1

@@ -1,0 +1,20 @@
+"""An ONNX model as a source: which trainer wrote it, and how the model itself is run beside what is made of it."""
+
+from __future__ import annotations
+
+from converters.files.fetch import Fetched
+from converters.formats.onnx.reader import read_onnx
+from converters.formats.onnx.trainers import understood
+from converters.formats.source import OriginalRun, ReadOptions, SourceModel
+
+
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    """The one model in a file. Raises SourceError, GraphError and their kinds.
+
+    The model itself is run by onnxruntime, the draws of its samplers fed from outside (``lift``).
+    """
+    model = read_onnx(given)
+    graph, facts = understood(model)
+    original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)})
+    producer = f"{model.producer}, opset {model.opset}" if model.producer else f"opset {model.opset}"
+    return [SourceModel(graph, model.files, facts, original=original, producer=producer)]

@@ -1,0 +1,119 @@
+"""From a path to models: fetched, recognised, read by its format; and what an artefact at a path takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from converters.files.fetch import Fetched
+from converters.formats.bundle import BUNDLE
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.format import Format, Member, Ports
+from converters.formats.recognise import not_readable, recognised
+from converters.formats.registry import FORMATS
+from converters.formats.source import ReadOptions, SourceModel
+from signatures.contract import POLICY
+from signatures.errors import BundleError, ExportModelError, SourceError, UsageError, naming
+
+#: What only some sources have a use for: option, flag, and what to give to have one.
+_TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"), ("activation", "a state dictionary"))
+
+
+def fetched(path: Path) -> tuple[Fetched, Format]:
+    """What lies at ``path``, recognised and not read yet. Raises SourceError, NotAPolicyError, DamagedFileError."""
+    given = Fetched(path)
+    found = recognised(given)
+    if not found.readable and found is not BUNDLE:
+        raise not_readable(found, path)
+    return given, found
+
+
+def check_options(found: Format, path: Path, options: ReadOptions) -> None:
+    """Raise UsageError where an option was given that this kind of source has no use for."""
+    for option, fix in _TAKEN:
+        if getattr(options, option) not in (None, ()) and option not in found.takes:
+            raise UsageError(
+                f"--{option} says nothing about this source",
+                where=str(path),
+                why=f"it is {found.label}",
+                fix=f"leave --{option} out, or give {fix}",
+            )
+
+
+def read_models(given: Fetched, found: Format, options: ReadOptions) -> list[SourceModel]:
+    """The models of a source. Raises SourceError, GraphError and their kinds, UsageError."""
+    import numpy as np
+
+    with np.errstate(all="ignore"):  # weights may be any numbers
+        if found.read is not None:
+            return found.read(given, options)
+        members = [_artefact(given.path)] if found.members is None else found.members(given.path, options)
+        inside = replace(options, step=None)
+        return [model for member in members for model in _of_member(member, given, inside)]
+
+
+def _artefact(folder: Path) -> Member:
+    """The artefact that a bundle is read from, the first that can be. Raises BundleError where it was changed."""
+    bundle = Bundle.open(folder)
+    able = [f for f in FORMATS if f.main and f.read is not None]
+    found = next((f for f in able if bundle.has(f)), None)
+    if found is None:
+        raise BundleError(
+            "names no file that can be read",
+            where=str(folder / POLICY),
+            why=f"a bundle has one of {', '.join(f.main_of(bundle.name) for f in able)}",
+            fix="export the policy again",
+        )
+    bundle.verify_hashes(found)
+    made_for = bundle.contract.tool.get("profile")
+    notes = () if made_for is None else (f"the source is a bundle made with --for {made_for}",)
+    return Member(bundle.path(found), bundle.name, notes=notes, files=(folder / POLICY,))
+
+
+def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[SourceModel]:
+    """The models of one source inside of another; errors name it relative to the folder."""
+    where = member.path.relative_to(folder.path)
+    given = folder.inside(member.path)
+    found = recognised(given)
+    if found.read is None:
+        raise not_readable(found, where)
+    try:
+        models = found.read(given, options)
+    except ExportModelError as error:
+        raise (error.at(str(where)) if member.path.is_file() else error) from error.__cause__
+    return [_named(model, member) for model in models]
+
+
+def _named(model: SourceModel, member: Member) -> SourceModel:
+    facts = replace(model.facts, notes=(*model.facts.notes, *member.notes))
+    name = model.name if member.name is None else member.name
+    return replace(model, name=name, facts=facts, files=(*member.files, *model.files))
+
+
+def ports_of(path: Path) -> list[tuple[Format, Ports]]:
+    """The artefacts at ``path``, one file or folder or every format of a bundle, and what each takes and gives.
+
+    Raises SourceError where no runtime loads the format by itself, DamagedFileError, NotAPolicyError, BundleError.
+    """
+    found = recognised(Fetched(path))
+    if found is BUNDLE:
+        bundle = Bundle.open(path)
+        artefacts = [(f, _ports(f, bundle.path(f))) for f in FORMATS if f.ports is not None and bundle.has(f)]
+        if not artefacts:
+            raise SourceError("the bundle holds no model", where=str(path), fix="export the policy again")
+        return artefacts
+    if found.ports is None:
+        able = ", ".join(f.key for f in FORMATS if f.ports is not None or f is BUNDLE)
+        raise SourceError(
+            f"{found.label} cannot be compared as it is",
+            where=str(path),
+            why=f"no runtime loads it by itself; what can be compared: {able}",
+            fix="export it, and compare the bundle",
+        )
+    return [(found, _ports(found, path))]
+
+
+def _ports(found: Format, path: Path) -> Ports:
+    assert found.ports is not None
+    with naming(path):
+        return found.ports(path)

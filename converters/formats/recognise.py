@@ -1,0 +1,152 @@
+"""What a file is, by its content. File names lie: public ``.bytes`` are ``.nn``, Unity assets, Git LFS pointers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from converters.files.fetch import Fetched, unreadable
+from converters.files.file_probe import Content
+from converters.formats.checkpoint import listing
+from converters.formats.format import Format
+from converters.formats.registry import FORMATS
+from signatures.errors import NotAPolicyError, SourceError
+
+_UNITY_ASSET = (b"UnityFS", b"UnityRaw", b"UnityWeb", b"%YAML 1.1\n%TAG !u!")
+_UNPACK = "unpack it and give the model inside"
+_NOT_A_MODEL = "give a model file"
+
+
+def _marked(at: int, marks: Sequence[bytes], file: Content) -> bool:
+    return any(file.head[at : at + len(mark)] == mark for mark in marks)
+
+
+#: Key, name, advice, where the mark stands, and the marks.
+_OTHERS: tuple[tuple[str, str, str, int, *tuple[bytes, ...]], ...] = (
+    ("png", "a PNG picture", _NOT_A_MODEL, 0, b"\x89PNG\r\n"),
+    ("jpeg", "a JPEG picture", _NOT_A_MODEL, 0, b"\xff\xd8\xff"),
+    ("gif", "a GIF picture", _NOT_A_MODEL, 0, b"GIF87a", b"GIF89a"),
+    ("pdf", "a PDF document", _NOT_A_MODEL, 0, b"%PDF-"),
+    ("video", "a video", _NOT_A_MODEL, 4, b"ftyp"),
+    ("npy", "a NumPy array", "give the model that it belongs to", 0, b"\x93NUMPY"),
+    ("xz", "an xz archive", _UNPACK, 0, b"\xfd7zXZ"),
+    ("bzip2", "a bzip2 archive", _UNPACK, 0, b"BZh"),
+    ("7z", "a 7z archive", _UNPACK, 0, b"7z\xbc\xaf\x27\x1c"),
+    ("rar", "a RAR archive", _UNPACK, 0, b"Rar!\x1a"),
+    ("zstd", "a Zstandard archive", _UNPACK, 0, b"\x28\xb5\x2f\xfd"),
+    ("tar", "a tar archive", _UNPACK, 257, b"ustar"),
+    ("program", "a program or library", _NOT_A_MODEL, 0, b"\x7fELF", b"MZ\x90", b"\xcf\xfa\xed\xfe"),
+    ("sqlite", "an SQLite database", _NOT_A_MODEL, 0, b"SQLite format 3"),
+)
+#: What people give and no reader takes, the particular before the general.
+REFUSED = (
+    Format(
+        key="lfs_pointer",
+        label="a Git LFS pointer, not the model itself",
+        advice="run 'git lfs pull' in the repository it came from, or download the file through the web page",
+        sniff=lambda file: file.starts(b"version https://git-lfs"),
+    ),
+    Format(
+        key="tflite",
+        label="a TensorFlow Lite model",
+        advice="give the graph it was converted from",
+        sniff=lambda file: file.head[4:8] == b"TFL3",
+    ),
+    Format(
+        key="unity_asset",
+        label="a Unity asset, which only refers to a model or wraps it",
+        advice="give the .nn, .onnx or .bytes file itself, as it lies in the project's Assets folder",
+        sniff=lambda file: file.starts(*_UNITY_ASSET) or b"%TAG !u!" in file.head[:64],
+    ),
+    Format(
+        key="text_graph",
+        label="a graph in text form (.pbtxt)",
+        advice="save it in binary: tf.io.write_graph(..., as_text=False)",
+        sniff=lambda file: (file.text or "").startswith(("node {", "node{")),
+    ),
+    Format(
+        key="html",
+        label="a web page",
+        advice="download the raw file instead of the page that shows it",
+        sniff=lambda file: (file.text or "").lower().startswith(("<!doctype", "<html")),
+    ),
+    *(
+        Format(
+            key=key,
+            label=label,
+            advice=advice,
+            sniff=partial(_marked, at, marks),
+        )
+        for key, label, advice, at, *marks in _OTHERS
+    ),
+    Format(key="json", label="JSON", advice="give a model file", sniff=lambda file: file.json is not None),
+    Format(key="zip", label="a ZIP archive", advice=_UNPACK, sniff=lambda file: file.starts(b"PK\x03\x04")),
+    Format(key="gzip", label="a gzip archive", advice=_UNPACK, sniff=lambda file: file.starts(b"\x1f\x8b")),
+    Format(
+        key="sentis",
+        label="a Unity Sentis / Inference Engine model (.sentis)",
+        advice="Unity's runtime format cannot be read back; give the .onnx it was imported from",
+        sniff=lambda file: file.text is None and file.name.lower().endswith(".sentis"),
+    ),
+    Format(key="text", label="a text file", advice="give a model file", sniff=lambda file: file.text is not None),
+)
+UNKNOWN = Format(
+    key="unknown",
+    label="not a model in any form this tool knows",
+    advice="give a .bytes or frozen_graph_def.pb file",
+)
+
+
+def recognise(data: bytes, name: str = "") -> Format:
+    """The format that ``data`` is in; ``name`` only decides where the bytes cannot (Sentis)."""
+    content = Content(data, name)
+    return next((f for f in (*FORMATS, *REFUSED) if f.sniff is not None and f.sniff(content)), UNKNOWN)
+
+
+def recognised(given: Fetched) -> Format:
+    """The format of a file (by content) or a folder (by what lies in it). Raises SourceError, DamagedFileError.
+
+    A checkpoint's prefix (``model-1000.cptk``) is no file; it is recognised by its index.
+    """
+    path = given.path
+    try:
+        if path.is_dir() or not path.exists():
+            marked = (f for f in FORMATS if f.marker and (path / f.marker).is_file())
+            found = next(marked, None) or next((f for f in FORMATS if f.at is not None and f.at(path)), None)
+            if found is not None:
+                return found
+            if path.is_dir():
+                raise _nothing_in(path)
+    except OSError as error:
+        raise unreadable(path, error) from error
+    return recognise(given.data, path.name)
+
+
+def _nothing_in(folder: Path) -> SourceError:
+    """There is no model in a folder: what there is instead, and where one may be."""
+    inside = sorted(p.name + ("/" if p.is_dir() else "") for p in folder.iterdir())
+    shown = ", ".join(inside[:10]) + (f" and {len(inside) - 10} more" if len(inside) > 10 else "")
+    nested = listing.runs(folder)
+    if nested:
+        fix = f"give one of the folders in it: {', '.join(map(str, nested[:5]))}" + (", …" if nested[5:] else "")
+    elif any(n.startswith("rllib_checkpoint.") for n in inside):
+        fix = "it is a checkpoint of RLlib: load it there, export its module (torch.onnx.export), and give the .onnx"
+    else:
+        fix = "give a run's folder (models/<run>, results/<run>), a SavedModel, a TensorFlow.js model, or a model file"
+    return SourceError(
+        "there is no model in this folder",
+        where=str(folder),
+        why=f"it holds {shown}" if inside else "it is empty",
+        fix=fix,
+    )
+
+
+def not_readable(found: Format, path: Path) -> NotAPolicyError:
+    """The refusal of a file that no reader takes: what it looks like instead, and what to do."""
+    return NotAPolicyError(
+        f"is {found.label}" if found is not UNKNOWN else found.label,
+        where=str(path),
+        why="its content says so, whatever its name is" if found.key not in ("unknown", "sentis") else None,
+        fix=found.advice or None,
+    )

@@ -1,0 +1,43 @@
+"""The list of rooms: all that there is to register. A room's ``FORMATS`` say what it reads and writes, and how."""
+
+from __future__ import annotations
+
+import importlib
+
+from converters.formats.format import Format
+from signatures.errors import UsageError, meant
+
+#: Packages of ``converters``, in the order in which formats are recognised, written and reported.
+ROOMS = (
+    "bundle",
+    "checkpoint",
+    "frozen_graph",
+    "saved_model",
+    "tfjs",
+    "onnx",
+    "barracuda",
+    "stable_baselines3",
+    "torch_checkpoint",
+    "keras",
+)
+FORMATS: tuple[Format, ...] = tuple(
+    found for room in ROOMS for found in importlib.import_module(f"converters.formats.{room}").FORMATS
+)
+#: What can be written, by key; and what is, where nobody says what.
+WRITTEN = {f.key: f for f in FORMATS if f.write is not None}
+DEFAULTS = tuple(f.key for f in WRITTEN.values() if f.default)
+
+
+def written(key: str) -> Format:
+    """The format of a word of ``--to``. Raises UsageError."""
+    if key not in WRITTEN:
+        raise UsageError(
+            f"--to {key}: there is no such format", fix=f"{meant(key, WRITTEN)}the formats are {', '.join(WRITTEN)}"
+        )
+    return WRITTEN[key]
+
+
+def narrows(key: str) -> bool:
+    """Whether a format lacks dtypes; ``key`` may name a signature (``saved_model:deterministic``)."""
+    found = WRITTEN.get(key.partition(":")[0])
+    return found is not None and bool(found.dtypes)

@@ -1,0 +1,44 @@
+"""SavedModels: of TensorFlow 1 and 2 read, and written with ``serving_default``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.files.file_probe import Content
+    from converters.formats.saved_model import artifact as _artifact
+    from converters.formats.saved_model import source as _source
+    from converters.formats.saved_model import vetted as _vetted
+    from converters.formats.saved_model import writer as _writer
+else:
+    _artifact, _source, _vetted, _writer = deferred(__name__, "artifact", "source", "vetted", "writer")
+
+
+def _sniff(file: Content) -> bool:
+    """It begins with its version (1), which is 1, and graphs (2); an ONNX model has fields 7 and 8 beside them."""
+    if [field[:2] for field in file.fields[:2]] != [(1, 0), (2, 2)] or file.numbers & {(7, 2), (8, 2)}:
+        return False
+    return bytes(file.fields[0][2]) == b"\x01"
+
+
+FORMATS = (
+    Format(
+        key="saved_model",
+        label="a SavedModel",
+        sniff=_sniff,
+        marker="saved_model.pb",
+        read=_source.read,
+        write=_writer.write,
+        main="saved_model",
+        default=True,
+        narrow=True,
+        held=_source.held,
+        ports=_artifact.ports,
+        vetted=_vetted.vetted,
+        inner=_artifact.inner,
+        runtimes=("tensorflow",),
+        signatures=True,
+    ),
+)

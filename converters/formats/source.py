@@ -1,0 +1,90 @@
+"""What a reader returns: a graph in the TensorFlow vocabulary, and what the format says beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import field, replace
+from pathlib import Path
+from typing import Any
+
+from converters.files import tensorflow_messages as schema
+from converters.files.external_data import Detached
+from converters.files.folders import scratch_folder
+from converters.formats.frozen_graph.subgraph import check, subgraph
+from converters.graph.nodes import Graph
+from converters.policy.facts import SourceFacts
+from signatures.records import dataclass
+from signatures.spec import SourceMap
+
+
+@dataclass(frozen=True)
+class OriginalRun:
+    """How the source itself is run, for comparison: a runtime, and what its child process is told to load.
+
+    ``definition`` is the GraphDef that TensorFlow runs, as the file has it, variables apart, which are constants. It
+    is None where the child reads the file itself, within the reader's own rules (ONNX).
+    """
+
+    runtime: str
+    path: Path
+    options: Mapping[str, Any] = field(default_factory=dict)
+    definition: Any = field(default=None, repr=False, compare=False)
+    #: what of the definition lies beside it
+    detached: Detached = field(default_factory=Detached, repr=False, compare=False)
+    #: the tensors that are asked for, and those that are fed: no more of the definition is run (None: all of it)
+    asked: tuple[Collection[str], Collection[str]] | None = None
+
+    def narrowed(self, source_map: SourceMap) -> OriginalRun:
+        """The same with no more of the definition than a policy asks for, which is held against what may be run.
+
+        Raises UnsupportedOpError where an op that does more than compute hangs on it, GraphError where it is not whole.
+        """
+        if self.definition is None:
+            return self
+        asked = source_map.fetched(), source_map.fed()
+        check(self.definition, *asked)
+        return replace(self, asked=asked)
+
+    @contextmanager
+    def loadable(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """The path and the options that the child is told; what was written for it is gone afterwards."""
+        if self.definition is None:
+            yield str(self.path), self.options
+            return
+        with scratch_folder() as folder:
+            file = folder / "source.pb"
+            part = self.definition if self.asked is None else subgraph(self.definition, *self.asked)
+            schema.pieces(part, self.detached).write(file)
+            yield str(file), {"kind": "graph"}
+
+
+@dataclass(frozen=True)
+class SourceModel:
+    """One model of a source (a run folder has one per behavior; a graph may still hold several brains).
+
+    ``name`` is the policy's name where the path does not give it; ``files`` are the files that were read, for the
+    hash of the source. ``original`` is None where no runtime reads the source (a ``.nn``). ``producer`` is what the
+    file says of the tool that wrote it, and in which version of the format.
+    """
+
+    graph: Graph
+    files: tuple[Path, ...]
+    facts: SourceFacts = field(default_factory=SourceFacts)
+    name: str | None = None
+    original: OriginalRun | None = None
+    producer: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
+    order, lists of entities [most, numbers], images C, H, W (empty: as far as the source tells); whether a source may
+    be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers.
+    """
+
+    step: int | None = None
+    sensors: tuple[tuple[int, ...], ...] = ()
+    trust_source: bool = False
+    goals: tuple[int, ...] = ()
+    activation: str | None = None

@@ -1,0 +1,23 @@
+"""Saved models of Stable-Baselines3 and sb3-contrib (``.zip``), and their unpacked folders."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.formats.stable_baselines3 import source as _source
+else:
+    (_source,) = deferred(__name__, "source")
+
+FORMATS = (
+    Format(
+        key="stable_baselines3",
+        label="a saved model of Stable-Baselines3 (.zip)",
+        sniff=lambda file: {"data", "policy.pth"} <= set(file.entries),
+        marker="policy.pth",
+        read=_source.read,
+        takes=frozenset({"activation"}),
+    ),
+)

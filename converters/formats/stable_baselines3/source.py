@@ -1,0 +1,59 @@
+"""A saved model of Stable-Baselines3 as a source: ``data`` (JSON) and ``policy.pth`` (PyTorch's archive) of its ZIP.
+
+Source: stable_baselines3/common/save_util.py. Values that JSON lacks stand in ``data`` as a pickle in base64, with
+their attributes as text beside it: the text is read, the pickle never. The archive is looked into and never unpacked to
+disk; what its two entries may unfold to is bounded by the file.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from converters.files.fetch import Fetched
+from converters.files.file_probe import json_in
+from converters.files.torch_archive import Archive
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
+from converters.formats.source import ReadOptions, SourceModel
+from converters.trainers.stable_baselines3.policy import to_graph
+from signatures.errors import DamagedFileError, NotAPolicyError
+
+_DATA, _POLICY = "data", "policy.pth"
+#: Stable-Baselines3 does not compress; a ZIP that was packed again shrinks JSON to a tenth, weights hardly.
+_MOST, _MOST_ADDED = 64, 64 << 20
+_COPY_AGAIN = "copy or download it again"
+
+
+def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
+    """The one policy of a saved model, or of the folder that it was unpacked to.
+
+    Raises NotAPolicyError, SourceError for a network that is not built, DamagedFileError, UsageError.
+    """
+    if given.path.is_dir():
+        files = tuple(given.path / name for name in (_DATA, _POLICY))
+        data, policy = (given.bytes_of(file) for file in files)
+    else:
+        files = (given.path,)
+        data, policy = _entries(given.data)
+    try:
+        content: Any = json_in(data)
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError("its data is not JSON", why=str(error)[:200], fix=_COPY_AGAIN) from error
+    if not isinstance(content, dict):
+        raise DamagedFileError("its data is no JSON object", why="what was saved is one", fix=_COPY_AGAIN)
+    archive = Archive(policy)
+    if not isinstance(archive.value, dict):
+        raise NotAPolicyError(
+            "its policy.pth is no state dictionary", why="model.save writes one", fix="save the model again: model.save"
+        )
+    graph, facts = to_graph(content, archive, archive.value, options.activation)
+    return [SourceModel(graph, files, facts)]
+
+
+def _entries(data: bytes) -> list[bytes]:
+    """``data`` and ``policy.pth`` of an archive. Raises DamagedFileError."""
+    try:
+        with opened(data) as archive:
+            most = min(_MOST * len(data), len(data) + _MOST_ADDED)
+            return [entry_of(archive, name, most) for name in (_DATA, _POLICY)]
+    except ZIP_ERRORS as error:
+        raise DamagedFileError(f"its archive cannot be read: {error}", why="it is damaged", fix=_COPY_AGAIN) from error

@@ -1,0 +1,41 @@
+"""TensorFlow.js models: graphs read from any converter, and written; layers models read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.formats.tfjs import artifact as _artifact
+    from converters.formats.tfjs import reader as _reader
+    from converters.formats.tfjs import source as _source
+    from converters.formats.tfjs import writer as _writer
+else:
+    _artifact, _reader, _source, _writer = deferred(__name__, "artifact", "reader", "source", "writer")
+
+FORMATS = (
+    Format(
+        key="tfjs",
+        label="a TensorFlow.js model",
+        sniff=lambda file: "modelTopology" in (file.json or {}),
+        marker="model.json",
+        at=lambda path: path.is_dir() and _reader.model_file(path).is_file(),
+        read=_source.read,
+        write=_writer.write,
+        main="tfjs",
+        default=True,
+        narrow=True,
+        held=_reader.held,
+        ports=_artifact.ports,
+        vetted=_artifact.vetted,
+        inner=_artifact.inner,
+        runtimes=(
+            *("tfjs-cpu", "tfjs-wasm", "tfjs-webgl"),
+            *("tfjs-cpu@chromium", "tfjs-wasm@chromium"),
+            "js",
+        ),
+        predicts=True,
+        dtypes=frozenset({"float32", "int32", "bool"}),
+    ),
+)

@@ -1,0 +1,31 @@
+"""PyTorch checkpoints (``.pt``): of ML-Agents, rsl_rl, CleanRL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.files.file_probe import Content
+    from converters.formats.torch_checkpoint import source as _source
+else:
+    (_source,) = deferred(__name__, "source")
+
+
+def _sniff(file: Content) -> bool:
+    """A pickle, alone or in an archive."""
+    return file.starts(b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05") or any(
+        name.endswith("data.pkl") for name in file.entries
+    )
+
+
+FORMATS = (
+    Format(
+        key="torch_checkpoint",
+        label="a PyTorch checkpoint (.pt)",
+        sniff=_sniff,
+        read=_source.read,
+        takes=frozenset({"sensors", "activation"}),
+    ),
+)

@@ -1,0 +1,279 @@
+"""The policies of a graph: their scopes, their outputs, their constants.
+
+Names are tried first (they are ML-Agents' own), then structure; what neither decides is an error that lists the
+candidates.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import field, replace
+
+import numpy as np
+
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
+from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
+from converters.policy.memories import looks_like_state
+from signatures.errors import NotAPolicyError, SignatureError, UsageError
+from signatures.records import dataclass
+from signatures.roles import (
+    ACTION_NAMES,
+    CANONICAL,
+    CONSTANT_NAMES,
+    LISTED_CONSTANTS,
+    OUTPUT_NAMES,
+    OUTPUT_ROLES,
+    Constant,
+    Role,
+)
+
+#: Names that inputs get; an output is called otherwise, since both may be nodes of one graph.
+INPUT_NAMES = ("state", "epsilon", "action_masks", "prev_action", "recurrent_in")
+_NUMBERED = re.compile(r"(state|observation|entities|epsilon)_\d+")
+#: A constant that lists sizes has no more of them.
+_MAX_LISTED = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """One action of a policy: its name in the source, and its canonical name (hybrid policies have two)."""
+
+    base: str
+    name: str
+
+    @property
+    def deterministic(self) -> str:
+        """The name of the same action without chance."""
+        return f"deterministic_{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Brain:
+    """One policy of a graph: its scope (``""`` or ``"GoalieBrain/"``) and where its outputs are."""
+
+    scope: str
+    #: (output's name in the source, its role, its tensor), in graph order
+    outputs: tuple[tuple[str, Role, str], ...]
+    constants: Mapping[str, Constant] = field(default_factory=dict)
+    #: tensors that nothing reads and that could be outputs too, in a graph whose names say nothing
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """The scope without its slash."""
+        return self.scope.rstrip("/")
+
+    @property
+    def heads(self) -> tuple[Head, ...]:
+        """The actions. Beside ``action``, outputs called by kind are duplicates; two kinds without it are a hybrid."""
+        bases = [base for base, role, _ in self.outputs if role is Role.ACTION]
+        if "action" in bases:
+            return (Head("action", "action"),)
+        if {"continuous_actions", "discrete_actions"} <= set(bases):
+            return (Head("continuous_actions", "continuous_actions"), Head("discrete_actions", "discrete_actions"))
+        return (Head(bases[0], "action"),)
+
+    @property
+    def canonical(self) -> dict[str, str]:
+        """Output's name in the source → canonical name; duplicates of the action are left out."""
+        heads = self.heads
+        names = {h.base: h.name for h in heads}
+        for base, role, _ in self.outputs:
+            if role is Role.DETERMINISTIC:
+                own = next((h for h in heads if base == f"deterministic_{h.base}"), None)
+                if own is not None or base == "deterministic_action":
+                    names[base] = heads[0].deterministic if own is None else own.deterministic
+            elif role is not Role.ACTION:
+                names[base] = CANONICAL.get(role, base)
+        return names
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        """The tensors that the policy computes."""
+        return tuple(reference for _, _, reference in self.outputs)
+
+
+def find_brains(
+    graph: Graph, wanted: Mapping[str, Role] | None = None, declared: Mapping[str, Role | None] | None = None
+) -> tuple[Brain, ...]:
+    """The policies in a graph, in graph order.
+
+    ``wanted`` (source output name → role, from ``--output``) decides instead of names. ``declared`` are the outputs
+    that the format names, with their roles where it knows them. Raises NotAPolicyError when
+    there is nothing that depends on a placeholder, SignatureError when several nodes could be the action.
+    """
+    if wanted:
+        return _chosen(graph, wanted, declared)
+    fed = depends_on_input(graph)
+    given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
+    if Role.ACTION in given.values():
+        outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
+        scope = _scope_of(graph, [n for n, role in given.items() if role is Role.ACTION])
+        rest = [n for n in declared or () if n in fed and n not in given]
+        return (Brain(scope, (*outputs, *_others(outputs, rest)), _constants(graph, scope)),)
+    if declared:
+        fed &= set(declared)
+    scopes: dict[str, int] = {}
+    for node in graph.nodes:
+        scope, _, base = node.name.rpartition("/")
+        if base in ACTION_NAMES and node.name in fed and not is_fed(node):
+            scopes[f"{scope}/" if scope else ""] = node.name.count("/")
+    if scopes:
+        depth = min(scopes.values())
+        return tuple(_brain(graph, scope, fed) for scope, d in scopes.items() if d == depth)
+    return (_unnamed(graph, fed, set(declared or ()), given),)
+
+
+def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
+    found: dict[str, Constant] = {}
+    for name in CONSTANT_NAMES:
+        node = graph.get(scope + name)
+        value = graph.constant(node.name) if node is not None else None
+        if value is None or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
+            continue
+        if value.size == 1:
+            number = value.reshape(()).item()
+            found[name] = int(number) if float(number).is_integer() else float(number)
+        elif name in LISTED_CONSTANTS and 0 < value.size <= _MAX_LISTED:
+            found[name] = [int(number) for number in value.reshape(-1).tolist()]
+    return found
+
+
+def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
+    outputs = []
+    for node in graph.nodes:
+        base = node.name[len(scope) :]
+        named = node.name.startswith(scope) and base in OUTPUT_NAMES
+        if named and node.name in fed and not is_fed(node):
+            outputs.append((base, OUTPUT_NAMES[base], node.name))
+    return Brain(scope, tuple(outputs), _constants(graph, scope))
+
+
+def depends_on_input(graph: Graph, left_out: Callable[[Node], bool] = lambda node: False) -> set[str]:
+    """Names of nodes downstream of a placeholder (parameters included), not by way of those that are ``left_out``."""
+    fed: set[str] = set()
+    count = -1
+    loops = any(CONTROL_FLOW.get(n.op) == "next_iteration" for n in graph.nodes)
+    while count != len(fed):  # a loop hands back what stands behind
+        count = len(fed)
+        for node in graph.nodes:
+            if is_fed(node) or (not fed.isdisjoint(map(node_of, node.inputs)) and not left_out(node)):
+                fed.add(node.name)
+        if not loops:
+            break
+    return fed
+
+
+def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None) -> tuple[Brain, ...]:
+    outputs: list[tuple[str, Role, str]] = []
+    for name, role in wanted.items():
+        node_name, _ = split_ref(name)
+        if node_name not in graph:
+            raise UsageError(
+                f"--output names {name!r}, which is not in the graph",
+                why=close_names(node_name, [n.name for n in graph.nodes]),
+                fix="export-model inspect FILE lists the outputs that were found",
+            )
+        if role not in OUTPUT_ROLES:
+            roles = ", ".join(OUTPUT_ROLES)
+            raise UsageError(f"--output {name}={role}: that is not an output's role", fix=f"one of: {roles}")
+        outputs.append((node_name.rsplit("/", 1)[-1], role, normal_ref(name)))
+    if any(role is Role.ACTION for _, role, _ in outputs):
+        scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
+        return (Brain(scope, tuple(outputs), _constants(graph, scope)),)
+    # Naming one output is enough to say that the rest is where it always is.
+    named = {reference for _, _, reference in outputs}
+    rest = {n: role for n, role in (declared or {}).items() if n not in named}
+    brains = find_brains(graph, declared=rest or declared)
+    owners = [
+        max((b for b in brains if o[2].startswith(b.scope)), key=lambda b: len(b.scope), default=brains[0])
+        for o in outputs
+    ]
+    return tuple(
+        replace(
+            brain,
+            outputs=(
+                *(o for o, owner in zip(outputs, owners, strict=True) if owner is brain),
+                *(o for o in brain.outputs if o[2] not in named),
+            ),
+        )
+        for brain in brains
+    )
+
+
+def _scope_of(graph: Graph, names: Sequence[str]) -> str:
+    """The scope of a brain whose outputs are ``names``: the one they share, if a placeholder is in it, too."""
+    parents = {name.rpartition("/")[0] for name in names}
+    scope = f"{parents.pop()}/" if len(parents) == 1 else "/"
+    return scope if any(is_fed(n) and n.name.startswith(scope) for n in graph.nodes) else ""
+
+
+def close_names(name: str, names: Sequence[str]) -> str | None:
+    """What may have been meant by a name that is not there."""
+    import difflib
+
+    near = difflib.get_close_matches(name, names, n=3)
+    return f"close to it: {', '.join(near)}" if near else None
+
+
+def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role]) -> Brain:
+    """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
+    read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
+    fed = fed - set(known)
+    sinks = [n for n in graph.nodes if n.name not in read and n.name in fed and not is_fed(n)]
+    if not sinks:
+        raise NotAPolicyError(
+            "there is no policy in this graph",
+            why="no node depends on a placeholder, so nothing is computed from an observation",
+            fix="give the frozen graph of the policy, or name its output with --output NAME=action",
+        )
+    likely = [n for n in sinks if re.search(r"action|policy|^pi$|/pi$", n.name.lower())]
+    chosen = sinks if len(sinks) == 1 else likely
+    if declared and not chosen:  # where no name says anything: the one output that is a choice
+        chosen = [n for n in sinks if _is_choice(graph, n)]
+    if len(chosen) != 1:
+        shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
+        raise SignatureError(
+            "no policy found: it is not clear which output is the action",
+            why=f"no node is called 'action'; candidates are {shown}",
+            fix="name them: --output NAME=action (and, if it has them, --output NAME=value_estimate …)",
+        )
+    node = chosen[0]
+    output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
+    outputs = (output, *((name.rsplit("/", 1)[-1], role, name) for name, role in known.items()))
+    rest = [n.name for n in sinks if n is not node]
+    if declared:
+        return Brain("", (*outputs, *_others(outputs, rest)), _constants(graph, ""))
+    return Brain("", outputs, _constants(graph, ""), tuple(rest))
+
+
+def _is_choice(graph: Graph, node: Node) -> bool:
+    while passes_on(node) or node.op == "Cast":
+        node = graph.producer(node.inputs[0])
+    return node.op == "ArgMax" or traits(node).sampler == "categorical"
+
+
+def _others(outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str]) -> list[tuple[str, Role, str]]:
+    """Outputs that the format declares and no name explains: kept as they are, under names that nothing else has.
+
+    Raises SignatureError where one looks like a memory: a policy that forgets is another policy.
+    """
+    taken = {*INPUT_NAMES, *CANONICAL.values(), *OUTPUT_NAMES, *(base for base, _, _ in outputs)}
+    found = []
+    for name in rest:
+        if looks_like_state(name):
+            raise SignatureError(
+                f"the output {name!r} looks like a memory, and it is not clear which input it is fed back to",
+                why="a pair agrees in name and shape (h_in and h_out); without its memory the policy acts otherwise",
+                fix=f"--input NAME=memory_in --output {name}=memory_out, or --output {name}=other if it is none",
+            )
+        wish = name.rsplit("/", 1)[-1]
+        wish = f"output_{wish}" if wish.isdigit() or wish in taken or _NUMBERED.fullmatch(wish) else wish
+        base, number = wish, 0
+        while base in taken:
+            number += 1
+            base = f"{wish}_{number}"
+        taken.add(base)
+        found.append((base, Role.OTHER, name))
+    return found

@@ -1,0 +1,1 @@
+"""Trainers' networks rebuilt from a state dictionary, one recipe each."""

@@ -1,0 +1,1 @@
+"""ML-Agents' PyTorch networks, rebuilt from their weights."""

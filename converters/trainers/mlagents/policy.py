@@ -1,0 +1,305 @@
+"""An actor's state dictionary as a graph: which generation it is of, and its parts put together as that computes them.
+
+Source: mlagents/trainers/torch_entities/{networks,action_model,model_serialization}.py of 1.1.0, trainers/torch/…
+before 0.30. What the weights say of a generation:
+
+======== ============================================================================================
+0.20     ``distribution.*`` and a step counter of floats (0.20, 0.21); the same lists as 0.22
+0.22     ``distribution.*``; vectors joined before images (``vector_processors``, ``visual_processors``)
+0.23     ``action_model.*``, the same lists
+0.24     ``processors``, one list in the order of the sensors; attention over lists of entities
+0.25     the list in an ``observation_encoder``, and again beside it
+0.26     ``version_number`` 3, ``_body_endoder`` in place of ``linear_encoder``; the same up to 1.1
+======== ============================================================================================
+
+What they do not say is fixed: the activation (Swish), the clip of a continuous action (±3, divided by 3) for PPO and
+POCA (none at all in 0.20 and 0.21), tanh for SAC, which alone has a deviation that depends on the observation
+(``log_sigma.weight``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.graph.nn.activations import clip, leaky_relu, swish
+from converters.graph.nodes import Graph
+from converters.policy.facts import SourceFacts
+from converters.policy.generations import TORCH_VERSION_3
+from converters.trainers.mlagents.body import attended, body_width, goal_width, hidden_layers
+from converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
+from converters.trainers.mlagents.state import LET_IT_EXPORT, State
+from converters.trainers.pytorch.activations import LEAKY_SLOPE
+from converters.trainers.pytorch.network import Network
+from converters.trainers.pytorch.weights import pytorch_alone
+from signatures.errors import SourceError
+from signatures.records import dataclass
+
+_BODY = "network_body"
+#: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.
+_FACTS = (
+    "is_continuous_int",
+    "act_size_vector",
+    "continuous_act_size_vector",
+    "discrete_act_size_vector",
+    "memory_size_vector",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Generation:
+    """Where things are in the state dictionary, and which versions put them there."""
+
+    span: str
+    version: int
+    #: module lists of the sensors, in the order in which the first layer reads them
+    lists: tuple[str, ...]
+    body: str
+    #: what holds the attention over entities
+    encoder: str
+    continuous: str
+    discrete: str
+    #: 0.20 and 0.21: no clip, other masks
+    preview: bool = False
+
+    @property
+    def by_sensor(self) -> bool:
+        """Whether each sensor is an input (``obs_0``, …)."""
+        return self.version >= TORCH_VERSION_3
+
+    @property
+    def first(self) -> bool:
+        """Whether the action is not named by its kind (0.22)."""
+        return self.continuous == "distribution"
+
+
+def _generation(state: State) -> _Generation:
+    """What wrote the checkpoint. Raises SourceError for what is not read, by its name."""
+    version = int(np.clip(np.nan_to_num(state.number("version_number")), 0, 99))
+    body = f"{_BODY}._body_endoder" if state.under(f"{_BODY}._body_endoder.") else f"{_BODY}.linear_encoder"
+    encoder = f"{_BODY}.observation_encoder" if state.under(f"{_BODY}.observation_encoder.rsa.") else _BODY
+    preview = state.step_is_float
+    if state.under("distribution."):
+        heads = ("distribution", "distribution")
+    else:
+        heads = ("action_model._continuous_distribution", "action_model._discrete_distribution")
+    two: tuple[str, ...] = (f"{_BODY}.vector_processors.", f"{_BODY}.visual_processors.")
+    one: tuple[str, ...] = (f"{_BODY}.processors.",)
+    if version >= TORCH_VERSION_3:
+        span, lists = "0.26-1.1", one
+    elif heads[0] == "distribution":
+        span, lists = "0.20-0.21" if preview else "0.22", two
+    elif state.indices(two[0]) or state.indices(two[1]):
+        span, lists = "0.23", two
+    elif state.indices(f"{_BODY}.observation_encoder.processors."):
+        span, lists = "0.25", one
+    elif state.indices(f"{_BODY}.processors."):
+        span, lists = "0.24", one
+    else:
+        span, lists = "0.23-0.25", one
+    return _Generation(span, version, lists, body, encoder, *heads, preview=preview and heads[0] == "distribution")
+
+
+def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int] = ()) -> tuple[Graph, SourceFacts]:
+    """The policy and what is known of it. ``told`` are the shapes of the sensors, where the user gives them, ``goals``
+    the places of those that are goals.
+
+    Raises SourceError and its kinds, UsageError.
+    """
+    generation = _generation(state)
+    state.forget(f"{_BODY}.observation_encoder.processors.")  # the same modules as processors
+    state.forget(*_FACTS)
+    width, condition = body_width(state, generation.body), goal_width(state, generation.body)
+    sensors, joined = find_sensors(state, generation.lists, generation.encoder, width, told)
+    goals = find_goals(state, sensors, condition, goals, joined=joined)
+    net = Network(state)
+    x, goal = _observed(net, generation, sensors, goals)
+    x = hidden_layers(net, x, goal, generation.body)
+    memory = None
+    if f"{_BODY}.lstm.lstm.weight_hh_l0" in state:
+        size = 2 * state.length(f"{_BODY}.lstm.lstm.weight_hh_l0", -1)
+        x, memory = net.lstm(x, net.input("recurrent_in", 1, size), f"{_BODY}.lstm.lstm")
+    net.fact("version_number", np.array([generation.version]))
+    net.fact("memory_size", np.array([0 if memory is None else net.width(memory)]))
+    names, conditional = _actions(net, generation, x)
+    trainer = _trainer(state, conditional)
+    if memory is not None:
+        net.output("recurrent_out", memory)
+        names.append("recurrent_out")
+    state.check_all_read()
+    facts = SourceFacts(
+        family=f"ML-Agents {generation.span} (PyTorch)",
+        algorithm=trainer,
+        image_layout="NCHW",
+        memory_layout=() if memory is None else ("h", "c"),
+        outputs=dict.fromkeys(("version_number", "memory_size", *names)),
+        notes=tuple(_notes(generation, sensors, joined, guessed=trainer is None and conditional is True)),
+    )
+    return net.graph(), facts
+
+
+def _trainer(state: State, conditional: bool | None) -> str | None:
+    """Which trainer saved the checkpoint, by its optimizers' names; None where none is saved with it.
+
+    ``conditional``: whether the deviation depends on the observation (None: no continuous action). Raises SourceError
+    where both contradict each other: whether tanh or a clip bounds the action is known of ML-Agents' trainers only.
+    """
+    optimizers = {m.removeprefix("Optimizer").removeprefix(":") for m in state.modules if m.startswith("Optimizer")}
+    if not optimizers:
+        return None
+    trainer = "SAC" if "entropy_optimizer" in optimizers else "POCA" if "adam" in optimizers else "PPO"
+    if conditional is not None and conditional != (trainer == "SAC"):
+        raise SourceError(
+            "the checkpoint does not tell what bounds its continuous action: a clip, or tanh",
+            why=f"its optimizers ({', '.join(sorted(optimizers))}) and its deviation are of different trainers; "
+            "a plugin may have trained it",
+            fix=LET_IT_EXPORT,
+        )
+    return trainer
+
+
+def _notes(generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, guessed: bool) -> list[str]:
+    notes = [pytorch_alone("ML-Agents", "a checkpoint")]
+    if guessed:
+        notes.append("its deviation depends on the observation, as SAC's alone does: tanh is taken to bound its action")
+    if joined and generation.by_sensor:
+        size = next(s.shape[0] for s in sensors if len(s.shape) == 1)
+        notes.append(
+            f"the checkpoint does not tell how many vector sensors the {size} numbers come from; they are one input, "
+            "in the order of the sensors"
+        )
+    return notes
+
+
+# ------------------------------------------------------------------ observations
+
+
+def _observed(
+    net: Network, generation: _Generation, sensors: Sequence[Sensor], goals: Sequence[int]
+) -> tuple[str, str | None]:
+    """All sensors, encoded and joined: what the first layer reads; and the goals alone, where there are some."""
+    vectors = [s for s in sensors if len(s.shape) == 1]
+    shared = None
+    if vectors and not generation.by_sensor:
+        shared = net.input("vector_observation", sum(s.shape[0] for s in vectors))
+    parts: dict[int, str] = {}
+    entities: list[tuple[str, str]] = []
+    start = images = 0
+    for index, sensor in enumerate(sensors):
+        image = len(sensor.shape) == 3
+        if len(sensor.shape) == 2:
+            assert sensor.module is not None
+            entities.append((sensor.module, net.input(f"obs_{index}", *sensor.shape)))
+            continue
+        if generation.by_sensor:
+            x = net.input(f"obs_{index}", *sensor.shape)
+        elif image:
+            x = net.input(f"visual_observation_{images}", *sensor.shape)
+        else:
+            assert shared is not None
+            net.at(sensor.module or _BODY)
+            whole = len(vectors) == 1
+            x = shared if whole else net.slice(shared, 1, start, start + sensor.shape[0])
+            start += sensor.shape[0]
+        images += image
+        if image and sensor.module is not None:
+            x = _image(net, x, sensor.module)
+        elif sensor.module is not None:
+            x = net.normalised(x, f"{sensor.module}.normalizer")
+        parts[index] = x
+    net.at(_BODY)
+    columns = [net.concat(list(parts.values()), 1)] if parts else []
+    if entities:
+        columns.append(attended(net, columns[0] if columns else None, entities, generation.encoder))
+    net.at(_BODY)
+    return net.concat(columns, 1), net.concat([parts[i] for i in goals], 1) if goals else None
+
+
+def _image(net: Network, x: str, module: str) -> str:
+    """A visual encoder on an image [B, C, H, W]: its features [B, hidden]."""
+    state = net.state
+    encoder = encoder_of(state, module)
+    assert encoder is not None
+    net.at(module)
+    if encoder.key == "fully_connected":
+        flat = net.reshape(x, (-1, math.prod(net.length(x, axis) for axis in (1, 2, 3))))
+    elif encoder.key == "resnet":
+        flat = _resnet(net, net.nhwc(x), f"{module}.sequential")
+        return net.add("Relu", [net.linear(flat, dense_name(state, module))])
+    else:
+        image = net.nhwc(x)
+        for index, (_, stride) in enumerate(encoder.windows):
+            image = leaky_relu(net, net.convolution(image, f"{module}.conv_layers.{2 * index}", stride), LEAKY_SLOPE)
+        flat = net.flat(image)
+    return leaky_relu(net, net.linear(flat, dense_name(state, module)), LEAKY_SLOPE)
+
+
+def _resnet(net: Network, image: str, module: str) -> str:
+    """Three stacks of a convolution, a pool and two residual blocks; a Swish at the end."""
+    for stack in range(3):
+        first = 4 * stack
+        image = net.max_pool(net.convolution(image, f"{module}.{first}", 1, "SAME"))
+        for block in (first + 2, first + 3):
+            inner = net.convolution(swish(net, image), f"{module}.{block}.layers.1", 1, "SAME")
+            inner = net.convolution(swish(net, inner), f"{module}.{block}.layers.3", 1, "SAME")
+            image = net.add("Add", [image, inner])
+    return net.flat(swish(net, image))
+
+
+# ------------------------------------------------------------------ actions
+
+
+def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], bool | None]:
+    """The outputs that act, by the names of the generation; and whether the continuous ones' deviation depends on the
+    observation (None: there are none). Then they are SAC's, and tanh bounds them.
+    """
+    names: list[str] = []
+    squashed: bool | None = None
+    made: dict[str, str] = {}
+    if f"{generation.continuous}.mu.weight" in net.state:
+        mean, draw, squashed = net.gaussian(x, generation.continuous)
+        if squashed:
+            value = net.add("Tanh", [draw])
+        else:
+            value = draw if generation.preview else net.add("RealDiv", [clip(net, draw, -3, 3), net.floats(3)])
+        made["continuous"] = value
+        size = net.width(mean)
+        if not generation.first:
+            net.output("continuous_actions", value)
+            net.fact("continuous_action_output_shape", np.array([size]))
+            names += ["continuous_actions", "continuous_action_output_shape"]
+    branches = [f"{generation.discrete}.branches.{i}" for i in net.state.indices(f"{generation.discrete}.branches.")]
+    if branches:
+        value, sizes = _discrete(net, generation, x, branches)
+        made["discrete"] = value
+        if not generation.first:
+            net.output("discrete_actions", value)
+            shape = np.array([sizes]) if generation.by_sensor else np.array([sum(sizes)])
+            net.fact("discrete_action_output_shape", shape)
+            names += ["discrete_actions", "discrete_action_output_shape"]
+    if not made:
+        raise net.state.damaged("its Policy has no action", "neither a mean nor a branch is in it")
+    if not generation.by_sensor and len(made) == 1:  # 0.22 to 0.25 called the one action by its old name, too
+        kind, value = next(iter(made.items()))
+        net.output("action", value)
+        net.fact("is_continuous_control", np.array([kind == "continuous"]))
+        net.fact("action_output_shape", np.array([net.width(value)]))
+        names = ["action", "is_continuous_control", "action_output_shape", *names]
+    return names, squashed
+
+
+def _discrete(net: Network, generation: _Generation, x: str, branches: Sequence[str]) -> tuple[str, list[int]]:
+    """Up to 0.25 log-probabilities [B, ΣB], from 0.26 on drawn actions [B, branches] (int64); and the branch sizes."""
+    sizes = [net.state.length(f"{b}.weight", 0) for b in branches]
+    masks = net.input("action_masks", sum(sizes))
+    parts, start = [], 0
+    for branch, size in zip(branches, sizes, strict=True):
+        probs = net.branch(x, branch, masks, start, twice=generation.first, preview=generation.preview)
+        start += size
+        if generation.by_sensor:
+            parts.append(net.choice(net.add("Log", [probs])))
+        else:
+            parts.append(net.add("Log", [probs]) if generation.preview else net.log(probs))
+    return net.concat(parts, 1), sizes

@@ -1,0 +1,1 @@
+"""What the recipes of PyTorch trainers share: weights, layers, activations."""

@@ -1,0 +1,131 @@
+"""Checkpoints of rsl_rl (``model_<n>.pt``; legged_gym, Isaac Lab): an actor, its normaliser, its memory.
+
+Source: rsl_rl/modules/{actor_critic,actor_critic_recurrent,student_teacher,normalizer,normalization}.py and
+runners/on_policy_runner.py of 2.3 and 3.1; rsl_rl/models/*.py and algorithms/ppo.py of 5.5. The policy is what
+``act_inference`` gives, the mean; its deviation stands beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from converters.files.torch_archive import Archive
+from converters.graph.nn.activations import Activation
+from converters.graph.nodes import Graph
+from converters.graph.types import FLOAT32
+from converters.policy.facts import SourceFacts
+from converters.trainers.pytorch.network import Network
+from converters.trainers.pytorch.weights import Weights, pytorch_alone
+from signatures.records import dataclass
+from signatures.roles import Role
+
+USUAL = "rsl_rl's default is elu"
+EXPORT_ONNX = "export the policy to ONNX in its own project (rsl_rl's exporter, torch.onnx.export), and give that"
+#: Added to the deviation by ``EmpiricalNormalization``.
+_EPSILON = 1e-2
+_NORMALISER = "obs_norm"
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Where things are: under which key of the checkpoint, and the modules in it."""
+
+    key: str
+    actor: str
+    memory: str
+    normaliser: str
+    deviation: str = "std"
+    log_deviation: str = "log_std"
+
+
+_NEW = ("mlp", "rnn.rnn", "obs_normalizer", "distribution.std_param", "distribution.log_std_param")
+_LAYOUTS = (
+    _Layout("model_state_dict", "actor", "memory_a.rnn", "actor_obs_normalizer"),
+    _Layout("model_state_dict", "student", "memory_s.rnn", "student_obs_normalizer"),
+    _Layout("actor_state_dict", *_NEW),
+    _Layout("student_state_dict", *_NEW),
+)
+_TRAINING = ("critic", "memory_c.", "teacher", "memory_t.", "distribution.distribution")
+
+
+def layout_of(value: Any) -> _Layout | None:
+    """Where the policy is in a checkpoint; None where it is none of rsl_rl's."""
+    for layout in _LAYOUTS:
+        state = value.get(layout.key) if isinstance(value, dict) else None
+        if isinstance(state, dict) and f"{layout.actor}.0.weight" in state:
+            return layout
+    return None
+
+
+def to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts]:
+    """The policy and what is known of it. Raises SourceError for parts that are not known, DamagedFileError."""
+    state: Mapping[Any, Any] = archive.value[layout.key]
+    beside = archive.value.get("obs_norm_state_dict")
+    if isinstance(beside, dict):  # up to 2.3
+        state = {**state, **{f"{_NORMALISER}.{k}": v for k, v in beside.items()}}
+    weights = Weights(archive, state, holder="its policy", maker="rsl_rl", fix=EXPORT_ONNX)
+    weights.forget(*_TRAINING)
+    net = Network(weights)
+    recurrent = f"{layout.memory}.weight_ih_l0" in weights
+    first = f"{layout.memory}.weight_ih_l0" if recurrent else f"{layout.actor}.0.weight"
+    x = net.input("obs", weights.length(first, 1))
+    for module in (layout.normaliser, _NORMALISER):
+        x = _normalised(net, x, module)
+    memory: tuple[str, ...] = ()
+    if recurrent:
+        x, memory = net.remembering(x, layout.memory)
+    mean = net.mlp(x, layout.actor, activation, ends=True)
+    net.output("action", mean)
+    outputs = {"action": Role.ACTION, **({"recurrent_out": Role.MEMORY_OUT} if memory else {})}
+    outputs |= _deviation(net, mean, layout)
+    weights.check_all_read()
+    facts = SourceFacts(
+        family="rsl_rl",
+        memory_layout=memory,
+        outputs=outputs,
+        notes=(
+            pytorch_alone("rsl_rl"),
+            "the action is the mean, as rsl_rl's act_inference gives it; what the environment does with it (scales, "
+            "offsets, clips) is not in the file",
+        ),
+    )
+    return net.graph(), facts
+
+
+def _normalised(net: Network, x: str, module: str) -> str:
+    """``EmpiricalNormalization``: (x − mean) / (deviation + 0.01); x where there is none."""
+    state = net.state
+    if f"{module}._mean" not in state:
+        return x
+    mean, deviation = (
+        state.array(f"{module}.{k}", *(1,) * (len(state.shape(f"{module}.{k}")) - 1), net.width(x)).reshape(-1)
+        for k in ("_mean", "_std")
+    )
+    state.forget(f"{module}._var", f"{module}.count")
+    net.at(module)
+    centred = net.add("Sub", [x, net.const(mean, "mean")])
+    return net.add("RealDiv", [centred, net.const((deviation + FLOAT32.type(_EPSILON)).astype(FLOAT32), "deviation")])
+
+
+def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
+    """The deviation of the action, a row per agent; its logarithm where that is what is learned."""
+    for module, name, role in (
+        (layout.deviation, "action_std", Role.STD),
+        (layout.log_deviation, "action_log_std", Role.LOG_STD),
+    ):
+        if module in net.state:
+            per_action(net, mean, net.state.array(module, net.width(mean)), name)
+            return {name: role}
+    raise net.state.damaged(
+        "its policy has no deviation of its own",
+        "it has none, or one that depends on the observation, or is no Gaussian: which, the weights do not tell",
+    )
+
+
+def per_action(net: Network, mean: str, values: np.ndarray, name: str) -> None:
+    """An output that is the same for every agent: one number per action, a row per agent."""
+    net.at(name)
+    net.output(name, net.add("Add", [net.add("ZerosLike", [mean]), net.const(values, "value")]))

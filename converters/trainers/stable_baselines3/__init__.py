@@ -1,0 +1,1 @@
+"""Stable-Baselines3's policies, rebuilt from their description and weights."""
