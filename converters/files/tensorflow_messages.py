@@ -19,7 +19,7 @@ from converters.files.external_data import LARGE_FILE, Detached, Fields
 from converters.files.message_limits import check_size
 from converters.files.protobuf_messages import message_classes
 from converters.files.wire_format import varint
-from converters.graph.types import DATA_TYPES
+from signatures.dtypes import DATA_TYPES
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Nodes of a file, training part and functions included.

@@ -31,7 +31,7 @@ class Runtime:
 
     What it loads of a bundle, each format says (``Format.runtimes``).
     ``find`` says whether it is here, without importing it: the import takes seconds, and this is only a question.
-    ``command`` gives the argument list of a child process that speaks the frames of converters/files/children/frames.py; it
+    ``command`` gives the argument list of a child process that speaks frames (converters/files/children/frames.py); it
     raises RuntimeUnavailableError. ``install`` fetches it, None where pip or the system's packages do that.
     """
 

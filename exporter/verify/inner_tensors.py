@@ -1,4 +1,4 @@
-"""The inner tensors of who takes part in a verification, called as the graph calls them (converters/formats/intermediate_tensors.py)."""
+"""Intermediate tensors of a participant, named as in the graph (converters/formats/intermediate_tensors.py)."""
 
 from __future__ import annotations
 

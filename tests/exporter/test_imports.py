@@ -119,6 +119,35 @@ def test_no_module_imports_itself_round_a_corner() -> None:
     assert not left, f"these modules import each other: {left}"
 
 
+#: The rooms of ``converters/``, the lowest first: each may import those before it, lazily too.
+ROOMS_FROM_BELOW = ("files", "graph", "policy", "compiler", "trainers", "formats", "consumers", "runtimes")
+
+
+def room_of(module: str) -> str | None:
+    """The room of ``converters`` that a module lies in; None elsewhere."""
+    package, _, rest = module.partition(".")
+    return rest.partition(".")[0] if package == "converters" and rest else None
+
+
+def test_rooms_import_only_those_below_them() -> None:
+    """Every import counts, those inside of functions too: an arrow upward is a cycle waiting for its other half."""
+    names = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", ".") for p in MODULES}
+    level = {room: number for number, room in enumerate(ROOMS_FROM_BELOW)}
+    upward = [
+        f"{module} -> {other}"
+        for path in MODULES
+        for module in [name_of(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")]
+        for other in sorted(own_imports(path, names))
+        if (own := room_of(module)) and (asked := room_of(other)) and level[own] < level[asked]
+    ]
+    assert not upward
+
+
+def test_every_module_of_converters_lies_in_a_room() -> None:
+    rooms = {path.relative_to(ROOT).parts[1] for path in MODULES if path.is_relative_to(ROOT / "converters")}
+    assert rooms == {"__init__.py", *ROOMS_FROM_BELOW}
+
+
 def test_nothing_below_the_command_line_asks_it() -> None:
     modules = [m for m in MODULES if not m.is_relative_to(ROOT / "exporter/cli") and m.name != "__main__.py"]
     asking = [name_of(m) for m in modules if "exporter.cli" in m.read_text(encoding="utf-8")]

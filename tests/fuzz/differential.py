@@ -1,8 +1,8 @@
 """``python -m tests.fuzz.differential``: mutants as our messages read them, and as Google's own do: they must agree.
 
-``converters/formats/onnx/messages.py`` and ``converters/files/tensorflow_messages.py`` know the fields that are needed, by their numbers. Whatever
-they read of a damaged file has to be what onnx and TensorFlow read of it, or a runtime would run another model than was
-looked at. Both refuse, or all fields that ours know have the same values.
+``converters/formats/onnx/messages.py`` and ``converters/files/tensorflow_messages.py`` know the fields that are
+needed, by their numbers. Whatever they read of a damaged file has to be what onnx and TensorFlow read of it, or a
+runtime would run another model than was looked at. Both refuse, or all fields that ours know have the same values.
 """
 
 from __future__ import annotations

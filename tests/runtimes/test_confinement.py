@@ -14,9 +14,9 @@ from converters.files.children import memory_limits as memory
 from converters.files.children.confinement import in_force
 from converters.files.children.memory_limits import FREE
 from converters.files.children.process import RunFailedError, RuntimeProcess
+from converters.files.children.python import child_command, confined
 from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import RuntimePool
-from converters.runtimes.python import child_command, confined
 from exporter.export.pipeline import ExportOptions, export
 from signatures.errors import RuntimeUnavailableError
 from tests.bench.big_policies import OBSERVED, frozen

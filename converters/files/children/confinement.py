@@ -3,9 +3,9 @@
 A model file decides what a runtime computes, and runtimes have had faults. So a child gives up, before it has seen a
 model, what it does not need: files are not written outside a scratch folder, TCP is neither listened on nor called
 (Landlock, security/landlock.rst of the kernel's documentation), no socket of any other kind is made either (seccomp),
-no core is dumped, files and their number are bounded. Memory is bounded while a request runs
-(converters/files/children/process.py), because what is fair depends on it. All of it is Linux; elsewhere, and where a kernel
-lacks a part, that part is not in force, and ``export-model runtimes`` says so.
+no core is dumped, files and their number are bounded. Memory is bounded while a request runs (process.py), because
+what is fair depends on it. All of it is Linux; elsewhere, and where a kernel lacks a part, that part is not in force,
+and ``export-model runtimes`` says so.
 
 A child in Python calls ``begin`` before anything else. For others this file is a program:
 ``python confinement.py FOLDER PARENT COMMAND…`` gives up the same and becomes the

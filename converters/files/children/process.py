@@ -17,9 +17,9 @@ import numpy as np
 
 from converters.files.children.frames import FramingError, Tensors, read_frame, write_frame
 from converters.files.children.memory_limits import Memory
+from converters.files.children.python import confined
 from converters.files.children.time_limits import allowed, computed
 from converters.files.folders import OwnFolder, scratch_folder, size_of
-from converters.runtimes.python import confined
 from signatures.errors import ExportModelError, RuntimeUnavailableError
 
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.

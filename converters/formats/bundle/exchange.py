@@ -1,7 +1,7 @@
 """Folders that are written beside their place and exchanged with what was there, so that a killed run leaves no half.
 
-What is written lies in a folder of its own (converters/files/folders.py), ``.export-model-<name>-<random>`` beside the place:
-no other is ever swept or put back. Within it, ``new`` is what is being written; on a system
+What is written lies in a folder of its own (converters/files/folders.py), ``.export-model-<name>-<random>`` beside the
+place: no other is ever swept or put back. Within it, ``new`` is what is being written; on a system
 without an exchange, ``old`` is what has been moved out of its place.
 """
 

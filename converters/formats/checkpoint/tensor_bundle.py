@@ -1,7 +1,7 @@
 """A checkpoint's values: ``<prefix>.index`` and ``<prefix>.data-?????-of-?????`` (TensorFlow's "bundle", V2 format).
 
-The index is a table (``converters.formats.checkpoint.table``) of tensor name → BundleEntryProto, with a BundleHeaderProto under
-the empty key (tensor_bundle.proto). An entry says in which shard the tensor's bytes lie, where, and their masked
+The index is a table (table.py) of tensor name → BundleEntryProto, with a BundleHeaderProto under the empty key
+(tensor_bundle.proto). An entry says in which shard the tensor's bytes lie, where, and their masked
 CRC-32C. A variable that was partitioned has an entry with slices (tensor_slice.proto) and no bytes; each slice has an
 entry of its own, whose key encodes the name and the extents in TensorFlow's ordered code (tensor_bundle.cc,
 saved_tensor_slice_util.cc: EncodeTensorNameSlice; ordered_code.cc).

@@ -1,8 +1,8 @@
 """What only a library reads, in a process of its own: HDF5 (h5py), and Keras models of more than plain layers.
 
 Keras builds what a file names, so loading one runs what it says. It is read where the caller trusts it, and then, too,
-only if it is made of Keras' own layers (converters/formats/keras/config.py): TensorFlow freezes it, in a child that has no
-network and cannot write. HDF5 files are ``.h5`` and ``model.weights.h5`` (hdf5_child.py).
+only if it is made of Keras' own layers (config.py): TensorFlow freezes it, in a child that has no network and cannot
+write. HDF5 files are ``.h5`` and ``model.weights.h5`` (hdf5_child.py).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from converters.files.children.process import RunFailedError, RuntimeProcess
+from converters.files.children.python import child_command, module_origin
 from converters.formats.saved_model.signature import ModelSignature, signature_of
-from converters.runtimes.python import child_command, module_origin
 from signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
 from signatures.records import dataclass
 

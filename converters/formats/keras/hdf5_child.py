@@ -1,7 +1,8 @@
 """The arrays and the configuration of an HDF5 file, read by h5py in a confined process.
 
-``python -m converters.formats.keras.hdf5_child``. Loads by ``path`` an ``.h5``, or a ``.keras``'s ``model.weights.h5``; run, it
-gives JSON as ``index`` ({"config", "version", "arrays": [[layer, name], …]}), and the arrays as ``0``, ``1``, ….
+``python -m converters.formats.keras.hdf5_child``. Loads by ``path`` an ``.h5``, or a ``.keras``'s
+``model.weights.h5``; run, it gives JSON as ``index`` ({"config", "version", "arrays": [[layer, name], …]}), and the
+arrays as ``0``, ``1``, ….
 The HDF5 library has met hostile files before: it has no network here, writes nothing, and can end without harm. What
 lies elsewhere, refers to something, or is larger than the file is refused before it is read.
 """

@@ -17,7 +17,7 @@ import numpy as np
 from converters.files.chunks import Pieces
 from converters.files.external_data import Detached, is_readable
 from converters.files.protobuf_messages import message_classes
-from converters.graph.types import DATA_TYPES
+from signatures.dtypes import DATA_TYPES
 
 _CLASSES = message_classes(
     "export_model_onnx",

@@ -20,7 +20,8 @@ from converters.files.fetch import MAX_WEIGHTS, read_bytes
 from converters.files.message_limits import check_size
 from converters.files.tensorflow_messages import check_nodes
 from converters.formats.onnx.messages import ModelProto
-from converters.graph.types import DATA_TYPES, FLOAT32
+from converters.graph.types import FLOAT32
+from signatures.dtypes import DATA_TYPES
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 
 _MAX_AXES, _MAX_ELEMENTS = 32, 1 << 31

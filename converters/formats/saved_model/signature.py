@@ -30,11 +30,12 @@ from converters.graph.nodes import (
     topological,
 )
 from converters.graph.ops.table import is_fed
-from converters.graph.types import DATA_TYPES, Symbols, TensorType
+from converters.graph.types import Symbols, TensorType
 from converters.policy.facts import SourceFacts
 from converters.policy.inputs import role_by_name
 from converters.policy.memories import float_rows, paired_memories
 from signatures.contract import EMBEDDED
+from signatures.dtypes import DATA_TYPES
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.memories import SeparateMemory
 from signatures.records import dataclass

@@ -13,9 +13,9 @@ import shutil
 from functools import partial
 from pathlib import Path
 
+from converters.files.children.python import module_origin
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
 from converters.runtimes.installed import built_beside, cache_folder, carried_out, check
-from converters.runtimes.python import module_origin
 from signatures.digest import sha256_hex
 from signatures.errors import RuntimeUnavailableError
 

@@ -1,6 +1,6 @@
 """ONNX Runtime."""
 
-from converters.runtimes.python import package_runtime
+from converters.runtimes.packages import package_runtime
 
 #: First come, first taken: all of them provide the package.
 DISTRIBUTIONS = (

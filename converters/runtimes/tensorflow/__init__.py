@@ -1,6 +1,6 @@
 """TensorFlow 2."""
 
-from converters.runtimes.python import package_runtime
+from converters.runtimes.packages import package_runtime
 
 #: First come, first taken: all of them provide the package.
 DISTRIBUTIONS = (

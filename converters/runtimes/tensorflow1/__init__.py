@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from converters.files.children.python import child_command
 from converters.runtimes.base import Progress, Runtime, RuntimeInfo
 from converters.runtimes.installed import check
-from converters.runtimes.python import child_command
 from converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     RELEASES,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from converters.graph.types import DATA_TYPES, FLOAT32
+from converters.graph.types import FLOAT32
+from signatures.dtypes import DATA_TYPES
 from signatures.errors import UnsupportedOpError
 from signatures.records import dataclass
 
