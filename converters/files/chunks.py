@@ -6,12 +6,12 @@ transposed view) is copied a few megabytes at a time, when it is written.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from signatures.digest import hasher
 from signatures.records import dataclass
 
 #: Bytes that are handed on at once.
@@ -84,7 +84,7 @@ class Pieces:
 
     def write(self, path: Path) -> str:
         """Write the file; returns its sha256. Raises OSError."""
-        digest = hasher(self.size)
+        digest = hashlib.sha256()
         with path.open("wb") as file:
             for chunk in self.chunks() if self.size > _CHUNK else (self.joined(),):
                 digest.update(chunk)

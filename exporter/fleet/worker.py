@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib  # noqa: F401  OpenSSL's sha256 is several times as fast, which one of many is worth
 import signal
 import sys
 from collections.abc import Mapping, Sequence

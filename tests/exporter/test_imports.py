@@ -179,7 +179,7 @@ NOT_LOADED = (
     # how messages are described in Python: converters/files/protobuf_messages.py describes them in bytes
     *("google.protobuf.descriptor_pb2", "google.protobuf.json_format", "google.protobuf.descriptor_pool"),
     *("google.protobuf.message_factory", "google.protobuf.text_format"),
-    *("rich", "email", "http", "ssl", "_hashlib", "socket", "asyncio", "multiprocessing", "subprocess", "tarfile"),
+    *("rich", "email", "http", "ssl", "socket", "asyncio", "multiprocessing", "subprocess", "tarfile"),
     *("numpy.ma", "numpy.random", "numpy.testing", "numpy.fft", "numpy.polynomial", "numpy.f2py", "numpy.ctypeslib"),
     *(
         "converters.formats.barracuda.writer",
