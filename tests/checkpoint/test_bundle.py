@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from converters.files import tensorflow_messages as schema
 from converters.formats.checkpoint.tensor_bundle import Checkpoint, slice_key
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
-from tests.checkpoint.writing import bundle, literal, table
+from tests.checkpoint.writing import bundle, table
 from tests.conftest import examples
 
 DTYPES = (np.float32, np.float64, np.float16, np.int32, np.int64, np.uint8, np.bool_)
@@ -29,11 +29,9 @@ FRESH = examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture,
 
 
 @FRESH
-@given(VALUES, st.integers(1, 3), st.booleans(), st.booleans())
-def test_any_checkpoint_is_read_back(
-    tmp_path: Path, values: dict[str, np.ndarray], shards: int, big: bool, snappy: bool
-) -> None:
-    bundle(tmp_path / "m", values, shards=shards, big=big, compress=literal if snappy else None)
+@given(VALUES, st.integers(1, 3), st.booleans())
+def test_any_checkpoint_is_read_back(tmp_path: Path, values: dict[str, np.ndarray], shards: int, big: bool) -> None:
+    bundle(tmp_path / "m", values, shards=shards, big=big)
     checkpoint = Checkpoint(tmp_path / "m")
     assert checkpoint.names == sorted(values, key=str.encode)
     assert len(checkpoint.files) == 1 + shards

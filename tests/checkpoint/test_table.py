@@ -1,19 +1,18 @@
-"""Tables, their checksums and compression: any content is read back, any damage is a clear error."""
+"""Tables and their checksums: any content is read back, any damage is a clear error."""
 
 from __future__ import annotations
 
 import struct
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.formats.checkpoint import table as module
 from converters.formats.checkpoint.crc32c import crc32c, masked
-from converters.formats.checkpoint.snappy import SnappyError, decompress
 from converters.formats.checkpoint.table import MAGIC, read_table
 from signatures.errors import DamagedFileError, ExportModelError
-from tests.checkpoint.writing import block, literal, table, varint
+from tests.checkpoint.writing import block, table, varint
 from tests.conftest import examples
 
 PAIRS = st.dictionaries(st.binary(max_size=12), st.binary(max_size=40), min_size=1, max_size=40).map(
@@ -62,64 +61,12 @@ def test_crc32c_of_short_data_is_by_the_definition(data: bytes) -> None:
     assert crc32c(data) == bitwise(data)
 
 
-# ------------------------------------------------------------------ Snappy
-
-
-@st.composite
-def compressed(draw: st.DrawFn) -> tuple[bytes, bytes]:
-    """(Snappy data, what is behind it): random elements, written as the format describes them."""
-    out, plain = bytearray(), bytearray()
-    for _ in range(draw(st.integers(0, 12))):
-        kind = draw(st.integers(0, 3)) if plain else 0
-        if kind == 0:
-            data = draw(st.binary(min_size=1, max_size=300))
-            length = len(data) - 1
-            if length < 60 and draw(st.booleans()):
-                out += bytes([length << 2])
-            else:
-                width = draw(st.integers(1 if length < 256 else 2, 4))
-                out += bytes([(59 + width) << 2]) + length.to_bytes(width, "little")
-            out += data
-            plain += data
-            continue
-        width = (0, 1, 2, 4)[kind]
-        offset = draw(st.integers(1, min(len(plain), (1 << 11) - 1 if width == 1 else 60000)))
-        count = draw(st.integers(4, 11) if width == 1 else st.integers(1, 64))
-        if width == 1:
-            out += bytes([1 | count - 4 << 2 | offset >> 8 << 5, offset & 0xFF])
-        else:
-            out += bytes([kind | count - 1 << 2]) + offset.to_bytes(width, "little")
-        for _ in range(count):
-            plain.append(plain[-offset])
-    return varint(len(plain)) + bytes(out), bytes(plain)
-
-
-@given(compressed())
-def test_snappy(data: tuple[bytes, bytes]) -> None:
-    assert decompress(data[0]) == data[1]
-
-
-@given(st.binary(max_size=60))
-@example(b"\xff\xff\xff\xff\x0f")
-@example(b"\x05\x00a\x01")
-def test_snappy_of_anything_ends_in_its_own_error(data: bytes) -> None:
-    try:
-        decompress(data)
-    except SnappyError as error:
-        assert str(error)
-
-
-def test_snappy_claims_are_bounded() -> None:
-    with pytest.raises(SnappyError, match="cannot hold"):
-        decompress(varint((1 << 32) - 1) + bytes(10))
-
-
 # ------------------------------------------------------------------ tables
 
 
-@given(PAIRS, st.integers(1, 10), st.integers(1, 6), st.booleans())
-def test_any_table_is_read_back(pairs: list[tuple[bytes, bytes]], size: int, interval: int, snappy: bool) -> None:
-    data = table(pairs, per_block=size, interval=interval, compress=literal if snappy else None)
+@given(PAIRS, st.integers(1, 10), st.integers(1, 6))
+def test_any_table_is_read_back(pairs: list[tuple[bytes, bytes]], size: int, interval: int) -> None:
+    data = table(pairs, per_block=size, interval=interval)
     assert list(read_table(data)) == pairs
 
 
@@ -192,9 +139,9 @@ def test_faults_are_named() -> None:
     wrong = with_index(framed(disorder), block([(b"z", varint(0) + varint(len(disorder)))], 1))
     with pytest.raises(DamagedFileError, match="disorder"):
         list(read_table(wrong))
-    other = with_index(framed(content, b"\2"), block([(b"c", place)], 1))
-    with pytest.raises(DamagedFileError, match="compression 2"):
-        list(read_table(other))
+    snappy = with_index(framed(content, b"\1"), block([(b"c", place)], 1))
+    with pytest.raises(DamagedFileError, match="compression 1"):
+        list(read_table(snappy))
     low = with_index(framed(content), block([(b"b", place)], 1))
     with pytest.raises(DamagedFileError, match="beyond the key that the index names"):
         list(read_table(low))

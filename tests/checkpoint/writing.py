@@ -1,9 +1,9 @@
-"""A small writer of TensorFlow's tables and checkpoints, for tests: every block size, restart interval, compression."""
+"""A small writer of TensorFlow's tables and checkpoints, for tests: every block size and restart interval."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +25,6 @@ def varint(value: int) -> bytes:
     return bytes([*out, value])
 
 
-def literal(data: bytes) -> bytes:
-    """Snappy that compresses nothing."""
-    out = bytearray(varint(len(data)))
-    for at in range(0, len(data), 60):
-        part = data[at : at + 60]
-        out += bytes([len(part) - 1 << 2]) + part
-    return bytes(out)
-
-
 def block(pairs: Pairs, interval: int) -> bytes:
     out, restarts, last = bytearray(), [], b""
     for number, (key, value) in enumerate(pairs):
@@ -49,17 +40,13 @@ def block(pairs: Pairs, interval: int) -> bytes:
     return bytes(out) + struct.pack(f"<{len(restarts)}I", *restarts) + struct.pack("<I", len(restarts))
 
 
-def table(
-    pairs: Pairs, *, per_block: int = 8, interval: int = 4, compress: Callable[[bytes], bytes] | None = None
-) -> bytes:
+def table(pairs: Pairs, *, per_block: int = 8, interval: int = 4) -> bytes:
     out = bytearray()
 
     def put(content: bytes) -> bytes:
-        kind = b"\0"
-        if compress is not None:
-            content, kind = compress(content), b"\1"
         handle = varint(len(out)) + varint(len(content))
-        out.extend(content + kind + struct.pack("<I", masked(crc32c(content + kind))))
+        content += b"\0"  # not compressed
+        out.extend(content + struct.pack("<I", masked(crc32c(content))))
         return handle
 
     index = []
@@ -77,7 +64,6 @@ def bundle(
     *,
     shards: int = 1,
     slices: Mapping[str, Sequence[Extents]] | None = None,
-    compress: Callable[[bytes], bytes] | None = None,
     big: bool = False,
 ) -> None:
     """Write a checkpoint; ``slices`` cuts a variable into parts of these extents."""
@@ -109,7 +95,7 @@ def bundle(
             put(slice_key(name, extents), array[window], number)
         entries[name.encode()] = entry.SerializeToString()
     prefix.parent.mkdir(parents=True, exist_ok=True)
-    prefix.with_name(prefix.name + ".index").write_bytes(table(sorted(entries.items()), compress=compress))
+    prefix.with_name(prefix.name + ".index").write_bytes(table(sorted(entries.items())))
     for number, content in enumerate(data):
         prefix.with_name(f"{prefix.name}.data-{number:05d}-of-{shards:05d}").write_bytes(bytes(content))
 

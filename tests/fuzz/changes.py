@@ -15,7 +15,7 @@ from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda.format import _Parser
 from converters.formats.checkpoint.table import read_table
 from signatures.digest import sha256_hex
-from tests.checkpoint.writing import literal, table
+from tests.checkpoint.writing import table
 from tests.fuzz import mutation
 
 Files = dict[str, bytes]
@@ -129,13 +129,9 @@ def _index(data: bytes, random: Random) -> bytes:
     if random.random() < 0.9:
         pairs.sort()
 
-    def compress(content: bytes) -> bytes:
-        packed = literal(content)
-        return mutation.damaged(packed, random) if random.random() < 0.2 else packed
-
     made = [(bytes(k), bytes(v)) for k, v in pairs]
     size = {"per_block": random.choice((1, 2, 8)), "interval": random.choice((1, 4))}
-    return table(made, **size, compress=compress if random.random() < 0.4 else None)  # type: ignore[arg-type]
+    return table(made, **size)
 
 
 def checkpoint(files: Files, random: Random) -> Files:

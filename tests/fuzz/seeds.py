@@ -23,7 +23,6 @@ from exporter.export.pipeline import ExportOptions, export
 from fixtures import FOLDER, path
 from signatures.errors import ExportModelError
 from tests.checkpoint.writing import bundle as write_checkpoint
-from tests.checkpoint.writing import literal
 from tests.checkpoint.writing import policy as training_policy
 from tests.fuzz import changes
 from tests.fuzz.changes import Files
@@ -151,17 +150,17 @@ def _saved_models() -> list[Files]:
 
 
 def _checkpoints() -> list[Files]:
-    def run(meta: bool, op: str, compress: Any) -> Callable[[Path], None]:
+    def run(meta: bool, op: str) -> Callable[[Path], None]:
         def make(folder: Path) -> None:
             graph = training_policy(op=op)
             prefix = folder / "model-10.cptk"
-            write_checkpoint(prefix, graph.variables, shards=2 if meta else 1, compress=compress)
+            write_checkpoint(prefix, graph.variables, shards=2 if meta else 1)
             graph.write(folder / ("model-10.cptk.meta" if meta else "raw_graph_def.pb"), meta=meta)
             (folder / "checkpoint").write_text('model_checkpoint_path: "model-10.cptk"\n')
 
         return make
 
-    ways = ((False, "VariableV2", None), (True, "VarHandleOp", literal), (False, "VarHandleOp", literal))
+    ways = ((False, "VariableV2"), (True, "VarHandleOp"), (False, "VarHandleOp"))
     return [*(_made(run(*way)) for way in ways), files_of(FOLDER / "trained" / "3DBall")]
 
 

@@ -13,12 +13,12 @@ from collections.abc import Iterator
 
 from converters.files.wire_format import read_varint
 from converters.formats.checkpoint.crc32c import crc32c, masked
-from converters.formats.checkpoint.snappy import SnappyError, decompress
 from signatures.errors import DamagedFileError
 
 MAGIC = struct.pack("<Q", 0xDB4775248B80FB57)
 _FOOTER, _TRAILER = 48, 5
-_NONE, _SNAPPY = 0, 1
+#: A block's compression. TensorFlow writes checkpoints without one (tensor_bundle.cc: kNoCompression).
+_NONE = 0
 #: Keys unfold from what they share with the one before: a small file could claim any amount of memory.
 MAX_KEY_BYTES = 1 << 26
 _FIX = "copy the checkpoint again (binary, not through a text filter), or take one of another step: --step N"
@@ -52,7 +52,7 @@ def read_table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _block(data: bytes, handle: tuple[int, int], name: str) -> bytes:
-    """A block's content, its checksum verified and its compression undone."""
+    """A block's content, its checksum verified."""
     offset, size = handle
     if offset + size + _TRAILER > len(data) - _FOOTER:
         raise _damaged(f"the {name} reaches beyond the end of the file")
@@ -61,14 +61,9 @@ def _block(data: bytes, handle: tuple[int, int], name: str) -> bytes:
     (stored,) = struct.unpack_from("<I", data, offset + size + 1)
     if masked(crc32c(data[offset : offset + size + 1])) != stored:
         raise _damaged(f"the {name} has another checksum (crc32c) than it was written with")
-    if kind == _NONE:
-        return content
-    if kind != _SNAPPY:
-        raise _damaged(f"the {name} has the compression {kind}", "a table has none (0) or Snappy (1)")
-    try:
-        return decompress(content)
-    except SnappyError as error:
-        raise _damaged(f"the {name} cannot be decompressed", str(error)) from error
+    if kind != _NONE:
+        raise _damaged(f"the {name} has the compression {kind}", "TensorFlow writes checkpoints without one (0)")
+    return content
 
 
 def _entries(block: bytes, name: str, budget: int) -> Iterator[tuple[bytes, bytes]]:
