@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from converters.compiler.passes.lean import lean
+from converters.compiler.targets import FEWER_OPS, prepare
 from converters.formats.bundle.embed import runnable
 from converters.graph.nodes import node_of
 from converters.graph.run import run_graph
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.export.again import verify_folder
@@ -24,8 +25,8 @@ from tests.faults.conftest import Bundle
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("runtimes"), pytest.mark.usefixtures("runtimes")]
 
-#: What of a lean graph the formats may hide: products that were fused with their bias, numbers that became attributes,
-#: a Minimum below a Maximum, and in ONNX the index below its column and an Elu that comes behind its pool.
+#: What of a graph in fewer ops the formats may hide: products that were fused with their bias, numbers that became
+#: attributes, a Minimum below a Maximum, and in ONNX the index below its column and an Elu that comes behind its pool.
 HIDDEN = {"MatMul", "BiasAdd", "Conv2D", "Const", "Minimum", "ArgMax", "Elu"}
 
 
@@ -56,7 +57,8 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
     read = outputs_read([n.name for n in graph.nodes], [r for n in graph.nodes for r in n.inputs])
     tensors = [t for n in graph.nodes for t in read[n.name]]
     expected = run_graph(graph, case.feeds, tensors)
-    leaner = lean(graph, tested.signature, {s.name: s.name for s in tested.signature.outputs})
+    names = {s.name: s.name for s in tested.signature.outputs}
+    shorter = prepare(Policy(name, graph, tested.signature, {}, names), FEWER_OPS)
     installed = [
         r.name for r in available_runtimes() if r.installed and "chromium" not in r.name and "webgl" not in r.name
     ]
@@ -66,12 +68,12 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
         assert participant.path is not None
         with inner_tensors(participant, participant.path, pool) as within:
             upstream = graph.ancestors(list(participant.outputs))
-            is_lean = participant.format in ("tfjs", "onnx")
-            kept = leaner.ancestors(list(participant.outputs)) if is_lean else upstream
+            has_fewer = participant.format in ("tfjs", "onnx")
+            kept = shorter.ancestors(list(participant.outputs)) if has_fewer else upstream
             got = within.fetch(case.feeds, [t for t in tensors if graph.producer(t).name in upstream])
         wanted = [t for t in tensors if node_of(t) in upstream & kept]
         missing = {graph.producer(t).op for t in wanted if t not in got}
-        assert missing <= (HIDDEN if is_lean else set()), (participant.name, missing)
+        assert missing <= (HIDDEN if has_fewer else set()), (participant.name, missing)
         assert len(got) > len(wanted) / 2
         for tensor, value in got.items():
             exact = graph.producer(tensor).op == "Const"

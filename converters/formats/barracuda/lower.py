@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.compiler.passes.fuse import fuse
+from converters.compiler.targets import BARRACUDA, prepare
 from converters.formats.barracuda.assemble import assembled
 from converters.formats.barracuda.format import NnInput, NnMemory, NnModel
 from converters.formats.barracuda.lower_arrays import as_row, joined, reshaped
@@ -78,7 +78,7 @@ class _Part:
 class _Lowering:
     def __init__(self, policy: Policy) -> None:
         self.policy, self.signature = policy, policy.signature
-        self.graph: Graph = fuse(policy.graph, policy.fetches.values(), activations=False)
+        self.graph: Graph = prepare(policy, BARRACUDA)
         self.inputs: list[NnInput] = []
         self.parts = self._memory_parts()
         self.heads = [s for s in self.signature.outputs if base_name(s) in ACTION_NAMES]
@@ -344,7 +344,7 @@ def dressed_model(policy: Policy) -> NnModel:
     UnsupportedOpError.
     """
     signature, constants = policy.signature, policy.constants
-    graph = fuse(policy.graph, policy.fetches.values(), activations=False)
+    graph = prepare(policy, BARRACUDA)
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
     b = NnBuilder(infer_types(graph), [*names, *constants], draws=True)
     inputs = [NnInput(s.name, _as_fed(s).dims) for s in signature.inputs]

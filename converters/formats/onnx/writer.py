@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.fuse import fuse
-from converters.compiler.passes.lean import lean
 from converters.compiler.passes.weights import Storage, compact
+from converters.compiler.targets import CONSUMER_ONNX, ONNX, prepare
 from converters.files.chunks import Pieces, equal
 from converters.files.external_data import LARGE, Detached
 from converters.formats.format import WriteOptions
@@ -271,13 +270,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
             why=f"the lowerings are made for opsets {min(ASKED_FOR)} to {max(ASKED_FOR)}",
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
-    roots = policy.fetches.values()
-    # Models for one consumer stay as they were tried in it.
-    graph = fuse(
-        policy.graph if options.profile else lean(policy.graph, policy.signature, policy.fetches),
-        roots,
-        activations=False,
-    )
+    graph = prepare(policy, CONSUMER_ONNX if options.profile else ONNX)
     builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], options.profile)
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from converters.compiler.passes.int8_products import join_products
 from converters.files.fetch import Fetched
 from converters.formats.bundle.embed import contract_of, facts_of, redrawn
 from converters.formats.saved_model.signature import exposed
 from converters.formats.source import ReadOptions, SourceModel
-from converters.formats.tfjs.int8 import joined
 from converters.formats.tfjs.reader import content_of, model_file, read_model, weights_of
 from converters.formats.tfjs.unfuse import unfuse
 from converters.graph.nodes import Graph, NameScope, Node, topological
@@ -30,7 +30,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         graph, facts = exposed(graph, model.signature)
         return [SourceModel(graph, model.files, facts)]
     contract = contract_of(model.contract)
-    graph = _retyped(redrawn(joined(graph), contract), contract)
+    graph = _retyped(redrawn(join_products(graph), contract), contract)
     return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]
 
 

@@ -22,19 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.fuse import fuse
-from converters.compiler.passes.lean import lean
 from converters.compiler.passes.weights import Storage, are_steps, compact
+from converters.compiler.targets import TFJS, TFJS_INT8, prepare
 from converters.files import tensorflow_messages as schema
 from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
 from converters.formats.frozen_graph.encode import PRODUCER, attributes
-from converters.formats.tfjs.int8 import stepped
-from converters.formats.tfjs.peephole import clipped
-from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.base import AttrKind
-from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT32
 from converters.policy.policy import Policy
@@ -70,18 +65,6 @@ def _narrowed(node: Node) -> np.ndarray:
             fix="write the other formats: --to bytes,saved_model,onnx",
         )
     return value.astype(target, copy=False)
-
-
-def for_tfjs(graph: Graph) -> Graph:
-    """The graph in ops that TensorFlow.js has and computes rightly; names of the nodes that stay are kept."""
-    if not any(op_of(n).tfjs for n in graph.nodes):
-        return graph
-    types = infer_types(graph)
-    editor = Editor(graph)
-    for node in graph.nodes:
-        rewrite = op_of(node).tfjs
-        editor.keep(node if rewrite is None else rewrite(editor, node, types))
-    return editor.graph()
 
 
 # ------------------------------------------------------------------ GraphDef as JSON
@@ -183,9 +166,7 @@ def _acting() -> Mapping[str, Pieces]:
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The TensorFlow.js artefact."""
-    roots = policy.fetches.values()
-    graph = clipped(for_tfjs(lean(policy.graph, policy.signature, policy.fetches)), roots)
-    graph = fuse(stepped(graph) if options.weights == "int8" else graph, roots, activations=True)
+    graph = prepare(policy, TFJS_INT8 if options.weights == "int8" else TFJS)
     entries, values = _weights(graph, options.weights)
     shards = _shards(Pieces(*values))
     contract = json.loads(options.contract)

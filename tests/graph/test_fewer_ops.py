@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from converters.compiler.passes.lean import lean
+from converters.compiler.targets import FEWER_OPS, prepare
 from converters.graph.nodes import Graph, Node
 from converters.graph.run import run_graph
 from converters.graph.types import INT32
@@ -140,7 +140,7 @@ def feeds(made: Graph) -> Mapping[str, Array]:
 
 
 def leaned(tested: Policy) -> Graph:
-    return lean(tested.graph, tested.signature, tested.fetches)
+    return prepare(tested, FEWER_OPS)
 
 
 CONSTANTS = {

@@ -4,12 +4,13 @@ Of a dense layer its product is multiplied, which is as wide as the layer, and n
 that as the layer has inputs: ``x·(steps × step)`` is ``(x·steps) × step`` but for rounding. The bias is added after
 that, as it is, so that it keeps every digit. A convolution's kernel is multiplied itself: its result is larger than it.
 
-The matrix itself is a node all the same, which nothing reads: who looks inside finds it, to the bit (``joined``).
+The matrix itself is a node all the same, which nothing reads: who looks inside finds it, to the bit
+(``join_products``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -18,8 +19,8 @@ from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node
 
 
-def stepped(graph: Graph) -> Graph:
-    """The graph with weights that were rounded as whole numbers, multiplied where it costs least."""
+def multiply_products(graph: Graph, roots: Collection[str] = ()) -> Graph:
+    """Return the graph with weights that were rounded as whole numbers, multiplied where it costs least."""
     readers = graph.consumers()
     editor = Editor(graph)
     steps: dict[str, tuple[str, str]] = {}
@@ -49,8 +50,8 @@ def _are_products(name: str, step: np.ndarray, readers: Sequence[Node]) -> bool:
     )
 
 
-def joined(graph: Graph) -> Graph:
-    """The graph with the matrices in their products again; whoever may have written it."""
+def join_products(graph: Graph) -> Graph:
+    """Return the graph with the matrices in their products again; whoever may have written it."""
     whole = {node.inputs: node.name for node in graph.nodes if _is_matrix(graph, node)}
     if not whole:
         return graph

@@ -9,7 +9,7 @@ from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.types import FLOAT32
 
 
-def clipped(graph: Graph, roots: Iterable[str]) -> Graph:
+def clip_by_value(graph: Graph, roots: Iterable[str]) -> Graph:
     """The graph with ClipByValue for a Maximum of a Minimum, each with one number, that nothing else reads."""
     outputs, readers = {node_of(r) for r in roots}, graph.consumers()
     editor = Editor(graph)

@@ -1,0 +1,84 @@
+"""What each target's writer asks of a graph before it encodes it: a named list of steps per target.
+
+``.bytes`` and SavedModel keep what the source has, and have no list. A step takes a graph and says of the same outputs
+the same, within the rounding of a constant or two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from functools import partial
+
+from converters.compiler.passes.batch_branches import join_branches
+from converters.compiler.passes.clip_by_value import clip_by_value
+from converters.compiler.passes.constant_chains import merge_constants, share, square_differences
+from converters.compiler.passes.fuse import fuse
+from converters.compiler.passes.int8_products import multiply_products
+from converters.compiler.passes.lowering import lower_for_tfjs
+from converters.compiler.passes.slice_of_concat import parts_for_slices
+from converters.graph.nodes import Graph
+from converters.policy.policy import Policy
+from signatures.records import dataclass
+from signatures.roles import Role
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Tensors that a step keeps: ``roots`` all of them, ``branches`` those that are joined of branches, so that the
+    number of branches can be told from the graph.
+    """
+
+    roots: tuple[str, ...]
+    branches: frozenset[str] = frozenset()
+
+
+Step = Callable[[Graph, Outputs], Graph]
+
+
+def _on_roots(function: Callable[[Graph, Collection[str]], Graph]) -> Step:
+    return lambda graph, outputs: function(graph, outputs.roots)
+
+
+#: Fewer ops, for runtimes in which the start of an op is most of a small policy's run.
+FEWER_OPS: tuple[Step, ...] = (
+    _on_roots(parts_for_slices),
+    _on_roots(share),
+    _on_roots(merge_constants),
+    _on_roots(square_differences),
+    lambda graph, outputs: join_branches(graph, outputs.roots, outputs.branches),
+)
+_FUSE: Step = _on_roots(partial(fuse, activations=False))
+_FUSE_ACTIVATIONS: Step = _on_roots(partial(fuse, activations=True))
+_LOWER_FOR_TFJS: tuple[Step, ...] = (_on_roots(lower_for_tfjs), _on_roots(clip_by_value))
+
+TFJS = (*FEWER_OPS, *_LOWER_FOR_TFJS, _FUSE_ACTIVATIONS)
+TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_ACTIVATIONS)
+ONNX = (*FEWER_OPS, _FUSE)
+#: Models for one consumer stay as they were tried in it.
+CONSUMER_ONNX = (_FUSE,)
+BARRACUDA = (_FUSE,)
+
+_OF_BRANCHES = (Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS, Role.PROBS)
+
+
+def prepare(policy: Policy, steps: tuple[Step, ...]) -> Graph:
+    """Return the policy's graph after a target's steps."""
+    branches = frozenset(policy.fetches[s.name] for s in policy.signature.outputs if s.role in _OF_BRANCHES)
+    return run_steps(policy.graph, Outputs(tuple(policy.fetches.values()), branches), steps)
+
+
+def run_steps(graph: Graph, outputs: Outputs, steps: tuple[Step, ...]) -> Graph:
+    """Return the graph after the steps. ``FEWER_OPS``, with which several targets begin, run once for a graph."""
+    shared = len(FEWER_OPS)
+    if steps[:shared] == FEWER_OPS:
+        key = FEWER_OPS, outputs
+        if key not in graph.made:
+            graph.made[key] = _run(graph, outputs, FEWER_OPS)
+        graph, steps = graph.made[key], steps[shared:]
+    return _run(graph, outputs, steps)
+
+
+def _run(graph: Graph, outputs: Outputs, steps: tuple[Step, ...]) -> Graph:
+    for step in steps:
+        graph = step(graph, outputs)
+    return graph
