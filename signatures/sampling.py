@@ -1,9 +1,10 @@
 """Inputs to try a policy on, drawn from the policy itself and seeded.
 
 Around the statistics of its own normaliser where it has one, at the edges (zeros, the ±5 clip, 8 to 1e4, one number far
-from the others, float32 denormals, every two inputs at opposite extremes, each action masked, a memory far from zero),
-in the patterns that observations have (one number alone, zeros and ones …), images in 0..1, dim and bright, pixels at
-their ends, batches of 1 to 9, and a large odd one (a smaller one of large images).
+from the others, float32 denormals, every two inputs at opposite extremes, a memory far from zero), each action masked
+alone and all but one, each id of a table, the patterns that observations have (one number alone, zeros and ones …),
+images in 0..1, dim and bright, pixels at their ends, with structure (signatures/pictures.py), batches of 1 to 7, of 16,
+32, 48 and 64, and an odd one above 512 (a smaller one of large images).
 """
 
 from __future__ import annotations
@@ -14,15 +15,20 @@ from typing import TypeAlias
 
 import numpy as np
 
+from signatures.pictures import structured
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
 #: Tried once; with images, which take long, the largest whose pixels are no more than these.
-LARGE_BATCH = 259
+LARGE_BATCH = 521
 LARGE_BATCHES_OF_IMAGES = (67, 33, 17, 9)
 MAX_PIXELS = 1 << 21
+#: Rows of each batch of ``draw_typical``.
+_TYPICAL_BATCH = 259
+#: Batches of images with structure, beside which vectors have the patterns of observations.
+PATTERN_BATCHES_OF_IMAGES = (32, 64)
 #: How far extremes are, in deviations, and what is beyond them, as it is: from … to …, each number drawn in between.
 EXTREMES = ((5.0, 5.0), (2.5, 4.0), (5.5, 8.0))
 FAR = ((8.0, 30.0), (30.0, 100.0), (100.0, 300.0), (300.0, 1e3), (1e3, 1e4))
@@ -30,6 +36,11 @@ FAR = ((8.0, 30.0), (30.0, 100.0), (100.0, 300.0), (300.0, 1e3), (1e3, 1e4))
 FAR_CASES = ("opposite extremes", "8 to 1e4", "one number far away")
 #: Its first two rows together forbid every action, but for the only one of a branch.
 ONE_ALLOWED = "all but one action masked"
+#: A row for each action that alone is forbidden, then some for two.
+ONE_FORBIDDEN = "one or two actions masked"
+#: Rows that forbid one action, and two; as many at most, drawn from all there are.
+MOST_FORBIDDEN = 64
+_PAIRS, _PAIRS_OF_IMAGES = 16, 4
 #: What a free axis behind the batch is tried with (image sides, number of entities).
 _FREE_AXIS = 8
 
@@ -74,6 +85,12 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     if any(s.role is Role.MASKS for s in signature.inputs):
         cases.append(_case(signature, rng, ONE_ALLOWED, 7, _typical, masks=_one_allowed))
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
+        forbidden = _forbidden(signature, rng)
+        if len(forbidden):
+            rows = len(forbidden)
+            cases.append(
+                _case(signature, rng, ONE_FORBIDDEN, rows, _typical, masks=lambda rng, batch, sizes: 1 - forbidden)
+            )
     large = _large_batch(signature)
     if any(s.role is Role.VISUAL for s in signature.inputs):
         cases.append(_case(signature, rng, "pixels at their ends", 3, _typical, pixels=_ends))
@@ -83,12 +100,16 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
             if pattern * _pixels(signature) <= MAX_PIXELS:
                 cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature, EXTREMES[:1])))
             cases.append(_case(signature, rng, "8 to 1e4", len(FAR), _far(signature, few=True)))
+        pixels = _pixels(signature)
+        for batch in (n for n in PATTERN_BATCHES_OF_IMAGES if n * pixels <= MAX_PIXELS) if pixels else ():
+            name = f"images with structure, batch {batch}"
+            cases.append(_case(signature, rng, name, batch, _every_pattern, pixels=_structured(batch)))
         return cases
     cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
     if any(_is_free(s) for s in signature.inputs):
         pattern = len(_opposed(signature))
         cases.append(_case(signature, rng, "opposite extremes", pattern * len(EXTREMES), _opposite(signature)))
-        cases.append(_case(signature, rng, "8 to 1e4", pattern * len(FAR), _far(signature)))
+        cases.append(_case(signature, rng, "8 to 1e4", 2 * pattern * len(FAR), _far(signature)))
         cases.append(_case(signature, rng, "one number far away", _FEW_FAR, _one_far))
     cases += [_case(signature, rng, name, batch, style) for name, batch, style in _PATTERNS]
     return cases
@@ -97,7 +118,7 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
 def draw_typical(signature: PolicySignature, *, seed: int, count: int) -> list[Case]:
     """``count`` large batches of what is typical: rows enough for shares and spreads."""
     rng = np.random.default_rng((seed, 2))
-    batch = _large_batch(signature)
+    batch = min(_TYPICAL_BATCH, _large_batch(signature))
     return [_case(signature, rng, f"typical, batch {batch}, #{i}", batch, _typical) for i in range(count)]
 
 
@@ -186,6 +207,13 @@ def _ends(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     return pixels
 
 
+def _structured(batch: int) -> Pixels:
+    def pixels(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        return structured(rng, shape, first=batch // 4)  # another batch begins with other ones
+
+    return pixels
+
+
 def _zeros(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
     return np.zeros(shape)
 
@@ -245,12 +273,23 @@ _PATTERNS: tuple[tuple[str, int, Style], ...] = (
     ("one number alone", 3, _alone),
     ("zeros and ones", 4, lambda rng, spec, shape: rng.integers(0, 2, shape).astype(np.float64)),
     ("all numbers equal", 5, _equal),
-    ("near zero", 6, lambda rng, spec, shape: np.asarray(0.01 * rng.standard_normal(shape))),
-    ("whole numbers", 8, _whole),
-    ("from zero to one", 9, _unit),
+    ("near zero", 16, lambda rng, spec, shape: np.asarray(0.01 * rng.standard_normal(shape))),
+    ("whole numbers", 32, _whole),
+    ("from zero to one", 64, _unit),
 )
 #: Rows of which each has one number far away.
-_FEW_FAR = 24
+_FEW_FAR = 48
+
+
+def _every_pattern(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """Each row in the next pattern, or with one number far away; then typical ones."""
+    styles = [style for _, _, style in _PATTERNS] + [_one_far, _typical]
+    made = np.zeros(shape)
+    for number, style in enumerate(styles):
+        rows = len(made[number :: len(styles)])
+        made[number :: len(styles)] = style(rng, spec, (rows, *shape[1:]))
+    return made
+
 
 #: A memory far from zero, in its standard deviations: what an LSTM's cell may reach, soon and after long.
 _MEMORIES: dict[Style, float] = {_clip_edges: 5.0, _beyond: 5.0, _whole: 50.0}
@@ -314,8 +353,14 @@ def _far(signature: PolicySignature, *, few: bool = False) -> Style:
     """The sizes of ``FAR`` with the signs of ``_opposed``, or with ``few`` a row of each, signs drawn."""
 
     def style(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-        signs = rng.choice([-1.0, 1.0], shape) if few else _signs(signature, spec, shape)
-        return np.asarray(signs * _sizes(rng, FAR, shape))
+        if few:
+            return np.asarray(rng.choice([-1.0, 1.0], shape) * _sizes(rng, FAR, shape))
+        sizes = _sizes(rng, FAR, shape)
+        # Of each stratum the signs twice: each number of its own size, and all numbers of a row alike.
+        same = np.arange(len(sizes)) // len(_opposed(signature)) % 2 == 1
+        if sizes.size:
+            sizes[same] = sizes[same].reshape(int(same.sum()), -1)[:, :1].reshape(-1, *(1,) * (len(shape) - 1))
+        return np.asarray(_signs(signature, spec, shape) * sizes)
 
     return style
 
@@ -336,6 +381,29 @@ def _one_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) 
     """Of each branch another one in the next row."""
     parts = [np.eye(size)[(rng.integers(0, size) + np.arange(batch)) % size] for size in branches]
     return np.concatenate(parts, axis=1)
+
+
+def _forbidden(signature: PolicySignature, rng: np.random.Generator) -> np.ndarray:
+    """Return what is forbidden, [rows, actions]: each action of a branch that has others, then two at once."""
+    width = next(int(s.shape[-1] or 0) for s in signature.inputs if s.role is Role.MASKS)
+    sizes = signature.branches if sum(signature.branches) == width else (width,)
+    branch = np.repeat(np.arange(len(sizes)), sizes)
+    single = np.flatnonzero(np.repeat(sizes, sizes) > 1)
+    if len(single) > MOST_FORBIDDEN:
+        ends = single[[0, -1]]
+        single = np.sort(np.concatenate([ends, rng.choice(single[1:-1], MOST_FORBIDDEN - 2, replace=False)]))
+    rows = [[int(i)] for i in single]
+    cameras = any(s.role is Role.VISUAL for s in signature.inputs)
+    pairs = min(_PAIRS_OF_IMAGES if cameras else _PAIRS, len(single))
+    for number in range(pairs):
+        one = int(single[number * len(single) // pairs] if number % 2 else rng.choice(single))
+        others = single[(single != one) & ((branch[single] != branch[one]) | (np.asarray(sizes)[branch[one]] > 2))]
+        if len(others):
+            rows.append([one, int(rng.choice(others))])
+    made = np.zeros((len(rows), width))
+    for row, actions in zip(made, rows, strict=True):
+        row[actions] = 1
+    return made
 
 
 def _random_masks(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:

@@ -11,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from signatures.roles import Role
-from signatures.sampling import BATCHES, EXTREMES, FAR, LARGE_BATCH, Case, draw_cases, draw_rollout
+from signatures.sampling import (
+    BATCHES,
+    EXTREMES,
+    FAR,
+    LARGE_BATCH,
+    ONE_FORBIDDEN,
+    Case,
+    draw_cases,
+    draw_rollout,
+)
 from signatures.spec import Memory, PolicySignature, TensorSpec
 
 ACTION = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
@@ -64,10 +73,14 @@ def test_every_batch_size_is_tried() -> None:
     cases = draw_cases(EVERYTHING, samples=3)
     typical = [c for c in cases if c.name.startswith("typical") and "#" in c.name]
     assert [c.batch for c in typical] == [b for b in BATCHES for _ in range(3)]
+    alone = draw_cases(signature(spec("state", Role.VECTOR, None, 3)))
+    assert {1, 2, 7, 16, 32, 48, 64, LARGE_BATCH} <= {c.batch for c in alone}
+    assert {1, 2, 7, 32, 64, 67} <= {c.batch for c in cases}
     assert [c.name for c in cases[len(typical) :]] == [
         *("zeros", "clip edges", "beyond the clip", "1e3", "denormals"),
-        *("all but one action masked", "random masks", "pixels at their ends", "typical, batch 67"),
-        *("opposite extremes", "8 to 1e4"),
+        *("all but one action masked", "random masks", "one or two actions masked"),
+        *("pixels at their ends", "typical, batch 67", "opposite extremes", "8 to 1e4"),
+        *("images with structure, batch 32", "images with structure, batch 64"),
     ]
     assert len({c.name for c in cases}) == len(cases)
 
@@ -86,6 +99,21 @@ def test_pixels_are_tried_at_their_ends() -> None:
     assert (black == 0).all()
     assert (white == 1).all()
     assert {*np.unique(both)} == {0, 1}
+
+
+def test_pictures_with_structure_are_tried_beside_every_pattern_of_a_vector() -> None:
+    cases = [c for c in draw_cases(EVERYTHING) if "structure" in c.name]
+    images = np.concatenate([c.feeds["observation_0"] for c in cases])
+    assert images.min() >= 0
+    assert images.max() <= 1
+    for half in (images[:, :, :2], images[:, :, 3:], images[:, :3], images[:, 3:]):
+        rest = images.any((1, 2, 3))
+        assert ((half == 0).all((1, 2, 3)) & rest).any()
+    assert ((images[..., 0] > 0).any((1, 2)) & (images[..., 1:] == 0).all((1, 2, 3))).any()
+    steps = np.abs(np.diff(images, axis=2)).max((1, 2, 3))
+    assert ((steps < 0.3) & (np.ptp(images, axis=(1, 2, 3)) > 0.5)).any(), "none is smooth"
+    vectors = (np.concatenate([c.feeds["state"] for c in cases]) != 0).sum(axis=1)
+    assert (vectors == 1).any()
 
 
 def test_every_two_numbers_are_at_opposite_extremes_of_two_inputs_too() -> None:
@@ -186,6 +214,9 @@ def test_masks_always_allow_an_action_of_every_branch(branches: list[int], seed:
         assert all((part.sum(axis=1) >= 1).all() for part in parts)
         if case.name == "all but one action masked":
             assert all((part.sum(axis=1) == 1).all() for part in parts)
+        elif case.name == ONE_FORBIDDEN:
+            assert {*(mask == 0).sum(axis=1)} <= {1, 2}
+            assert {*np.flatnonzero(np.repeat(branches, branches) > 1)} <= {*(1 - mask).argmax(axis=1)}
         elif case.name != "random masks":
             assert mask.all()
 

@@ -18,12 +18,14 @@ from exporter.verify.participants import Feeds, Participant, Run
 from exporter.verify.statistics import FALSE_ALARM, dependent, fit, fit_all
 from exporter.verify.trial import Trial
 from signatures.roles import Role
-from signatures.sampling import ONE_ALLOWED
+from signatures.sampling import ONE_ALLOWED, ONE_FORBIDDEN
 
 Arrays = dict[str, np.ndarray]
 #: Draws for one input; all draws together, where a run takes long.
 DRAWS = 512
 FEW = 2 * DRAWS
+#: Draws for all masks together that forbid one action or two, in one run.
+FORBIDDEN = 4 * DRAWS
 #: Draws that two starts are compared by, where a run takes long.
 STARTS = 48
 REPEATED = "its draws are the same after every start: a sampler has a fixed seed"
@@ -54,7 +56,7 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
         (case, row, expected[scores][row])
         for case, expected in made
         for row in range(2 if case.name == ONE_ALLOWED else 1)
-        if case.name not in _LEFT_OUT and not np.isnan(expected[scores][row]).any()
+        if case.name not in _LEFT_OUT and case.name != ONE_FORBIDDEN and not np.isnan(expected[scores][row]).any()
     ]
     if not known:
         return
@@ -76,8 +78,48 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
         and (apart := repeats(drawn, log_probs, trial.signature.branches))
     ):
         difference = wrong(DEPENDENT.format(apart))
+    if difference.passed and (masked := _with_one_forbidden(trial, participant, action, scores)) is not None:
+        yield masked
+        return
     begins = trial.bisected(participant, action, difference, rows[worst], branch)
     yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
+
+
+def _with_one_forbidden(trial: Trial, participant: Participant, action: str, scores: str) -> Finding | None:
+    """What is wrong where one action is forbidden, or two; None where nothing is, or nothing can be.
+
+    Each mask is drawn for a few times, all in one run: what is forbidden must never come up, whatever else is allowed.
+    """
+    found = [(c, e) for c, e in zip(trial.cases, trial.expected, strict=True) if c.name == ONE_FORBIDDEN]
+    if not found:
+        return None
+    (case, expected) = found[0]
+    single = _one_row_at_a_time(participant)
+    cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
+    count = max(4, (FEW if single or cameras else FORBIDDEN) // case.batch)
+    if np.isnan(expected[scores]).any() or not trial.allowance(participant, "draws").takes(
+        count * case.batch, f"{count * case.batch} draws with one or two actions masked"
+    ):
+        return None
+    batched = {s.name for s in trial.signature.inputs if s.batched}
+    feeds = {n: np.repeat(a, count, axis=0) if n in batched else a for n, a in case.feeds.items()}
+    if single:
+        numbers = range(count * case.batch)
+        inputs = [{n: a[i : i + 1] if n in batched else a for n, a in feeds.items()} for i in numbers]
+    else:
+        inputs = [feeds]
+    drawn = np.concatenate([answer[action] for answer in participant.run(inputs, [action])])
+    drawn = drawn.reshape(case.batch, count, -1)
+    log_probs = np.asarray(expected[scores])
+    if participant.runtime in _ZEROS:
+        log_probs = with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
+    p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
+    difference = likely(p_value)
+    if difference.passed:
+        return None
+    row = {n: a[worst : worst + 1] if n in batched else a for n, a in case.feeds.items()}
+    begins = trial.bisected(participant, action, difference, row, branch)
+    return trial.finding(Draws, participant, action, difference, case.name, bisection=begins)
 
 
 def _started_alike(
