@@ -34,7 +34,8 @@ PROFILES: tuple[Profile, ...] = (
         aliases=("sentis", "inference-engine"),
         purpose="ML-Agents 3.0 and 4.0 in Unity 2023 and Unity 6 (Sentis 2.1, Inference Engine 2.2 to 2.4)",
         formats=("onnx",),
-        dress=partial(version3.dress, profile="unity6"),
+        # PreviousActionInputGenerator of 3.0.0 throws at the first decision (../shared/unity/r3/player.json)
+        dress=partial(version3.dress, profile="unity6", feeds_previous=False),
         importers=("Sentis 2.1.3", "Inference Engine 2.2.2", "Inference Engine 2.4.0"),
         checkers=("R22", "R23", "R23-2.4"),
     ),

@@ -41,9 +41,9 @@ ATOL = RTOL = 1e-5
 CONTRACT = '{"tool": {"version": "test"}}'
 
 
-def compiled(path: Path) -> list[Policy]:
+def compiled(path: Path, options: CompileOptions | None = None) -> list[Policy]:
     """The policies of a source, as every export has them."""
-    return [policy for _, policy in read_source(path, ReadOptions()).compiled(CompileOptions())]
+    return [policy for _, policy in read_source(path, ReadOptions()).compiled(options)]
 
 
 class Plain:
@@ -244,7 +244,14 @@ class Pair:
         if isinstance(spec.source, tuple) and spec.role is Role.VECTOR:
             parts = [s for s in self.policy.signature.inputs if s.role is Role.VECTOR]
             return np.concatenate([own[s.name].astype(np.float32) for s in parts], 1)
-        source = [s for s in self.policy.signature.inputs if s.role is spec.role and s.source == spec.source]
+        role = spec.role
+        if role is Role.MEMORY_IN and self.policy.signature.memory is None:
+            role = Role.PREV_ACTION  # a memory that holds the last action alone
+        source = [
+            s
+            for s in self.policy.signature.inputs
+            if s.role is role and (s.source == spec.source or role is not spec.role)
+        ]
         assert len(source) == 1, spec
         value = own[source[0].name]
         if spec.role is Role.VISUAL:
@@ -253,7 +260,7 @@ class Pair:
             turn = {("NHWC", "NCHW"): (0, 3, 1, 2), ("NCHW", "NHWC"): (0, 2, 3, 1)}.get((done["layout"], given))
             value = value.transpose(turn) if turn is not None else value
             value = value / np.float32(done["range"][1])
-        if spec.role is Role.MEMORY_IN and self.keeps_action:
+        if role is Role.MEMORY_IN and self.keeps_action:
             last = next(own[s.name] for s in self.policy.signature.inputs if s.role is Role.PREV_ACTION)
             value = np.concatenate([value.reshape(len(value), -1), last.reshape(len(value), -1)], 1)
         return value.astype(spec.dtype).reshape([len(value), *(d or -1 for d in spec.shape[1:])])
@@ -272,9 +279,13 @@ class Pair:
             name = self._own_name(spec)
             want, got = expected[name], actual[spec.name]
             if spec.role is Role.MEMORY_OUT and self.keeps_action:
-                if got[:, -1:].tolist() != actual["action"].tolist():
+                last = actual.get("discrete_actions", actual.get("action", actual.get("continuous_actions")))
+                assert last is not None
+                if got.reshape(len(got), -1)[:, -last.shape[1] :].tolist() != last.tolist():
                     return f"{spec.name} does not keep the action"
-                want = np.concatenate([want.reshape(len(want), -1), actual["action"]], 1)
+                kept = self.policy.signature.memory
+                own = [] if kept is None or kept.output is None else [expected[kept.output].reshape(len(got), -1)]
+                want = np.concatenate([*own, last], 1)
             if [d for d in spec.shape if d is not None] != list(got.shape[1:]):
                 return f"{spec.name} has the shape {got.shape}, not {spec.shape}"
             if got.size != want.size or not np.allclose(

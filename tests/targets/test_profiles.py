@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 
+from converters.compiler.options import CompileOptions
 from converters.consumers.profile import Profile
 from converters.consumers.profiles import PROFILES, profile
 from converters.formats.barracuda.format import parse
@@ -159,12 +160,18 @@ def test_a_branch_of_one_action_is_held_beside_others(wanted: Profile, tmp_path:
     assert pair.difference(3, 0) is None
 
 
-def drawing(path: Path, *inputs: NodeDef, scores: Sequence[NodeDef], given: Sequence[NodeDef] = ()) -> Policy:
+def drawing(
+    path: Path,
+    *inputs: NodeDef,
+    scores: Sequence[NodeDef],
+    given: Sequence[NodeDef] = (),
+    options: CompileOptions | None = None,
+) -> Policy:
     """A policy that draws from the node ``scores``."""
     drawn = node("action", "Multinomial", "scores", "one", output_dtype=np.int64, seed=1, seed2=2)
     before = [placeholder("vector_observation"), *inputs, constant("one", 1)]
     path.write_bytes(graph_bytes([*before, *dense("logits", "vector_observation", 3, 4), *scores, drawn, *given]))
-    (policy,) = compiled(path)
+    (policy,) = compiled(path, options)
     return policy
 
 
@@ -205,13 +212,58 @@ def test_the_last_action_goes_with_the_memory_where_nothing_feeds_it(tmp_path: P
     policy = drawing(path, *inputs, scores=scores, given=[node("recurrent_out", "Tanh", "scores")])
     pair = Pair.of(policy, profile("tfsharp-0.2"))
     assert {s.name: s.shape for s in pair.dressed.signature.inputs} == {"state": (None, 3), "recurrent_in": (None, 5)}
-    assert any("the Memory Size of the brain is 5" in note for note in pair.dressed.signature.notes)
+    assert any("the memory size is 5" in note for note in pair.dressed.signature.notes)
     assert pair.difference(3, 0) is None
     fed = Pair.of(policy, profile("tfsharp-0.3")).dressed.signature
     assert fed.has_input("prev_action") and fed.memory is not None and fed.memory.size == 4
     (made,) = export_model(path, tmp_path / "out", for_="tfsharp-0.2", verify="none")
     asked = commands.export_model("verify", made.folder, "--runtimes", "numpy", "--allow-unverified")
     assert asked.status == 0, asked.err
+
+
+@pytest.mark.parametrize("remembers", [True, False])
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_unity6_is_never_given_a_last_action_to_feed(tmp_path: Path, remembers: bool, deterministic: bool) -> None:
+    """PreviousActionInputGenerator of 3.0.0 writes int into float32: InvalidCastException (r3/player.json)."""
+    inputs = [placeholder("prev_action", (None, 1), np.int32)]
+    scores = [
+        constant("depth", 4),
+        constant("on", 1.0),
+        constant("off", 0.0),
+        constant("row", np.array([-1], np.int32)),
+        node("numbers", "Reshape", "prev_action", "row"),
+        node("last", "OneHot", "numbers", "depth", "on", "off", axis=-1),
+        node("scores", "Add", "logits", "last"),
+    ]
+    given = []
+    if remembers:
+        inputs.append(placeholder("recurrent_in", (None, 4)))
+        scores[-1] = node("scores", "Add", "kept", "last")
+        scores.insert(-1, node("kept", "Add", "logits", "recurrent_in"))
+        given.append(node("recurrent_out", "Tanh", "scores"))
+    path = tmp_path / "last.bytes"
+    policy = drawing(path, *inputs, scores=scores, given=given, options=CompileOptions(deterministic=deterministic))
+    pair = Pair.of(policy, profile("unity6"))
+    size = 5 if remembers else 1
+    shapes = {s.name: s.shape for s in pair.dressed.signature.inputs}
+    assert shapes == {"obs_0": (None, 3), "action_masks": (None, 4), "recurrent_in": (None, 1, size)}
+    assert pair.dressed.constants["memory_size"].tolist() == [size]
+    for step in range(3):
+        assert pair.difference(3, step) is None
+    said = "the deterministic one" if deterministic else "a drawn one"
+    assert any(said in note for note in pair.dressed.signature.notes)
+
+
+def test_a_last_action_of_another_width_is_refused(tmp_path: Path) -> None:
+    scores = [
+        node("floats", "Cast", "prev_action", DstT=np.float32),
+        constant("weights", np.ones((2, 4), np.float32)),
+        node("weighted", "MatMul", "floats", "weights"),
+        node("scores", "Add", "logits", "weighted"),
+    ]
+    policy = drawing(tmp_path / "last.bytes", placeholder("prev_action", (None, 2), np.int32), scores=scores)
+    with pytest.raises(ProfileError, match="last action has 2 columns and its action 1"):
+        Pair.of(policy, profile("unity6"))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.naming import Dressing, row
+from converters.consumers.mlagents.memory import action_columns, give_memory, previous_action, take_memory
+from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import (
     Heads,
     branches,
@@ -26,7 +27,7 @@ from converters.graph.types import BATCH, FLOAT32, INT32
 from converters.policy.policy import Policy
 from signatures.records import dataclass
 from signatures.roles import Role
-from signatures.spec import Memory, TensorSpec
+from signatures.spec import TensorSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,7 @@ def dress(policy: Policy, generation: Generation) -> Policy:
     _take_observations(dressing, generation)
     masks = _take_masks(dressing, generation)
     carried = _take_previous_action(dressing, generation)
-    size = _take_memory(dressing, carried)
+    state = take_memory(dressing, carried, _rows)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
     found = heads(dressing)
     if found.continuous is not None and found.discrete is not None:
@@ -65,16 +66,12 @@ def dress(policy: Policy, generation: Generation) -> Policy:
             fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
         )
     width = _give_action(dressing, generation, found, masks)
-    memory = None
-    if size:
-        own = policy.signature.memory
-        assert own is not None and own.output is not None
-        given = row(dressing.builder, dressing.own(own.output), own.size)
-        if carried is not None:
-            given = dressing.builder.concat([given, dressing.builder.cast(dressing.fetches["action"], FLOAT32)], 1)
-        dressing.give("recurrent_out", given, Role.MEMORY_OUT)
-        memory = Memory(size, "recurrent_in", "recurrent_out", own.layout if carried is None else ())
-    return dressing.finished(memory, _beside(generation, found, width, size))
+    memory = give_memory(dressing, state, _rows)
+    return dressing.finished(memory, _beside(generation, found, width, state.size))
+
+
+def _rows(size: int) -> tuple[int | None, ...]:
+    return (None, size)
 
 
 def _take_observations(dressing: Dressing, generation: Generation) -> None:
@@ -112,46 +109,14 @@ def _take_masks(dressing: Dressing, generation: Generation) -> str | None:
 
 def _take_previous_action(dressing: Dressing, generation: Generation) -> TensorSpec | None:
     """Take ``prev_action``; returned where it is not fed and has to be kept with the memory."""
-    spec = next((s for s in dressing.policy.signature.inputs if s.role is Role.PREV_ACTION), None)
+    spec = previous_action(dressing)
     if spec is None:
         return None
     if not generation.previous:
         return spec
-    shape: tuple[int | None, ...] = (None, _columns(spec)) if generation.branches else (None,)
+    shape: tuple[int | None, ...] = (None, action_columns(spec)) if generation.branches else (None,)
     dressing.give_in(spec, dressing.take("prev_action", spec, shape, INT32))
     return None
-
-
-def _columns(previous: TensorSpec) -> int:
-    return int(previous.shape[1] or 1) if len(previous.shape) > 1 else 1
-
-
-def _take_memory(dressing: Dressing, carried: TensorSpec | None) -> int:
-    """Take ``recurrent_in``: the policy's memory, and behind it the last action where that is ``carried``."""
-    memory = dressing.policy.signature.memory
-    if memory is None or memory.input is None:
-        if carried is not None:
-            dressing.refuse(
-                f"nothing feeds its input {carried.name}",
-                why="ML-Agents 0.1 and 0.2 do not feed the last action, and the policy has no memory to keep it in",
-                fix="use a project of 0.3 or later (--for tfsharp-0.3)",
-            )
-        return 0
-    if memory.output is None:
-        feeding.refuse_lost_memory(dressing, memory.input)
-    spec = dressing.policy.signature.input(memory.input)
-    if carried is None:
-        dressing.give_in(spec, dressing.take("recurrent_in", spec, (None, memory.size)))
-        return memory.size
-    size, builder = memory.size + _columns(carried), dressing.builder
-    taken = dressing.take("recurrent_in", spec, (None, size))
-    dressing.give_in(spec, builder.slice(taken, 1, 0, memory.size))
-    dressing.give_in(carried, builder.slice(taken, 1, memory.size, size))
-    dressing.notes.append(
-        f"{dressing.profile} does not feed the last action: it is kept as the last number of the memory, "
-        f"so that the Memory Size of the brain is {size}"
-    )
-    return size
 
 
 def _give_action(dressing: Dressing, generation: Generation, found: Heads, masks: str | None) -> int:

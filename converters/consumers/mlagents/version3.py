@@ -1,6 +1,7 @@
 """API version 3: what ML-Agents' C# side looks up from release 17 on (2021), and still does in Unity 6.
 
-``obs_i`` for every sensor, ``action_masks``, ``prev_action``, ``recurrent_in`` [B, 1, M]; ``continuous_actions`` and
+``obs_i`` for every sensor, ``action_masks``, ``prev_action`` (not in 3.0 and 4.0, whose players cannot feed it),
+``recurrent_in`` [B, 1, M]; ``continuous_actions`` and
 ``discrete_actions``, both drawn in the model, ``deterministic_…`` of both, ``recurrent_out`` [B, 1, M]; constants as
 float32 outputs (BarracudaModelParamLoader.cs 2.3.0-exp.3, SentisModelInfo.cs 3.0.0 and 4.0.0; measured, see
 ``converters/consumers/unity``). Every input is float32: the Editor of release 22 takes no other.
@@ -11,29 +12,34 @@ from __future__ import annotations
 import numpy as np
 
 from converters.consumers.mlagents import input_mapping as feeding
+from converters.consumers.mlagents.memory import give_memory, previous_action, take_memory
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, samples
 from converters.policy.policy import Policy
 from signatures.roles import Role
-from signatures.spec import Memory
 
 _VERSION = 3
 _DETERMINISTIC = "deterministic_"
 
 
-def dress(policy: Policy, profile: str) -> Policy:
-    """The policy under the names of API version 3. Raises ProfileError where it cannot be held."""
+def dress(policy: Policy, profile: str, *, feeds_previous: bool = True) -> Policy:
+    """The policy under the names of API version 3; the last action is kept with the memory unless it is fed.
+
+    Raises ProfileError where it cannot be held.
+    """
     dressing = Dressing(policy, profile)
     feeding.refuse_parameters(dressing)
     for name, spec in feeding.observation_names(dressing):
         feeding.take_observation(dressing, name, spec)
     masks = feeding.take_masks(dressing)
-    feeding.take_previous_action(dressing)
-    size = _take_memory(dressing)
+    carried = None if feeds_previous else previous_action(dressing)
+    if carried is None:
+        feeding.take_previous_action(dressing)
+    state = take_memory(dressing, carried, _rows)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
     found = heads(dressing)
     dressing.constants["version_number"] = np.array([_VERSION], np.float32)
-    dressing.constants["memory_size"] = np.array([size], np.float32)
+    dressing.constants["memory_size"] = np.array([state.size], np.float32)
     plain: list[tuple[str, str]] = []
     if found.continuous is not None:
         drawn, without, width = continuous_rows(dressing, found.continuous)
@@ -49,26 +55,8 @@ def dress(policy: Policy, profile: str) -> Policy:
         plain.append(("discrete_actions", best))
     for name, without in plain:  # behind the actions, which a signature has first
         dressing.give(f"{_DETERMINISTIC}{name}", without, Role.DETERMINISTIC)
-    memory = None
-    if size:
-        own = policy.signature.memory
-        assert own is not None and own.output is not None
-        builder = dressing.builder
-        given = builder.add(
-            "Reshape", [dressing.own(own.output), builder.ints([-1, 1, size], "memory")], "recurrent_out/rows"
-        )
-        dressing.give("recurrent_out", given, Role.MEMORY_OUT)
-        memory = Memory(size, "recurrent_in", "recurrent_out", own.layout)
-    return dressing.finished(memory)
+    return dressing.finished(give_memory(dressing, state, _rows))
 
 
-def _take_memory(dressing: Dressing) -> int:
-    """The input ``recurrent_in`` [B, 1, M] of a policy with memory; returns M, 0 for none."""
-    memory = dressing.policy.signature.memory
-    if memory is None or memory.input is None:
-        return 0
-    if memory.output is None:
-        feeding.refuse_lost_memory(dressing, memory.input)
-    spec = dressing.policy.signature.input(memory.input)
-    dressing.give_in(spec, dressing.take("recurrent_in", spec, (None, 1, memory.size)))
-    return memory.size
+def _rows(size: int) -> tuple[int | None, ...]:
+    return (None, 1, size)
