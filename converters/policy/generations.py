@@ -7,6 +7,12 @@ from collections.abc import Collection, Mapping
 #: What ``version_number`` says from release 17 (0.26.0) on.
 TORCH_VERSION_3 = 3
 
+#: TanhGaussianDistInstance (torch_entities/distributions.py) has no ``deterministic_sample`` of its own, 0.28 to 1.1.
+SAC_MEAN = (
+    "deterministic_continuous_actions is the raw mean of SAC, neither squashed by tanh nor clipped (so ML-Agents 0.28 to "
+    "1.1 give it); it is exported as it is"
+)
+
 
 def generation(constants: Mapping[str, int | float], placeholders: Collection[str], ops: Collection[str]) -> str:
     """A label such as ``"ML-Agents 0.19.0"`` or ``"ML-Agents 0.3-0.4"``; ``"own model"`` where nothing tells.

@@ -79,9 +79,8 @@ def expected(case: Case, golden: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         assert action is not None
         found["continuous_actions" if hybrid else "action"] = action
         mean = golden.get("deterministic_continuous_actions")
-        if mean is not None:  # SAC's is the raw mean, a fault of the exporter
-            without = "deterministic_continuous_actions" if hybrid else "deterministic_action"
-            found[without] = np.tanh(mean) if case.trainer == "sac" else mean
+        if mean is not None:
+            found["deterministic_continuous_actions" if hybrid else "deterministic_action"] = mean
     if case.branches and "log_probs" in golden:
         found["action_log_probs"] = golden["log_probs"]
         if "deterministic_discrete_actions" in golden:
@@ -119,8 +118,6 @@ def test_is_the_policy_that_the_onnx_beside_it_is(case: Case) -> None:
     assert [getattr(ours.signature, f) for f in facts] == [getattr(theirs.signature, f) for f in facts]
     given = feeds(case, ours)
     names = [n for n, (role, *_) in exported.items() if role is not Role.SAMPLED]
-    if case.trainer == "sac":  # the exporter of 0.28 and later forgot the tanh of the deterministic one
-        names = [n for n in names if n not in ("deterministic_action", "deterministic_continuous_actions")]
     mine, other = run_graph(ours.graph, given, names), run_graph(theirs.graph, given, names)
     for name in names:
         assert mine[name].reshape(other[name].shape) == pytest.approx(other[name], abs=1e-6, rel=1e-5), name

@@ -19,7 +19,7 @@ from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
 from converters.policy.brains import depends_on_input
 from converters.policy.facts import SourceFacts
-from converters.policy.generations import torch_generation
+from converters.policy.generations import SAC_MEAN, torch_generation
 from signatures.contract import EMBEDDED
 from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, Role
 
@@ -109,10 +109,7 @@ def _of_torch(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts
         notes.append("discrete_actions stands for the same as action; it is exported once")
     raw = outputs.get("deterministic_continuous_actions")
     if raw is not None and "continuous_actions" in outputs and _squashed(model.graph, outputs["continuous_actions"]):
-        notes.append(
-            "deterministic_continuous_actions is the raw mean of SAC, neither squashed by tanh nor clipped (a fault of "
-            "ML-Agents 0.28 to 1.1); it is exported as it is"
-        )
+        notes.append(SAC_MEAN)
     return replace(
         facts,
         family=torch_generation(version, model.inputs, outputs),

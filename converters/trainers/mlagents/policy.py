@@ -27,7 +27,7 @@ import numpy as np
 from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
-from converters.policy.generations import TORCH_VERSION_3
+from converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
 from converters.trainers.mlagents.body import attended, body_width, goal_width, hidden_layers
 from converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
 from converters.trainers.mlagents.state import LET_IT_EXPORT, State
@@ -135,7 +135,7 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
         image_layout="NCHW",
         memory_layout=() if memory is None else ("h", "c"),
         outputs=dict.fromkeys(("version_number", "memory_size", *names)),
-        notes=tuple(_notes(generation, sensors, joined, guessed=trainer is None and conditional is True)),
+        notes=tuple(_notes(generation, sensors, joined, squashed=conditional is True, guessed=trainer is None)),
     )
     return net.graph(), facts
 
@@ -160,9 +160,13 @@ def _trainer(state: State, conditional: bool | None) -> str | None:
     return trainer
 
 
-def _notes(generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, guessed: bool) -> list[str]:
+def _notes(
+    generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, squashed: bool, guessed: bool
+) -> list[str]:
     notes = [pytorch_alone("ML-Agents", "a checkpoint")]
-    if guessed:
+    if squashed and generation.by_sensor:
+        notes.append(SAC_MEAN)
+    if squashed and guessed:
         notes.append("its deviation depends on the observation, as SAC's alone does: tanh is taken to bound its action")
     if joined and generation.by_sensor:
         size = next(s.shape[0] for s in sensors if len(s.shape) == 1)
@@ -270,6 +274,9 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
             net.output("continuous_actions", value)
             net.fact("continuous_action_output_shape", np.array([size]))
             names += ["continuous_actions", "continuous_action_output_shape"]
+            if squashed and generation.by_sensor:
+                net.output("deterministic_continuous_actions", mean)
+                names.append("deterministic_continuous_actions")
     branches = [f"{generation.discrete}.branches.{i}" for i in net.state.indices(f"{generation.discrete}.branches.")]
     if branches:
         value, sizes = _discrete(net, generation, x, branches)
