@@ -1,4 +1,4 @@
-"""``inspect --unity``: what Unity would say to a file, for the terminal."""
+"""``inspect --unity``: what Unity would say to a file and do with it, for the terminal."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 from converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
 from converters.consumers.unity.consumers import CONSUMERS, consumer
 from converters.consumers.unity.findings import Finding, Thrown
+from converters.consumers.unity.players import PLAYERS
+from converters.consumers.unity.playing import Played
 from converters.consumers.unity.settings import Brain, parse_actions, parse_sensors, read_brain
 from exporter.tables import paragraph
 from signatures.errors import UsageError
@@ -26,13 +28,14 @@ def check_for_unity(
     Raises UsageError for options that contradict each other, SourceError for what is no model of Unity's.
     """
     names = [name.strip() for given in releases for name in given.split(",") if name.strip()]
-    wanted = list(CONSUMERS.values()) if "all" in names else [consumer(name) for name in names]
+    wanted = list(CONSUMERS.values()) if "all" in names else []
+    wanted += [consumer(name) for name in names if name != "all"]
     agent = _agent(sensors, actions, brain)
     return [check_file(path, release, agent) for path in _files(source) for release in dict.fromkeys(wanted)]
 
 
 def accepted(verdicts: Sequence[UnityVerdict]) -> bool:
-    """Whether every file is accepted by every release with Deterministic Inference off."""
+    """Whether every release accepts every file and its player plays it, with Deterministic Inference off."""
     return all(verdict.accepted["stochastic"] for verdict in verdicts)
 
 
@@ -90,34 +93,59 @@ def _verdict_text(verdict: UnityVerdict) -> str:
         lines += [printable(f"  the agent{assumed}: {_agent_text(verdict.brain)}")]
         same = len({(m.load, m.checks, m.check_throws) for m in verdict.modes.values()}) == 1
         for mode, found in list(verdict.modes.items())[: 1 if same else None]:
-            lines += _mode_lines("" if same else f", {_MODES[mode]}", found)
+            lines += _mode_lines("" if same else f", {_MODES[mode]}", found, verdict.consumer.checks is not None)
     if verdict.misread:
         lines.append(f"  what {verdict.consumer.runtime} reads wrongly:")
         lines += [line for finding in verdict.misread for line in _told("misread", finding)]
-    if verdict.overlooked:
-        lines.append("  what Unity does not say:")
-        lines += [line for finding in verdict.overlooked for line in _told("in play", finding)]
+    if verdict.refused is None:
+        lines += _player_lines(verdict)
     return "\n".join(lines)
 
 
 def _summary(verdict: UnityVerdict) -> str:
     yes = [_MODES[mode] for mode, said in verdict.accepted.items() if said]
-    return "accepted" if len(yes) == len(_MODES) else f"accepted with {yes[0]} only" if yes else "not accepted"
+    if len(yes) == len(verdict.accepted):
+        return "accepted"
+    if yes:
+        return f"accepted with {yes[0]} only"
+    return "not accepted (checked, but not played)" if any(verdict.checked.values()) else "not accepted"
 
 
-def _mode_lines(title: str, found: ModeVerdict) -> list[str]:
+def _player_lines(verdict: UnityVerdict) -> list[str]:
+    """What the model of the player finds, which is no checker: it may fail on what the Inspector says nothing to."""
+    modes = verdict.modes
+    same = len({mode.played for mode in modes.values()}) == 1
+    source = PLAYERS[verdict.consumer.name].played
+    title = "the model of the player" + ("" if source == "run" else f" ({source})")
+    lines = []
+    for mode, found in list(modes.items())[: 1 if same else None]:
+        where = title if same else f"{title}, {_MODES[mode]}"
+        lines.append(f"  {where}:{'' if found.played else ' plays it'}")
+        if found.load is not None:
+            lines[-1] += " nothing is played, loading throws"
+            continue
+        for played in found.played:
+            lines += _told(played.outcome.value, played)
+            lines += paragraph(played.exception, " " * 6 + "throws: ", " " * 10).split("\n") if played.exception else []
+    return lines
+
+
+def _mode_lines(title: str, found: ModeVerdict, known: bool) -> list[str]:
+    """``known``: so are the checks of the release."""
     lines = [f"  loading for running{title}: {'ok' if found.load is None else ''}".rstrip()]
     if found.load is not None:
         lines += _thrown_lines(found.load)
     if found.check_throws is not None and found.check_throws == found.load:
         return [*lines, f"  the Inspector{title}: the same exception in place of a list"]
+    if not known:
+        return [*lines, "  the Inspector: the checks of this release are not known"]
     listed = [line for finding in found.checks for line in _told(finding.severity.value, finding)]
     if found.check_throws is not None:
         listed = _thrown_lines(found.check_throws)
     return [*lines, f"  the Inspector{title}: {'' if listed else 'nothing to say'}".rstrip(), *listed]
 
 
-def _told(kind: str, said: Finding | Thrown) -> list[str]:
+def _told(kind: str, said: Finding | Thrown | Played) -> list[str]:
     """A finding or an exception: what, where and what to do."""
     lines = []
     for head, text in ((f"{kind}: ", said.message), ("  where: ", said.where), ("  fix: ", said.fix)):

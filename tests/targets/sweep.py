@@ -99,8 +99,8 @@ def tried(
         if other is not None:
             return "wrong", other
         for release, verdict in pair.verdicts(Path(folder)).items():
-            modes = ["stochastic"] if wanted.name == "barracuda-1.0" else list(verdict.accepted)
-            if not all(verdict.accepted[mode] for mode in modes):
+            modes = ["stochastic"] if wanted.name == "barracuda-1.0" else list(verdict.checked)
+            if not all(verdict.checked[mode] for mode in modes):
                 return "wrong", f"{release} does not accept it"
     return "held", ""
 
@@ -112,7 +112,7 @@ def _tried_own(policy: Policy, wanted: Profile, pool: RuntimePool | None, folder
         assert_answers(policy, model, BATCHES)
     path = folder / "policy.nn"
     path.write_bytes(encode(model))
-    accepted = [check_file(path, consumer(r)).accepted["stochastic"] for r in wanted.checkers if not model.memories]
+    accepted = [check_file(path, consumer(r)).checked["stochastic"] for r in wanted.checkers if not model.memories]
     return ("held", "") if all(accepted) else ("wrong", "R20 does not accept it")
 
 

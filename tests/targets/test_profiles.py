@@ -83,8 +83,8 @@ def is_held(path: Path, plain: Plain, wanted: Profile, folder: Path) -> bool:
         assert pair.difference(rows, seed) is None, (policy.name, wanted.name, rows)
     for name, verdict in pair.verdicts(folder).items():
         # releases 1 to 16 know no deterministic inference
-        modes = ["stochastic"] if wanted.name == "barracuda-1.0" else list(verdict.accepted)
-        assert all(verdict.accepted[mode] for mode in modes), (policy.name, name, verdict.to_dict())
+        modes = ["stochastic"] if wanted.name == "barracuda-1.0" else list(verdict.checked)
+        assert all(verdict.checked[mode] for mode in modes), (policy.name, name, verdict.to_dict())
     return True
 
 
@@ -357,7 +357,7 @@ def test_a_fixture_as_nn_of_version_3_acts_the_same_and_is_accepted(path: Path, 
         for seed, rows in enumerate(BATCHES):
             assert pair.difference(rows, seed) is None, (policy.name, rows)
         (verdict,) = pair.verdicts(tmp_path).values()
-        assert all(verdict.accepted.values()), verdict.to_dict()
+        assert all(verdict.checked.values()), verdict.to_dict()
 
 
 @pytest.mark.parametrize(("wanted", "version"), [("barracuda-1.0", 2), ("barracuda-1.4", 3), ("barracuda-3", 3)])

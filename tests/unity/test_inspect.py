@@ -12,12 +12,15 @@ from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
 from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS
+from converters.consumers.unity.consumers import CONSUMERS, EARLIER
 from converters.consumers.unity.settings import Brain, sensors_of
 from exporter.cli.app import app
 from signatures.errors import UsageError
 from tests.commands import export_model, is_refused
 from tests.unity.policies import Draft
+
+BOTH = {"stochastic": True, "deterministic": True}
+BOTH_NOT = {"stochastic": False, "deterministic": False}
 
 
 def run(*arguments: object) -> Result:
@@ -25,7 +28,7 @@ def run(*arguments: object) -> Result:
 
 
 def in_play(path: Path, release: str = "R22", brain: Brain | None = None) -> list[str]:
-    return [finding.message for finding in check_file(path, CONSUMERS[release], brain).overlooked]
+    return [played.message for played in check_file(path, CONSUMERS[release], brain).played]
 
 
 def test_an_accepted_policy_has_status_0_and_nothing_to_say(tmp_path: Path) -> None:
@@ -92,13 +95,54 @@ def test_options_that_say_nothing_are_refused(tmp_path: Path, options: list[str]
     assert isinstance(result.exception, UsageError)
 
 
-# ------------------------------------------------------------------ what Unity does not say
+# ------------------------------------------------------------------ what the player does
+
+
+def test_what_the_player_cannot_play_is_not_accepted_though_it_is_checked(tmp_path: Path) -> None:
+    draft = Draft()
+    draft.inputs["sequence_length"] = (TensorProto.FLOAT, [1])
+    path = draft.write(tmp_path)
+    said = run(path, "--unity", "R22")
+    assert said.exit_code == 1
+    assert "not accepted (checked, but not played) by R22" in said.output
+    assert "the Inspector: nothing to say" in said.output and "the model of the player:" in said.output
+    assert "throws: InvalidCastException: Unable to cast" in " ".join(said.output.split())
+    found = json.loads(run(path, "--unity", "R22,R20", "--json").output)
+    first, second = found["verdicts"]
+    assert found["accepted"] is False
+    assert (first["accepted"], first["checked"]) == (BOTH_NOT, BOTH) and first["plays"] == BOTH_NOT
+    assert first["stochastic"]["played"][0]["outcome"] == "throws at the first decision"
+    assert second["accepted"] == second["plays"] == BOTH and second["overlooked"] == []
+
+
+def test_a_warning_of_the_player_alone_is_accepted(tmp_path: Path) -> None:
+    draft = Draft(constants={"version_number": 3.0, "memory_size": 9.0, "continuous_action_output_shape": 2.0})
+    for name in ("recurrent_in", "recurrent_out"):
+        draft.inputs[name] = (TensorProto.FLOAT, ["N", 1, 8])
+    model = draft.model()
+    model.graph.output.append(model.graph.input.pop())
+    model.graph.node.append(helper.make_node("Identity", ["recurrent_in"], ["recurrent_out"]))
+    path = tmp_path / "memory.onnx"
+    path.write_bytes(model.SerializeToString())
+    said = run(path, "--unity", "R22")
+    assert said.exit_code == 0, said.output
+    assert "plays, with a warning: memory_size says 9" in said.output
+
+
+@pytest.mark.parametrize("release", list(EARLIER))
+def test_earlier_players_are_asked_by_name(tmp_path: Path, release: str) -> None:
+    result = run(Draft().write(tmp_path), "--unity", release)
+    plays = release == "2.0.1"  # the others know vector_observation alone
+    assert result.exit_code == (0 if plays else 1)
+    assert (f": accepted by {release}" in result.output) is plays
+    assert ("Unknown tensorProxy expected as input : obs_0" in " ".join(result.output.split())) is not plays
 
 
 def test_an_output_that_only_resembles_the_name_is_missed_in_play(tmp_path: Path) -> None:
     path = Draft(actions={"Brain/continuous_actions": 2}).write(tmp_path)
-    assert check_file(path, CONSUMERS["R22"]).accepted["stochastic"]
-    assert in_play(path) == ["a player fetches the output continuous_actions, which the file does not have"]
+    verdict = check_file(path, CONSUMERS["R22"])
+    assert verdict.checked["stochastic"] and not verdict.accepted["stochastic"]
+    assert in_play(path)[:1] == ["a player fetches the output continuous_actions, which the file does not have"]
 
 
 def test_a_memory_without_its_output_is_missed_in_play(tmp_path: Path) -> None:
@@ -107,13 +151,15 @@ def test_a_memory_without_its_output_is_missed_in_play(tmp_path: Path) -> None:
     draft.constants["memory_size"] = 16.0
     found = in_play(draft.write(tmp_path))
     assert "a player fetches the output recurrent_out, which the file does not have" in found
-    assert "recurrent_in is [N, 1, 8], and a memory of memory_size 16 is carried as [N, 1, 16]" in found
+    assert "memory_size says 16 and recurrent_in has 8 numbers: players go by the latter" in found
 
 
-def test_widths_are_compared_with_the_constants(tmp_path: Path) -> None:
+def test_widths_are_compared_with_the_agent(tmp_path: Path) -> None:
     path = Draft(actions={"continuous_actions": 3, "deterministic_continuous_actions": 2}).write(tmp_path)
-    assert check_file(path, CONSUMERS["R20"]).accepted["stochastic"]
-    assert in_play(path, "R20") == ["the output continuous_actions has 3 columns, and the file's constant says 2"]
+    verdict = check_file(path, CONSUMERS["R20"])
+    assert verdict.checked == {"stochastic": True, "deterministic": True}
+    assert verdict.accepted == {"stochastic": False, "deterministic": True}
+    assert in_play(path, "R20") == ["continuous_actions has 3 columns and the agent 2"]
 
 
 def test_a_mask_of_another_width_and_a_fixed_batch_are_told(tmp_path: Path) -> None:
@@ -123,9 +169,9 @@ def test_a_mask_of_another_width_and_a_fixed_batch_are_told(tmp_path: Path) -> N
         {"version_number": 3.0, "memory_size": 0.0, "discrete_action_output_shape": [3.0, 2.0]},
     )
     found = in_play(draft.write(tmp_path), brain=Brain(0, (3, 2), sensors=sensors_of([[5]])))
-    assert "action_masks has 6 columns, and the branches together 5" in found
-    assert "obs_0 is declared for 4 agents, and a player feeds as many as decide at once" in found
-    assert any(text.startswith("the output discrete_actions is given out as floats") for text in found)
+    assert "action_masks has 6 columns, and the agent's branches together 5 (not run)" in found
+    assert "obs_0 is declared for 4 agents: with any other number deciding at once the player throws" in found
+    assert "discrete_actions is given out as floats, and read as integers" in found
 
 
 def test_actions_of_a_kind_that_is_not_fetched_are_told(tmp_path: Path) -> None:
@@ -141,8 +187,8 @@ def test_actions_of_a_kind_that_is_not_fetched_are_told(tmp_path: Path) -> None:
     )
     draft.inputs["action_masks"] = (TensorProto.FLOAT, ["N", 3])
     path = draft.write(tmp_path)
-    assert check_file(path, CONSUMERS["R20"]).accepted["stochastic"]
-    told = "no continuous_actions are fetched (stochastic inference), and the agent has some: they stay 0"
+    assert check_file(path, CONSUMERS["R20"]).checked["stochastic"]
+    told = "no continuous_actions are fetched, and the agent has some: they stay 0 (read, not run)"
     assert told in in_play(path, "R20")
 
 

@@ -61,9 +61,9 @@ def onnx_ranks(file: OnnxFile, model: CheckedModel) -> list[int]:
 
 
 def nn_ranks(model: NnModel) -> list[int]:
-    """A ``.nn`` has four axes everywhere; a vector is one with height and width 1."""
+    """A ``.nn`` has four axes everywhere; a vector is one with height and width 1, a list of entities has height 1."""
     shapes = [four_axes(i.shape, f"input {i.name!r}") for i in model.inputs]
-    return [2 if shape[1:3] == (1, 1) else 4 for shape in shapes]
+    return [2 if shape[1:3] == (1, 1) else 3 if shape[1] == 1 else 4 for shape in shapes]
 
 
 def _actions(model: CheckedModel) -> tuple[int, tuple[int, ...]]:

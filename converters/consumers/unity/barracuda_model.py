@@ -13,8 +13,19 @@ from typing import Any
 
 import numpy as np
 
+from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
-from converters.consumers.unity.model import MEMORY_SIZE, VERSION, CheckedModel, InputView, truncated
+from converters.consumers.unity.model import (
+    ACTION,
+    CONTINUOUS,
+    DISCRETE,
+    DISCRETE_SHAPE,
+    MEMORY_SIZE,
+    VERSION,
+    CheckedModel,
+    InputView,
+    truncated,
+)
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from converters.formats.barracuda.format import NnModel, four_axes
 from signatures.records import dataclass
@@ -71,16 +82,51 @@ class BarracudaModel(CheckedModel):
         return super().fetched(deterministic)
 
 
-def of_onnx(file: OnnxFile) -> BarracudaModel:
+@dataclass(frozen=True)
+class EarlierModel(BarracudaModel):
+    """A model in ML-Agents 1.x: a missing shape of actions is not expected, and memories are outputs of their own.
+
+    ``action_alone``: no other output has actions. ``kept`` are the outputs that the memories are made of.
+    """
+
+    kept: tuple[str, ...] = ()
+    action_alone: bool = False
+
+    def has_discrete(self, deterministic: bool) -> bool:
+        """As for continuous actions, the first number of the shape is read without a look whether it is there."""
+        if self.names_kinds and self.has_output(DISCRETE):
+            self._first(DISCRETE_SHAPE)
+        return super().has_discrete(deterministic)
+
+    @property
+    def names_kinds(self) -> bool:
+        """Whether actions come under names of their kind, which the first releases do not know."""
+        return not self.action_alone and super().names_kinds
+
+    def fetched(self, deterministic: bool) -> tuple[str, ...]:
+        """``action``, or the actions by their kinds, and the memories."""
+        memory = self.kept if self.memory_size > 0 else ()
+        if self.action_alone:
+            return (ACTION, *memory)
+        kinds = ((CONTINUOUS, self.has_continuous(False)), (DISCRETE, self.has_discrete(False)))
+        names = [name for name, there in kinds if there]
+        return (*(names if self.names_kinds else [ACTION] if names else []), *memory)
+
+
+def of_onnx(file: OnnxFile, consumer: Consumer) -> BarracudaModel:
     """The model that the ONNX importer makes; ``importing.refusal`` has said before that it takes the file."""
     memories, taken = _memories(file)
-    inputs = [_input(file, i.name, i.dims or ()) for i in file.inputs if i.name not in taken]
+    kept = _keeps_all_nhwc(file) if not consumer.reads_version else None
+    inputs = [_input(file, i.name, i.dims or (), kept) for i in file.inputs if i.name not in taken]
     found = {name: file.value(name) for name in file.outputs}
     constants = {trimmed(n): v.astype(np.float64).ravel() for n, v in found.items() if v is not None}
-    return BarracudaModel(tuple(inputs), tuple(trimmed(n) for n in file.outputs), memories, constants)
+    outputs = tuple(trimmed(n) for n in file.outputs)
+    if consumer.reads_version:
+        return BarracudaModel(tuple(inputs), outputs, memories, constants)
+    return EarlierModel(tuple(inputs), outputs, memories, constants, (), consumer.fetches_action_alone)
 
 
-def of_nn(model: NnModel) -> BarracudaModel:
+def of_nn(model: NnModel, consumer: Consumer) -> BarracudaModel:
     """The model that a ``.nn`` holds: constants are datasets of that name, wherever they lie."""
     inputs = []
     for given in model.inputs:
@@ -91,7 +137,12 @@ def of_nn(model: NnModel) -> BarracudaModel:
         for dataset in layer.datasets:
             end = dataset.offset + dataset.length
             constants.setdefault(dataset.name, model.weights[dataset.offset : end].astype(np.float64))
-    return BarracudaModel(tuple(inputs), model.outputs, tuple(m.input for m in model.memories), constants)
+    memories, kept = tuple(m.input for m in model.memories), tuple(m.output for m in model.memories)
+    if consumer.reads_version:
+        return BarracudaModel(tuple(inputs), model.outputs, memories, constants)
+    # what a memory becomes is fetched by its name, whether or not the file lists it
+    outputs = (*model.outputs, *kept)
+    return EarlierModel(tuple(inputs), outputs, memories, constants, kept, consumer.fetches_action_alone)
 
 
 def trimmed(name: str) -> str:
@@ -99,10 +150,11 @@ def trimmed(name: str) -> str:
     return name.removesuffix(":0")
 
 
-def _input(file: OnnxFile, name: str, dims: Dims) -> InputView:
+def _input(file: OnnxFile, name: str, dims: Dims, keeps_nhwc: bool | None) -> InputView:
+    """``keeps_nhwc`` is what the importer decides for all inputs at once, None where it looks at each."""
     lengths = [d or 0 for d in dims]
     height = width = channels = 1
-    if len(lengths) == 4 and _kept_nhwc(file, name):
+    if len(lengths) == 4 and (_kept_nhwc(file, name) if keeps_nhwc is None else keeps_nhwc):
         height, width, channels = lengths[1:]
     elif len(lengths) >= 2:
         channels = lengths[1]
@@ -120,6 +172,17 @@ def _kept_nhwc(file: OnnxFile, name: str) -> bool:
                 return True
             if node.op_type == "Reshape" and _moves_one_channel(file, name, made):
                 return True
+    return False
+
+
+def _keeps_all_nhwc(file: OnnxFile) -> bool:
+    """Whether Barracuda 1.3 takes a file for TensorFlow's: a Transpose to NCHW that a Conv reads
+    (cases/gray_camera_barracuda-1.0, where two cameras are NCHW and both are taken for NHWC).
+    """
+    for node in file.model.graph.node:
+        perm = attributes(node).get("perm")
+        if node.op_type == "Transpose" and perm is not None and tuple(perm.ints) == _TO_NCHW:
+            return any(r.op_type == "Conv" and r.input[0] == node.output[0] for r in file.readers(node.output[0]))
     return False
 
 

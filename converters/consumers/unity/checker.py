@@ -1,21 +1,23 @@
-"""What Unity would say to a file: importing it, loading it for running, and the Inspector's list."""
+"""What Unity would do with a file: importing it, loading it for running, the Inspector's list, and playing it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from converters.consumers.unity import barracuda_model, importing, rules, sentis_model
 from converters.consumers.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
 from converters.consumers.unity.constructs import INPUT, OUTPUT, constructs
-from converters.consumers.unity.consumers import Consumer, Engine
+from converters.consumers.unity.consumers import CONSUMERS, Consumer, Engine
 from converters.consumers.unity.findings import Finding, Severity, Thrown, UnityThrows
 from converters.consumers.unity.model import CheckedModel
 from converters.consumers.unity.onnx_file import OnnxFile, read_onnx_file
-from converters.consumers.unity.overlooked import overlooked
+from converters.consumers.unity.players import PLAYERS, Outcome
+from converters.consumers.unity.playing import Played, play, throws
 from converters.consumers.unity.readings import Reading, misreadings
+from converters.consumers.unity.scene import Scene
 from converters.consumers.unity.settings import Brain
 from converters.files.fetch import Fetched, read_bytes
 from converters.formats.barracuda import format as nn_format
@@ -37,23 +39,38 @@ class ModeVerdict:
 
     ``load`` is what loading for running throws; ``checks`` the Inspector's list, in its order, and ``check_throws`` the
     exception that takes its place; ``fetched`` the outputs that a player fetches, or the exception of finding them.
+    ``played`` is what the player trips over.
     """
 
     load: Thrown | None
     checks: tuple[Finding, ...]
     check_throws: Thrown | None = None
     fetched: tuple[str, ...] | Thrown = ()
+    played: tuple[Played, ...] = ()
+
+    @property
+    def checked(self) -> bool:
+        """Whether it loads and the Inspector's list is empty."""
+        return self.load is None and self.check_throws is None and not self.checks
+
+    @property
+    def plays(self) -> bool:
+        """Whether the model of the player plays it."""
+        return not any(played.fails for played in self.played)
 
     @property
     def accepted(self) -> bool:
-        """Whether it loads and the Inspector's list is empty."""
-        return self.load is None and self.check_throws is None and not self.checks
+        """Whether the checker accepts it and the player plays it."""
+        return self.checked and self.plays
 
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
         fetched = self.fetched.to_dict() if isinstance(self.fetched, Thrown) else list(self.fetched)
         return {
             "accepted": self.accepted,
+            "checked": self.checked,
+            "plays": self.plays,
+            "played": [p.to_dict() for p in self.played],
             "load": None if self.load is None else self.load.to_dict(),
             "check": [f.to_dict() for f in self.checks],
             "check_throws": None if self.check_throws is None else self.check_throws.to_dict(),
@@ -65,9 +82,8 @@ class ModeVerdict:
 class UnityVerdict:
     """What one release says to one file with one set of Behavior Parameters.
 
-    ``refused`` is what the import throws; ``modes`` is empty then. ``overlooked`` is what Unity does not say and a
-    player trips over, ``misread`` what of the graph its importer takes for something else. ``assumed``: nobody gave
-    the parameters, they were taken from the file.
+    ``refused`` is what the import throws; ``modes`` is empty then. ``misread`` is what of the graph its importer takes
+    for something else. ``assumed``: nobody gave the parameters, they were taken from the file.
     """
 
     path: Path
@@ -75,14 +91,29 @@ class UnityVerdict:
     brain: Brain
     refused: Thrown | None
     modes: Mapping[str, ModeVerdict] = field(default_factory=dict)
-    overlooked: tuple[Finding, ...] = ()
     misread: tuple[Finding, ...] = ()
     assumed: bool = False
 
     @property
     def accepted(self) -> Mapping[str, bool]:
-        """Mode → whether the file is accepted in it."""
-        return {mode: mode in self.modes and self.modes[mode].accepted for mode in MODES}
+        """Mode → whether the checker accepts the file in it and the player plays it."""
+        return {mode: mode in self.modes and self.modes[mode].accepted for mode in modes_of(self.consumer)}
+
+    @property
+    def checked(self) -> Mapping[str, bool]:
+        """Mode → whether the checker accepts the file in it; nothing where the checker is not known."""
+        known = () if self.consumer.checks is None else modes_of(self.consumer)
+        return {mode: mode in self.modes and self.modes[mode].checked for mode in known}
+
+    @property
+    def plays(self) -> Mapping[str, bool]:
+        """Mode → whether the model of the player plays the file."""
+        return {mode: mode in self.modes and self.modes[mode].plays for mode in modes_of(self.consumer)}
+
+    @property
+    def played(self) -> tuple[Played, ...]:
+        """What the player trips over, in either mode, each once."""
+        return tuple(dict.fromkeys(played for mode in self.modes.values() for played in mode.played))
 
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -93,11 +124,23 @@ class UnityVerdict:
             "brain": self.brain.to_dict(),
             "brain_assumed": self.assumed,
             "accepted": dict(self.accepted),
+            "checked": dict(self.checked),
+            "plays": dict(self.plays),
+            "player": PLAYERS[self.consumer.name].played,
             "import": None if self.refused is None else self.refused.to_dict(),
             **{mode: verdict.to_dict() for mode, verdict in self.modes.items()},
-            "overlooked": [f.to_dict() for f in self.overlooked],
+            "overlooked": [
+                {"severity": "warning", "message": p.message, "where": p.where, "fix": p.fix}
+                for p in self.played
+                if p.outcome not in (Outcome.REFUSED, Outcome.LOADING)
+            ],
             "misread": [f.to_dict() for f in self.misread],
         }
+
+
+def modes_of(consumer: Consumer) -> tuple[str, ...]:
+    """The modes of inference that a release has."""
+    return tuple(mode for mode, deterministic in MODES.items() if consumer.deterministic or not deterministic)
 
 
 def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> UnityVerdict:
@@ -121,7 +164,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
         return UnityVerdict(path, consumer, brain or Brain(), refused, misread=wrong, assumed=brain is None)
     model: CheckedModel
     if consumer.engine is Engine.BARRACUDA:
-        model = barracuda_model.of_onnx(file)
+        model = barracuda_model.of_onnx(file, consumer)
     else:
         model = sentis_model.of_onnx(file, consumer)
     return _imported(path, consumer, brain, model, onnx_ranks(file, model), file, wrong)
@@ -140,7 +183,7 @@ def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdi
     if refused is not None:
         return UnityVerdict(path, consumer, brain or Brain(), refused, assumed=brain is None)
     parsed = nn_format.parse(data)
-    return _imported(path, consumer, brain, barracuda_model.of_nn(parsed), nn_ranks(parsed))
+    return _imported(path, consumer, brain, barracuda_model.of_nn(parsed, consumer), nn_ranks(parsed), nn=parsed)
 
 
 def _imported(
@@ -151,14 +194,17 @@ def _imported(
     ranks: Sequence[int],
     file: OnnxFile | None = None,
     wrong: tuple[Finding, ...] = (),
+    nn: nn_format.NnModel | None = None,
 ) -> UnityVerdict:
     """The verdict on a model that was imported; ``ranks`` are the numbers of axes of its inputs."""
-    agent = brain or assumed_brain(model, ranks)
-    modes = {name: _mode(model, consumer, agent, deterministic, file) for name, deterministic in MODES.items()}
-    fetched = {name: mode.fetched for name, mode in modes.items() if mode.load is None}  # past loading
-    silent = [name for name, mode in modes.items() if mode.accepted]
-    unsaid = overlooked(model, agent, fetched, silent, consumer, file)
-    return UnityVerdict(path, consumer, agent, None, modes, unsaid, wrong, brain is None)
+    # a release that lays pictures out wrongly is no witness of what the agent sees
+    seen = model if file is None or consumer.reads_version else barracuda_model.of_onnx(file, CONSUMERS["R20"])
+    agent = brain or assumed_brain(seen, ranks)
+    modes = {}
+    for name in modes_of(consumer):
+        judged = _mode(model, consumer, agent, MODES[name], file)
+        modes[name] = replace(judged, played=_played(judged, consumer, model, agent, file, nn))
+    return UnityVerdict(path, consumer, agent, None, modes, wrong, brain is None)
 
 
 def _mode(
@@ -168,14 +214,29 @@ def _mode(
         thrown = sentis_model.failure(file, consumer) or _tried(lambda: model.load(deterministic))
         if thrown is not None:
             return ModeVerdict(thrown, (), thrown, thrown)
-    checks = _tried(lambda: rules.check(model, brain, deterministic, consumer.profile))
+    checks = _tried(lambda: rules.check(model, brain, deterministic, consumer))
     fetched = _tried(lambda: model.fetched(deterministic))
-    load = _tried(lambda: rules.version_error(model, consumer.profile))
+    load = _tried(lambda: rules.version_error(model, consumer.profile)) if consumer.reads_version else None
     if isinstance(load, Finding):
         load = Thrown("UnityAgentsException", load.message, load.where, load.fix)
     if isinstance(checks, Thrown):
         return ModeVerdict(load, (), checks, fetched)
     return ModeVerdict(load, tuple(checks), None, fetched)
+
+
+def _played(
+    judged: ModeVerdict,
+    consumer: Consumer,
+    model: CheckedModel,
+    brain: Brain,
+    file: OnnxFile | None,
+    nn: nn_format.NnModel | None,
+) -> tuple[Played, ...]:
+    for thrown in (judged.load, judged.fetched):
+        if isinstance(thrown, Thrown):
+            return (throws(Outcome.LOADING, thrown),)
+    assert not isinstance(judged.fetched, Thrown)
+    return play(Scene(consumer, model, brain, judged.fetched, file, nn))
 
 
 def _tried(step: Callable[[], _Result]) -> _Result | Thrown:

@@ -1,8 +1,9 @@
 """The consumers whose behaviour is known: releases of ML-Agents' C# package, each with the runtime it stands on.
 
-Measured are exactly these pairs. ML-Agents 3.0.0 and 4.0.0 have the same checker; between Sentis 2.1.3 and Inference
-Engine 2.2.2 no verdict differs. ML-Agents 4.0.1 depends on Inference Engine 2.4.1; the checker of 4.0.0 was run on
-2.4.0 in its place.
+Measured are exactly these pairs. Before release 20 it is the players that were run, on whole files and small models,
+and their checkers on the same; what their importers misread stands in ``readings``. ML-Agents 3.0.0 and 4.0.0 have the
+same checker; between Sentis 2.1.3 and Inference Engine 2.2.2 no verdict differs. ML-Agents 4.0.1 depends on Inference
+Engine 2.4.1; the checker of 4.0.0 was run on 2.4.0 in its place.
 """
 
 from __future__ import annotations
@@ -20,6 +21,14 @@ class Engine(Enum):
     SENTIS = "Sentis"
 
 
+class Checks(Enum):
+    """The generations of ML-Agents' checks: what they know of versions and of deterministic actions."""
+
+    VERSION_2 = "1.9"
+    VERSION_3 = "2.0"
+    DETERMINISTIC = "2.3"
+
+
 @dataclass(frozen=True, slots=True)
 class Consumer:
     """A release and what tells it from the others.
@@ -27,6 +36,11 @@ class Consumer:
     ``namespace`` stands in the text of a failed cast; ``strips_zero``: the importer takes ``:0`` from the end of
     names; ``reads_value_float``: it reads a Constant with ``value_float``; ``trips_on_reshape``: an output that is
     Identity of another output made by Reshape cannot be imported. ``profile`` is the ``--for`` that writes for it.
+
+    ``checks`` are ML-Agents' checks that are known (None: not these); ``deterministic``: there is Deterministic
+    Inference; ``reads_version``: the player goes by ``version_number``, and refuses what it does not know;
+    ``feeds_entities``: there are sensors of two axes; ``fetches_action_alone``: no other output has actions.
+    ``refusals``: what its importer refuses is known (``importing``), not only what it misreads (``readings``).
     """
 
     name: str
@@ -38,6 +52,12 @@ class Consumer:
     strips_zero: bool = True
     reads_value_float: bool = False
     trips_on_reshape: bool = False
+    checks: Checks | None = Checks.DETERMINISTIC
+    deterministic: bool = True
+    reads_version: bool = True
+    feeds_entities: bool = True
+    fetches_action_alone: bool = False
+    refusals: bool = True
 
     @property
     def title(self) -> str:
@@ -64,11 +84,52 @@ CONSUMERS = {
         ),
     )
 }
+#: Releases before those, whose players are known, and of whose checks less.
+EARLIER = {
+    consumer.name: consumer
+    for consumer in (
+        Consumer(
+            "2.0.1",
+            "ML-Agents 2.0.1",
+            "Barracuda 2.0.0",
+            Engine.BARRACUDA,
+            "barracuda-1.4",
+            checks=Checks.VERSION_3,
+            deterministic=False,
+            refusals=False,
+        ),
+        Consumer(
+            "1.9.1",
+            "ML-Agents 1.9.1",
+            "Barracuda 1.3.2",
+            Engine.BARRACUDA,
+            "barracuda-1.0",
+            checks=Checks.VERSION_2,
+            deterministic=False,
+            reads_version=False,
+            refusals=False,
+        ),
+        Consumer(
+            "1.0.8",
+            "ML-Agents 1.0.8",
+            "Barracuda 1.0.4",
+            Engine.BARRACUDA,
+            "barracuda-1.0",
+            checks=None,
+            deterministic=False,
+            reads_version=False,
+            feeds_entities=False,
+            fetches_action_alone=True,
+            refusals=False,
+        ),
+    )
+}
 
 
 def consumer(name: str) -> Consumer:
     """A consumer by name, in any case of letters. Raises UsageError with the names there are."""
-    for known, found in CONSUMERS.items():
+    every = {**CONSUMERS, **EARLIER}
+    for known, found in every.items():
         if known.lower() == name.strip().lower():
             return found
-    raise UsageError(f"--unity {name}: not a release whose rules are known", fix=f"one of {', '.join(CONSUMERS)}")
+    raise UsageError(f"--unity {name}: not a release whose rules are known", fix=f"one of {', '.join(every)}")

@@ -11,6 +11,7 @@ from typing import Any
 
 from converters.consumers.unity.consumers import Consumer, Engine
 from converters.consumers.unity.findings import Thrown, null_reference
+from converters.consumers.unity.model import RECURRENT_IN
 from converters.consumers.unity.onnx_file import OnnxFile, attributes
 
 #: The operators of Barracuda 3.0.0 (its manual, and the constructs that were run).
@@ -47,6 +48,11 @@ def refusal(file: OnnxFile, consumer: Consumer) -> Thrown | None:
     for given in file.inputs:
         if given.dims is None:
             return null_reference(f"input {given.name}", "declare a shape for the input")
+        if not consumer.reads_version and given.name == RECURRENT_IN and given.dims[:1] == (1,):
+            text = f"The given key '{RECURRENT_IN}' was not present in the dictionary."  # minimal model mem_1NM
+            return Thrown("KeyNotFoundException", text, f"input {given.name}", "put the batch first: [N, 1, M]")
+    if not consumer.refusals:
+        return None
     found = _by_barracuda(file) if consumer.engine is Engine.BARRACUDA else _by_sentis(file, consumer)
     return next(found, None)
 

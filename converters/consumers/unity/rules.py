@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from converters.consumers.unity.consumers import Checks, Consumer
 from converters.consumers.unity.findings import Finding, Severity, warning
 from converters.consumers.unity.model import (
     ACTION,
@@ -43,20 +44,22 @@ _SIGNS = "_-,;:!?.'\"()[]{}@*/\\&#%`^+<=>|~$"
 Findings = Iterator[Finding]
 
 
-def check(model: CheckedModel, brain: Brain, deterministic: bool, profile: str) -> list[Finding]:
-    """The list that the Inspector shows. Raises UnityThrows where the check itself ends in an exception.
+def check(model: CheckedModel, brain: Brain, deterministic: bool, consumer: Consumer) -> list[Finding]:
+    """The list that the Inspector shows. Raises UnityThrows where the check itself ends in an exception."""
+    return (
+        [] if consumer.checks is None else list(_checks(model, brain, deterministic, consumer.profile, consumer.checks))
+    )
 
-    ``profile`` is the ``--for`` that the advice names.
-    """
-    return list(_checks(model, brain, deterministic, profile))
 
-
-def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str) -> Findings:
-    missing = next(_expected(model, deterministic, profile), None)
+def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str, known: Checks) -> Findings:
+    missing = next(_expected(model, deterministic, profile, known), None)
     if missing is not None:
         yield missing
         return
-    refused = version_error(model, profile)
+    if known is Checks.VERSION_2 and model.version != FIRST_VERSION:
+        yield _another_version(model.version, profile)
+        return
+    refused = version_error(model, profile) if known is not Checks.VERSION_2 else None
     if refused is not None:
         yield refused
     if model.memory_size == -1:
@@ -71,7 +74,7 @@ def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str
         yield from _shapes(model, brain, _testers_of_version_2(brain), spared="visual_observation")
     elif model.version == LAST_VERSION:
         yield from _inputs_of_version_3(model, brain, deterministic, profile)
-        yield from _shapes(model, brain, {_observation(i): _tester(sensor) for i, sensor in enumerate(brain.sensors)})
+        yield from _shapes(model, brain, {observation(i): _tester(sensor) for i, sensor in enumerate(brain.sensors)})
     yield from _actions(model, brain)
 
 
@@ -108,7 +111,22 @@ def version_error(model: CheckedModel, profile: str) -> Finding | None:
 # ------------------------------------------------------------------ what must be there before anything is looked at
 
 
-def _expected(model: CheckedModel, deterministic: bool, profile: str) -> Findings:
+def _another_version(version: int, profile: str) -> Finding:
+    """What ML-Agents 1.x says, which knows version 2 alone."""
+    text = (
+        "Model was trained with a newer version of the trainer than is supported. Either retrain with an older "
+        f"trainer, or update to a newer version of {_PACKAGE}.\n"
+        f"Model version: {version} Supported version: {FIRST_VERSION}"
+    )
+    if version < FIRST_VERSION:
+        text = (
+            f"Version of the trainer the model was trained with ({version}) is not compatible with the Brain's version "
+            f"({FIRST_VERSION})."
+        )
+    return Finding(Severity.ERROR, text, f"constant {VERSION}", f"no retraining is needed: use --for {profile}")
+
+
+def _expected(model: CheckedModel, deterministic: bool, profile: str, known: Checks) -> Findings:
     """Each would end the check; the first does."""
     for name in (VERSION, MEMORY_SIZE):
         if model.constant(name) is None:
@@ -117,7 +135,8 @@ def _expected(model: CheckedModel, deterministic: bool, profile: str) -> Finding
                 f"constant {name}",
                 f"a constant output of that very name is needed; --for {profile} writes it",
             )
-    if not any(model.has_output(name) for name in _ACTION_OUTPUTS):
+    listed = _ACTION_OUTPUTS if known is Checks.DETERMINISTIC else _ACTION_OUTPUTS[:3]
+    if not any(model.has_output(name) for name in listed):
         yield warning(
             "The model does not contain any Action Output Node.",
             "outputs",
@@ -168,8 +187,8 @@ def _kind_of_action(model: CheckedModel, name: str, kind: str, end: str, determi
 def _inputs_of_version_3(model: CheckedModel, brain: Brain, deterministic: bool, profile: str) -> Findings:
     names = model.input_names
     for index, sensor in enumerate(brain.sensors):
-        if _observation(index) not in names:
-            yield _no_observation(index, sensor)
+        if observation(index) not in names:
+            yield _noobservation(index, sensor)
     if model.memory_size > 0 and RECURRENT_IN not in names:
         yield _no_recurrent_input(f"name the memory's input {RECURRENT_IN}, or set {MEMORY_SIZE} to 0")
     if model.has_discrete(deterministic) and MASKS not in names:
@@ -196,8 +215,8 @@ def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool)
                     "take the camera off the agent, or give the file that was trained with it",
                 )
             cameras += 1
-        if len(sensor.shape) == 2 and _observation(index) not in names:
-            yield _no_observation(index, sensor)
+        if len(sensor.shape) == 2 and observation(index) not in names:
+            yield _noobservation(index, sensor)
     expected = sum(i.name.startswith(VISUAL) for i in model.inputs)
     if expected > cameras:
         yield warning(
@@ -211,11 +230,11 @@ def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool)
         yield _no_masks("")
 
 
-def _no_observation(index: int, sensor: Sensor) -> Finding:
+def _noobservation(index: int, sensor: Sensor) -> Finding:
     return warning(
         f"The model does not contain an Observation Placeholder Input for sensor component {index} ({sensor.kind}).",
-        f"input {_observation(index)}",
-        f"sensor {index} ({sensor.name}, {'x'.join(map(str, sensor.shape))}) is fed as {_observation(index)}: "
+        f"input {observation(index)}",
+        f"sensor {index} ({sensor.name}, {'x'.join(map(str, sensor.shape))}) is fed as {observation(index)}: "
         "name the input so, or take the sensor off the agent",
     )
 
@@ -263,7 +282,7 @@ def _testers_of_version_2(brain: Brain) -> dict[str, Tester]:
     testers: dict[str, Tester] = {VECTOR: lambda view: _vector(view, brain)}
     cameras = [s for s in brain.sensors if len(s.shape) == 3]
     testers.update({f"{VISUAL}{i}": _tester(sensor) for i, sensor in enumerate(cameras)})
-    testers.update({_observation(i): _tester(s) for i, s in enumerate(brain.sensors) if len(s.shape) == 2})
+    testers.update({observation(i): _tester(s) for i, s in enumerate(brain.sensors) if len(s.shape) == 2})
     return testers
 
 
@@ -371,5 +390,6 @@ def _each_branch(wanted: tuple[int, ...], held: tuple[int, ...]) -> Findings:
             return
 
 
-def _observation(index: int) -> str:
+def observation(index: int) -> str:
+    """The name of a sensor's input in version 3."""
     return f"obs_{index}"

@@ -31,5 +31,5 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
             thrown = [t.message for t in (said.refused, *(m.load for m in modes)) if t is not None]
             listed = [f.message for m in modes for f in m.checks]
             wrong = [*thrown, *listed, *(f.message for f in said.misread)]
-            passed = said.accepted["stochastic"] and not said.misread
+            passed = said.checked["stochastic"] and not said.misread
             yield Accepted(key, release, "*", 0.0, 0.0, Tolerance(0.0, 0.0), passed, None, "; ".join(wrong)[:600])

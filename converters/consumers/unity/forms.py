@@ -1,0 +1,118 @@
+"""Forms of inputs and outputs that a player trips over, and the words for one: what the rows of ``players`` ask."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from converters.consumers.unity.layout import reads_flat
+from converters.consumers.unity.model import ACTION, CONTINUOUS
+from converters.consumers.unity.scene import Port, Scene
+
+
+def sensed(port: Port) -> int:
+    """The numbers that the sensor gives."""
+    return math.prod(port.sensor)
+
+
+def lacks_axes(port: Port) -> bool:
+    """Whether it has fewer axes than what is written into it."""
+    return len(port.lengths) < len(port.sensor)
+
+
+def outside_last(port: Port, axes: int) -> bool:
+    """Whether an agent's numbers lie on other axes than the last: players count from the agent by the last lengths."""
+    return any(length > 1 for length in port.lengths[: len(port.lengths) - axes])
+
+
+def off_channels(port: Port) -> bool:
+    """Whether numbers lie on Barracuda's height or width."""
+    return port.view is not None and max(port.view.height, 1) * max(port.view.width, 1) > 1
+
+
+def masks_of_another_size(port: Port, scene: Scene) -> bool:
+    """Whether masks have another number of columns than the agent has actions."""
+    return bool(scene.brain.branches) and port.size not in (1, sum(scene.brain.branches))
+
+
+def written_outside(port: Port, scene: Scene) -> bool:
+    """Whether Barracuda's tensor ends before the sensor's last number, at the place that ML-Agents writes it to."""
+    del scene
+    assert port.view is not None
+    if 0 in (port.view.height, port.view.width, port.view.channels):
+        return False
+    return _last_place(port) >= port.view.height * port.view.width * port.view.channels
+
+
+def turned_picture(port: Port, scene: Scene) -> bool:
+    """Whether a picture is written into a tensor of other lengths that has room for it."""
+    if len(port.sensor) != 3 or written_outside(port, scene):
+        return False
+    assert port.view is not None
+    return port.sensor != (port.view.channels, port.view.height, port.view.width)
+
+
+def _last_place(port: Port) -> int:
+    assert port.view is not None
+    if len(port.sensor) < 3:
+        return sensed(port) - 1
+    channels, height, width = port.sensor
+    return ((height - 1) * port.view.width + width - 1) * port.view.channels + channels - 1
+
+
+def reads_entities_transposed(port: Port, scene: Scene) -> bool:
+    """Whether a list of entities is read in the order that the file declares, not in that of what is written."""
+    return len(port.sensor) == 2 and min(port.sensor) > 1 and not reads_flat(port.name, scene.file, scene.nn)
+
+
+def wanted(port: Port, scene: Scene) -> int:
+    """The columns that the agent takes of an action."""
+    brain = scene.brain
+    if port.name.endswith(CONTINUOUS) or (port.name == ACTION and brain.continuous):
+        return brain.continuous
+    return sum(brain.branches) if scene.old_names else len(brain.branches)
+
+
+def gives_too_few(port: Port, scene: Scene) -> bool:
+    """Whether actions have fewer columns than the agent takes."""
+    return port.dims is not None and len(port.dims) > 1 and port.size < wanted(port, scene)
+
+
+def gives_too_many(port: Port, scene: Scene) -> bool:
+    """Whether actions have more columns than the agent takes, and it takes some."""
+    return port.dims is not None and len(port.dims) > 1 and port.size > wanted(port, scene) > 0
+
+
+def given_off_channels(port: Port, scene: Scene) -> bool:
+    """Whether actions lie on other axes than the second."""
+    if port.dims is None or wanted(port, scene) < 2:
+        return False
+    return len(port.dims) < 2 or port.size != port.lengths[0]
+
+
+def fields(port: Port, scene: Scene) -> Mapping[str, object]:
+    """What the sentences of a row may name."""
+    free = "N" if port.dims is None or not port.dims or port.dims[0] is None or port.view is None else port.dims[0]
+    lengths = port.lengths if port.dims is not None or port.view is not None else ()
+    declared = () if port.dims is None else port.dims
+    return {
+        "name": port.name,
+        "index": port.index,
+        "shape": f"[{', '.join(map(str, (free, *lengths)))}]",
+        "size": math.prod(lengths),
+        "sensor": "x".join(map(str, port.sensor)),
+        "sensor_lengths": ", ".join(map(str, port.sensor)),
+        "declare": f"[{', '.join(map(str, ('N', *port.sensor)))}]",
+        "axes": len(port.sensor) + 1,
+        "wanted": sensed(port) if port.sensor else _columns(port, scene),
+        "batch": free,
+        "expected": f"({', '.join('d0' if d is None else str(d) for d in declared)})",
+        "received": f"({', '.join(map(str, ('N', *lengths)))})",
+        "memory_size": scene.model.memory_size,
+        "namespace": scene.consumer.namespace,
+        "profile": scene.consumer.profile,
+    }
+
+
+def _columns(port: Port, scene: Scene) -> int:
+    return sum(scene.brain.branches) if port.view is not None else wanted(port, scene)

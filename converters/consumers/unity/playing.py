@@ -1,0 +1,154 @@
+"""What ML-Agents' player does with an imported model: the rows of ``players``, asked of one file and one agent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from converters.consumers.unity.findings import Thrown
+from converters.consumers.unity.forms import fields
+from converters.consumers.unity.layers import trips
+from converters.consumers.unity.model import ACTION, CONTINUOUS, DISCRETE, RECURRENT_OUT
+from converters.consumers.unity.players import ANY, FED, OBSERVATION, ONE_NUMBER, PLAYERS, UNKNOWN, Outcome, Player, Row
+from converters.consumers.unity.rules import culture_key
+from converters.consumers.unity.scene import Port, Scene
+from signatures.records import dataclass
+
+_ABSENT = "mem_out_missing, cont_missing_drawn, disc_missing_drawn"
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One thing that comes of playing a model: ``exception`` in Unity's words where it throws, ``evidence`` the small
+    models that it was measured with.
+    """
+
+    outcome: Outcome
+    message: str
+    where: str
+    fix: str
+    exception: str = ""
+    evidence: str = ""
+
+    @property
+    def fails(self) -> bool:
+        """Whether the model cannot be played so."""
+        return self.outcome is not Outcome.WARNS
+
+    def to_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "outcome": self.outcome.value,
+            "message": self.message,
+            "exception": self.exception or None,
+            "where": self.where,
+            "fix": self.fix,
+            "evidence": self.evidence or None,
+        }
+
+
+def throws(outcome: Outcome, thrown: Thrown) -> Played:
+    """An exception that stands in the verdict already, as what comes of playing."""
+    said = f"{thrown.exception}: {thrown.message}" if thrown.worded else thrown.exception
+    return Played(outcome, thrown.message, thrown.where, thrown.fix, said)
+
+
+def play(scene: Scene) -> tuple[Played, ...]:
+    """What a player trips over, the worst first; nothing where it plays the model rightly."""
+    player = PLAYERS[scene.consumer.name]
+    found = [
+        *_inputs(scene, player),
+        *_absent(scene, player),
+        *_outputs(scene, player),
+        *_kinds(scene),
+        *_layers(scene),
+    ]
+    order = list(Outcome)
+    return tuple(sorted(dict.fromkeys(found), key=lambda played: order.index(played.outcome)))
+
+
+def _inputs(scene: Scene, player: Player) -> Iterator[Played]:
+    known = {*scene.sensed, *FED, *scene.model.memories}
+    for port in sorted(scene.inputs(), key=lambda p: culture_key(p.name)):
+        if port.name not in known:
+            yield Played(
+                Outcome.FIRST,
+                f"no sensor of the agent and nothing in ML-Agents feeds {port.name}",
+                f"input {port.name}",
+                "give the agent the sensor it stands for, rename it, or fix it with --set NAME=VALUE",
+                UNKNOWN.format(name=port.name),
+                "unknown_input, obs_extra, obs_v2_name",
+            )
+            continue
+        groups = {port.name}
+        groups |= {OBSERVATION} if port.sensor else set()
+        groups |= set() if port.name in ONE_NUMBER else {ANY}
+        yield from _told(player.inputs, groups, port, scene, "input")
+
+
+def _outputs(scene: Scene, player: Player) -> Iterator[Played]:
+    for port in scene.outputs():
+        yield from _told(player.outputs, {port.name}, port, scene, "output")
+
+
+def _told(rows: Sequence[Row], groups: set[str], port: Port, scene: Scene, kind: str) -> Iterator[Played]:
+    for row in rows:
+        if groups.intersection(row.of) and row.when(port, scene):
+            words = fields(port, scene)
+            yield Played(
+                row.outcome,
+                row.says.format_map(words),
+                f"{kind} {port.name}",
+                row.fix.format_map(words),
+                row.exception.format_map(words),
+                row.evidence,
+            )
+
+
+def _absent(scene: Scene, player: Player) -> Iterator[Played]:
+    for name in scene.fetched:
+        if name in scene.model.outputs or (name == RECURRENT_OUT and scene.model.memories):
+            continue
+        text = f"a player fetches the output {name}, which the file does not have"
+        fix, evidence = f"name the output {name}; --for {scene.consumer.profile} does", _ABSENT
+        if name == ACTION and {CONTINUOUS, DISCRETE}.intersection(scene.model.outputs):
+            text += f": before ML-Agents 1.7 no player knows {CONTINUOUS} and {DISCRETE}"
+            fix, evidence = "play it in ML-Agents 1.7 or later", "cases/hybrid_nn_ml-agents-1.0.8"
+        yield Played(Outcome.FIRST, text, f"output {name}", fix, player.absent.format(name=name), evidence)
+
+
+def _layers(scene: Scene) -> Iterator[Played]:
+    for row, layer in () if scene.nn is None else trips(scene.nn, scene.consumer.name):
+        yield Played(
+            row.outcome,
+            row.says,
+            f"layer {layer.name}",
+            row.fix.format(profile=scene.consumer.profile),
+            row.exception(layer, scene.nn) if scene.nn is not None else "",
+            row.evidence,
+        )
+
+
+def _kinds(scene: Scene) -> Iterator[Played]:
+    acts = [name for name in scene.fetched if name != RECURRENT_OUT]
+    brain = scene.brain
+    if not acts and (brain.continuous or brain.branches):
+        yield Played(
+            Outcome.NOTHING,
+            "no output with actions is fetched: no action comes out, and the agent keeps an empty one",
+            "outputs",
+            f"give the file the actions of this mode, and their shape's constant; --for {scene.consumer.profile} does",
+            "",
+            "cont_missing_det, disc_missing_det, no_continuous_action_output_shape",
+        )
+        return
+    if ACTION in acts:
+        return
+    for kind, wanted in ((CONTINUOUS, brain.continuous > 0), (DISCRETE, bool(brain.branches))):
+        if acts and wanted and not any(name.endswith(kind) for name in acts):
+            yield Played(
+                Outcome.WRONG,
+                f"no {kind} are fetched, and the agent has some: they stay 0 (read, not run)",
+                f"output {kind}",
+                f"give the file {kind} for this mode, or take them off the agent",
+            )
