@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.compiler.passes.int8_products import join_products, multiply_products
 from converters.compiler.passes.weights import LEAST, Storage, are_steps, compact, rounded
 from converters.formats.format import WriteOptions
 from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.formats.tfjs.int8 import joined, stepped
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
@@ -86,7 +86,7 @@ def test_tensorflow_js_multiplies_the_products_of_layers_and_not_their_matrices(
             Node("y", "BiasAdd", ("product", "b"), {"data_format": "NHWC"}),
         )
     )
-    made = stepped(plain)
+    made = multiply_products(plain)
     product = made.producer(made["product"].inputs[0])
     assert (made["product"].op, product.op) == ("Mul", "MatMul")
     steps = made[product.inputs[1]].value
@@ -95,7 +95,7 @@ def test_tensorflow_js_multiplies_the_products_of_layers_and_not_their_matrices(
     was, now = (run_graph(g, {"x": x}, ["y", "w"]) for g in (plain, made))
     np.testing.assert_allclose(now["y"], was["y"], rtol=1e-5, atol=1e-5 * np.abs(was["y"]).max())
     assert now["w"].tobytes() == was["w"].tobytes()  # who looks inside finds it
-    again = joined(made)
+    again = join_products(made)
     assert again["product"].op == "MatMul" and again["product"].inputs == ("x", "w")
     assert run_graph(again, {"x": x}, ["y"])["y"].tobytes() == was["y"].tobytes()
 
@@ -104,8 +104,8 @@ def test_a_matrix_that_is_turned_or_read_by_others_is_multiplied_itself() -> Non
     matrix = rounded(graph_of(drawn(24, 40).T, transpose_b=True), "int8")["w"].value
     for other in (("y", "MatMul", ("x", "w"), {"transpose_b": True}), ("y", "Square", ("w",), {})):
         plain = Graph((Node("x", "Placeholder"), Node("w", "Const", value=matrix), Node(*other)))
-        assert stepped(plain)["y"] == plain["y"] and stepped(plain)["w"].op == "Mul"
-        assert joined(stepped(plain))["y"] == plain["y"]
+        assert multiply_products(plain)["y"] == plain["y"] and multiply_products(plain)["w"].op == "Mul"
+        assert join_products(multiply_products(plain))["y"] == plain["y"]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_what_anyone_may_have_written_stays_as_it_is(odd: Node) -> None:
             odd,
         )
     )
-    assert joined(graph) is graph
+    assert join_products(graph) is graph
 
 
 @pytest.mark.parametrize("storage", _KEPT)
