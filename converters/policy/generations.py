@@ -9,8 +9,8 @@ TORCH_VERSION_3 = 3
 
 #: TanhGaussianDistInstance (torch_entities/distributions.py) has no ``deterministic_sample`` of its own, 0.28 to 1.1.
 SAC_MEAN = (
-    "deterministic_continuous_actions is the raw mean of SAC, neither squashed by tanh nor clipped (so ML-Agents 0.28 to "
-    "1.1 give it); it is exported as it is"
+    "deterministic_continuous_actions is the raw mean of SAC, neither squashed by tanh nor clipped (so ML-Agents 0.28 "
+    "to 1.1 give it); it is exported as it is"
 )
 
 
