@@ -277,14 +277,32 @@ def _distribution(entry: Field, shape: tuple[int | None, ...]) -> dict[str, Any]
     """What its kind says, and nothing else: what is shown and drawn from it was looked at."""
     kind = entry["kind"].one_of(("normal", "uniform", "integer", "mask"))
     if kind == "integer":
-        low = entry["low"].integer(0, 2**31 - 1)
-        return {"kind": kind, "low": low, "high": entry["high"].integer(low, 2**31 - 1)}
+        return {"kind": kind, **_id_bounds(entry["low"], entry["high"], shape)}
     if kind == "uniform":
         return {"kind": kind, "low": entry["low"].number(), "high": entry["high"].number()}
     if kind == "normal":
         clip = {} if entry["clip"].missing else {"clip": entry["clip"].number()}
         return {"kind": kind, **{key: _statistics(entry[key], shape) for key in ("mean", "std")}, **clip}
     return {"kind": kind, **{key: entry[key].integer(0, 1) for key in ("allowed", "forbidden")}}
+
+
+def _id_bounds(low: Field, high: Field, shape: tuple[int | None, ...]) -> dict[str, Any]:
+    """The lowest and highest id, or one pair for each number of the input; None where any integer goes."""
+
+    def pair(first: Field, last: Field) -> tuple[int | None, int | None]:
+        if first.value is None and last.value is None:
+            return None, None
+        lowest = first.integer(-(2**31), 2**31 - 1)
+        return lowest, last.integer(lowest, 2**31 - 1)
+
+    if not isinstance(high.value, list):
+        return dict(zip(("low", "high"), pair(low, high), strict=True))
+    both = (low.items(_MOST_FED), high.items(_MOST_FED))
+    for entry, found in zip((low, high), both, strict=True):
+        if len(found) != (shape[-1] if len(shape) > 1 else 1):
+            raise entry.error(f"has {len(found)} numbers, and the input {shape[-1] if len(shape) > 1 else 1}")
+    pairs = [pair(*each) for each in zip(*both, strict=True)]
+    return {"low": [p[0] for p in pairs], "high": [p[1] for p in pairs]}
 
 
 def _statistics(entry: Field, shape: tuple[int | None, ...]) -> Any:

@@ -15,9 +15,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from signatures.ids import id_bounds
+from signatures.masks import all_allowed, forbidden, one_allowed, random_masks
 from signatures.pictures import structured
 from signatures.records import dataclass
-from signatures.roles import Role
+from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
@@ -38,11 +40,13 @@ FAR_CASES = ("opposite extremes", "8 to 1e4", "one number far away")
 ONE_ALLOWED = "all but one action masked"
 #: A row for each action that alone is forbidden, then some for two.
 ONE_FORBIDDEN = "one or two actions masked"
-#: Rows that forbid one action, and two; as many at most, drawn from all there are.
-MOST_FORBIDDEN = 64
-_PAIRS, _PAIRS_OF_IMAGES = 16, 4
+#: Rows of the case in which every id of a table turns up where there are no more; beside images fewer.
+EVERY_ID = "every id"
+MOST_IDS, MOST_IDS_OF_IMAGES = 512, 64
 #: What a free axis behind the batch is tried with (image sides, number of entities).
 _FREE_AXIS = 8
+#: The deviation of integers that nothing looks up.
+_SPREAD_OF_INTEGERS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +87,14 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
     for name, style in (*edges, ("denormals", _denormals)):
         cases.append(_case(signature, rng, name, 2, style))
     if any(s.role is Role.MASKS for s in signature.inputs):
-        cases.append(_case(signature, rng, ONE_ALLOWED, 7, _typical, masks=_one_allowed))
-        cases.append(_case(signature, rng, "random masks", 7, _typical, masks=_random_masks))
-        forbidden = _forbidden(signature, rng)
-        if len(forbidden):
-            rows = len(forbidden)
-            cases.append(
-                _case(signature, rng, ONE_FORBIDDEN, rows, _typical, masks=lambda rng, batch, sizes: 1 - forbidden)
-            )
+        cases.append(_case(signature, rng, ONE_ALLOWED, 7, _typical, masks=one_allowed))
+        cases.append(_case(signature, rng, "random masks", 7, _typical, masks=random_masks))
+        without = 1 - forbidden(signature, rng)
+        if len(without):
+            given = _case(signature, rng, ONE_FORBIDDEN, len(without), _typical, masks=lambda *_: without)
+            cases.append(given)
+    if (ids := _ids(signature)) > 1:
+        cases.append(_case(signature, rng, EVERY_ID, ids, _each_id))
     large = _large_batch(signature)
     if any(s.role is Role.VISUAL for s in signature.inputs):
         cases.append(_case(signature, rng, "pixels at their ends", 3, _typical, pixels=_ends))
@@ -146,7 +150,7 @@ def _case(
         shape = tuple((batch if i == 0 else _FREE_AXIS) if n is None else n for i, n in enumerate(spec.shape))
         if spec.role is Role.MASKS:
             branches = signature.branches if sum(signature.branches) == shape[-1] else (shape[-1],)
-            feeds[spec.name] = (masks or _all_allowed)(rng, batch, branches).astype(spec.dtype)
+            feeds[spec.name] = (masks or all_allowed)(rng, batch, branches).astype(spec.dtype)
         else:
             feeds[spec.name] = np.asarray(_other(signature, rng, spec, shape, style, pixels), dtype=spec.dtype)
     return Case(name, feeds, batch)
@@ -172,12 +176,50 @@ def _other(
         return rng.standard_normal(shape) if style is _typical else rng.uniform(-_FAR_NOISE, _FAR_NOISE, shape)
     if spec.role is Role.MEMORY_IN:
         return rng.standard_normal(shape) * _MEMORIES.get(style, 0.5)
+    if (bounds := id_bounds(spec)) is not None:
+        return _integers(rng, spec, shape, bounds, style)
     if np.dtype(spec.dtype).kind in "iu":
-        high = int((spec.distribution or {}).get("high", 1))
-        return rng.integers(0, high + 1, shape)
+        return rng.integers(0, 2, shape)
     if spec.role is Role.PARAMETER:
         return rng.random(shape) if style not in (_equal, _whole) else style(rng, spec, shape)
     return style(rng, spec, shape)
+
+
+def _integers(
+    rng: np.random.Generator,
+    spec: TensorSpec,
+    shape: tuple[int, ...],
+    bounds: tuple[np.ndarray, np.ndarray],
+    style: Style,
+) -> np.ndarray:
+    """Ids within their bounds, each of a table in turn if the style says so; what has none in the style of the case."""
+    low, high = (np.broadcast_to(b, shape) for b in bounds)
+    known = np.isfinite(high)
+    first, count = np.where(known, low, 0).astype(np.int64), np.where(known, high - low + 1, 1).astype(np.int64)
+    drawn = rng.integers(0, count) if shape else rng.integers(0, int(count))
+    if style is _each_id and shape:
+        turn = np.arange(shape[0]).reshape(-1, *(1,) * (len(shape) - 1))
+        start = rng.integers(0, count[:1])  # the columns are not in step
+        ends = np.where(turn == 0, 0, np.where(turn == 1, count - 1, drawn))
+        drawn = np.where(count <= shape[0], (turn + start) % count, ends)
+    free = np.zeros(shape) if known.all() else np.asarray(style(rng, spec, shape))
+    if np.dtype(spec.dtype).kind in "iu":
+        limits = np.iinfo(spec.dtype)
+        free = np.clip(np.rint(_SPREAD_OF_INTEGERS * free if style is _typical else free), limits.min, limits.max)
+    return np.where(known, first + drawn, free)
+
+
+def _each_id(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
+    """What is no id is typical where each id is tried."""
+    return _typical(rng, spec, shape)
+
+
+def _ids(signature: PolicySignature) -> int:
+    """Rows in which every id turns up, as far as there are not too many; 0 where there are no ids beyond 0 and 1."""
+    bounds = [b for s in signature.inputs if s.role in OBSERVATIONS and (b := id_bounds(s)) is not None]
+    spans = [float(np.max((high - low + 1)[np.isfinite(high)], initial=0)) for low, high in bounds]
+    most = MOST_IDS_OF_IMAGES if any(s.role is Role.VISUAL for s in signature.inputs) else MOST_IDS
+    return min(int(max(spans, default=0)), most) if max(spans, default=0) > 2 else 0
 
 
 def _statistics(spec: TensorSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -300,6 +342,12 @@ def _denormals(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...
     return np.asarray(np.finfo(np.float32).tiny * rng.uniform(-1.0, 1.0, shape))
 
 
+def unknown_ids(signature: PolicySignature) -> list[str]:
+    """Return the inputs of integers of which only 0 and 1 are tried, as nothing says which go."""
+    observed = (s for s in signature.inputs if s.role in OBSERVATIONS and s.role is not Role.VISUAL)
+    return [s.name for s in observed if np.dtype(s.dtype).kind in "iu" and id_bounds(s) is None]
+
+
 def _is_free(spec: TensorSpec) -> bool:
     decided = (Role.MASKS, Role.PREV_ACTION, Role.VISUAL, Role.NOISE, Role.MEMORY_IN, Role.PARAMETER)
     return spec.role not in decided and np.dtype(spec.dtype).kind not in "iu"
@@ -371,41 +419,3 @@ def _sizes(rng: np.random.Generator, strata: Sequence[tuple[float, float]], shap
     which = np.arange(rows) * len(strata) // rows
     low, high = (np.asarray(strata)[which, i].reshape(-1, *(1,) * len(shape[1:])) for i in (0, 1))
     return np.asarray(low * (high / low) ** rng.random(shape or (1,))).reshape(shape)
-
-
-def _all_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
-    return np.ones((batch, sum(branches)))
-
-
-def _one_allowed(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
-    """Of each branch another one in the next row."""
-    parts = [np.eye(size)[(rng.integers(0, size) + np.arange(batch)) % size] for size in branches]
-    return np.concatenate(parts, axis=1)
-
-
-def _forbidden(signature: PolicySignature, rng: np.random.Generator) -> np.ndarray:
-    """Return what is forbidden, [rows, actions]: each action of a branch that has others, then two at once."""
-    width = next(int(s.shape[-1] or 0) for s in signature.inputs if s.role is Role.MASKS)
-    sizes = signature.branches if sum(signature.branches) == width else (width,)
-    branch = np.repeat(np.arange(len(sizes)), sizes)
-    single = np.flatnonzero(np.repeat(sizes, sizes) > 1)
-    if len(single) > MOST_FORBIDDEN:
-        ends = single[[0, -1]]
-        single = np.sort(np.concatenate([ends, rng.choice(single[1:-1], MOST_FORBIDDEN - 2, replace=False)]))
-    rows = [[int(i)] for i in single]
-    cameras = any(s.role is Role.VISUAL for s in signature.inputs)
-    pairs = min(_PAIRS_OF_IMAGES if cameras else _PAIRS, len(single))
-    for number in range(pairs):
-        one = int(single[number * len(single) // pairs] if number % 2 else rng.choice(single))
-        others = single[(single != one) & ((branch[single] != branch[one]) | (np.asarray(sizes)[branch[one]] > 2))]
-        if len(others):
-            rows.append([one, int(rng.choice(others))])
-    made = np.zeros((len(rows), width))
-    for row, actions in zip(made, rows, strict=True):
-        row[actions] = 1
-    return made
-
-
-def _random_masks(rng: np.random.Generator, batch: int, branches: Sequence[int]) -> np.ndarray:
-    drawn = (rng.random((batch, sum(branches))) < 0.5).astype(float)
-    return np.asarray(np.maximum(drawn, _one_allowed(rng, batch, branches)))

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from exporter.acting.generator import Generator, likeliest
 from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
+from signatures.ids import check_ids
 from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
@@ -111,8 +112,8 @@ class LoadedPolicy:
         for them. ``parameters`` are the source's own placeholders. ``deterministic`` takes the likeliest action and the
         mean; without it, a policy that gives its mean and σ (``action_std``, ``action_log_std``) is drawn from.
         ``seed`` starts the draws anew before this decision. Raises UsageError where something is missing, is of the
-        wrong shape or is not taken, where masks forbid all actions of a branch, where nothing can be drawn, and where
-        ``deterministic`` asks for what the file does not have.
+        wrong shape or is not taken, where an id is outside of its table, where masks forbid all actions of a branch,
+        where nothing can be drawn, and where ``deterministic`` asks for what the file does not have.
         """
         if deterministic:
             self._check_plain()
@@ -129,6 +130,7 @@ class LoadedPolicy:
         for spec in sorted(self.signature.inputs, key=lambda s: s.role not in OBSERVATIONS):
             if spec.role in OBSERVATIONS:
                 array = self._fitting(spec, self._scaled(spec, given.pop(spec.name)), rows)
+                check_ids(spec, array)
                 rows = len(array)
             elif spec.role is Role.NOISE:
                 continue

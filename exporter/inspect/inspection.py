@@ -22,6 +22,7 @@ from exporter.tables import paragraph, size_text, table
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError, naming
 from signatures.fields import printable
+from signatures.ids import bounds_text
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -240,7 +241,7 @@ def _label_lines(labels: Mapping[str, Any]) -> list[str]:
 def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
     known = spec.distribution or {}
     if spec.role is Role.VECTOR and known.get("kind") == "integer":
-        return f"the discrete state, an integer from {known['low']} to {known['high']}"
+        return f"the discrete state, {bounds_text(spec)}"
     own = preprocess.get("range") == [0, 255]
     colours = "from 0 to 255 (bytes as they are)" if own else "from 0 to 1 (divide bytes by 255)"
     return _FEED.get(spec.role, spec.role.value).format(

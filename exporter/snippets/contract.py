@@ -14,6 +14,7 @@ from converters.formats.bundle import bundle
 from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.registry import WRITTEN
 from signatures.errors import naming
+from signatures.ids import bounds_text
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -148,7 +149,7 @@ def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
         text = f"camera image, {how.get('layout', 'NHWC')}, colours {colours}, first row at the top"
     known = spec.distribution or {}
     if spec.role is Role.VECTOR and known.get("kind") == "integer":
-        text = f"discrete state, an integer from {known['low']} to {known['high']}"
+        text = f"discrete state, {bounds_text(spec)}"
     names = signature.labels.get("observations", {}).get(spec.name, [])
     return folded(f"{spec.name}: {text}", numbered(names))
 

@@ -108,7 +108,7 @@ def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) 
     rows = []
     for spec in vectors:
         known = spec.distribution or {}
-        if known.get("kind") == "integer":
+        if isinstance(known.get("high"), int):
             rows.append(("Vector Observation", f"Space Type Discrete, Space Size {int(known['high']) + 1}"))
             continue
         size = spec.shape[-1] or 0

@@ -22,7 +22,7 @@ from exporter.verify.rounding import Rounding
 from exporter.verify.tolerances import Tolerance, ruled, tolerance_for
 from exporter.verify.work import Allowance, products
 from signatures.roles import Role
-from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout
+from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
 
 Arrays = dict[str, np.ndarray]
 #: A difference so many times what rounding explained is not explained by looking longer.
@@ -73,7 +73,14 @@ class Trial:
         return self._allowances[key]
 
     def notes(self) -> list[str]:
-        """What was left out, for the report."""
+        """What was left out, for the report, and what could not be fed."""
+        unknown = [
+            f"which integers {name} takes is not known: 0 and 1 were tried, and no others"
+            for name in unknown_ids(self.signature)
+        ]
+        return [*unknown, *self._left_out()]
+
+    def _left_out(self) -> list[str]:
         return [note for (who, _), each in self._allowances.items() if (note := each.note(who)) is not None]
 
     def drawn(self, name: str, participant: Participant) -> bool:

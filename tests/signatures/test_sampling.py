@@ -79,7 +79,7 @@ def test_every_batch_size_is_tried() -> None:
     assert [c.name for c in cases[len(typical) :]] == [
         *("zeros", "clip edges", "beyond the clip", "1e3", "denormals"),
         *("all but one action masked", "random masks", "one or two actions masked"),
-        *("pixels at their ends", "typical, batch 67", "opposite extremes", "8 to 1e4"),
+        *("every id", "pixels at their ends", "typical, batch 67", "opposite extremes", "8 to 1e4"),
         *("images with structure, batch 32", "images with structure, batch 64"),
     ]
     assert len({c.name for c in cases}) == len(cases)

@@ -17,6 +17,7 @@ from converters.graph.types import static_shape
 from converters.policy.action import ActionMeaning, action_meaning
 from converters.policy.brains import Head
 from converters.policy.generations import generation
+from converters.policy.identifiers import id_distribution
 from converters.policy.memories import memory_layout
 from converters.policy.observations import highest_colour, normaliser
 from signatures.errors import SignatureError
@@ -300,20 +301,9 @@ def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[st
         return {"kind": "mask", "allowed": 1, "forbidden": 0}
     if role is Role.VISUAL:
         return {"kind": "uniform", "low": 0.0, "high": float(highest_colour(graph, node.name))}
-    if role is Role.VECTOR and node.attrs["dtype"].kind in "iu":
-        depth = _one_hot_depth(graph, types, node)
-        return None if depth is None else {"kind": "integer", "low": 0, "high": depth - 1}
-    if role is Role.VECTOR:
-        return normaliser(graph, node.name)
-    return None
-
-
-def _one_hot_depth(graph: Graph, types: Types, node: Node) -> int | None:
-    reached = graph.descendants([node.name])
-    for reader in graph.nodes:
-        if reader.op == "OneHot" and node_of(reader.inputs[0]) in reached:
-            depth = types[reader.inputs[1]].constant
-            return None if depth is None else int(depth)
+    if role in (Role.VECTOR, Role.ENTITIES):
+        normal = normaliser(graph, node.name) if role is Role.VECTOR else None
+        return normal or id_distribution(graph, types, node)
     return None
 
 

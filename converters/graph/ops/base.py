@@ -95,6 +95,8 @@ class GraphBuilder(NodeBuilder, Protocol):
 
 
 Lower = Callable[[Node, OnnxBuilder], Any]
+#: How many rows the table has that an op looks up, by the types of its operands; None where that is not known.
+TableSize = Callable[[Node, Sequence[TensorType]], int | None]
 #: A node as nodes of older ops; returns the tensor that stands for its output 0.
 Older = Callable[[GraphBuilder, Node], str]
 #: A node as TensorFlow.js computes it rightly: further nodes are added, the one that takes its place is returned.
@@ -179,6 +181,11 @@ class OpDef:
     activation: str = ""
     #: TensorFlow.js computes the activation as a part of a fused product, on every backend (tfjs-core ops/fused_util).
     tfjs_fuses: bool = False
+    #: The operand whose integers are looked up, and how many rows there are to find.
+    looks_up: int | None = None
+    table_size: TableSize | None = None
+    #: The result says which elements of two operands are equal.
+    compares_equal: bool = False
     #: The op that computes this one, a bias and an activation in one.
     fused: str = ""
 

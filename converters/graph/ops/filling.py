@@ -83,6 +83,11 @@ def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
     return [TensorType(args[2].dtype, inserted(shape, max(axis, -1), depth))]
 
 
+def _depth(node: Node, args: Sequence[TensorType]) -> int | None:
+    depth = args[1].constant
+    return None if depth is None else int(depth)
+
+
 def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
     """ONNX's OneHot wraps negative indices round where TensorFlow gives a row of off-values: compare instead."""
     depth = int(constant_input(node, builder, 1, "a depth"))
@@ -159,5 +164,7 @@ OPS = (
         (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
         tfjs=_tfjs_one_hot,
         precision="exact",
+        looks_up=0,
+        table_size=_depth,
     ),
 )

@@ -34,7 +34,16 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower)
     if name in ("Equal", "NotEqual"):
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
     kernel = plain(function)
-    return OpDef(name, broadcast_of(BOOL, count=2), kernel, lowering, attrs, precision="exact", elementwise=True)
+    return OpDef(
+        name,
+        broadcast_of(BOOL, count=2),
+        kernel,
+        lowering,
+        attrs,
+        precision="exact",
+        elementwise=True,
+        compares_equal=name == "Equal",
+    )
 
 
 def _select(node: Node, condition: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

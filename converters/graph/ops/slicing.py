@@ -246,6 +246,14 @@ def _infer_gather(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
     return [TensorType(args[0].dtype, args[0].shape[:axis] + args[1].shape + args[0].shape[axis + 1 :])]
 
 
+def _rows_of_table(node: Node, args: Sequence[TensorType]) -> int | None:
+    axis = 0 if len(args) < 3 else args[2].constant
+    if args[0].shape is None or axis is None:
+        return None
+    size = args[0].shape[int(axis) % max(1, len(args[0].shape))] if args[0].shape else None
+    return size if isinstance(size, int) else None
+
+
 def _lower_gather(node: Node, builder: OnnxBuilder) -> Any:
     axis = 0 if len(node.inputs) < 3 else int(constant_input(node, builder, 2, "an axis"))
     return builder.emit("Gather", [builder.value(r) for r in node.inputs[:2]], axis=axis)
@@ -271,6 +279,8 @@ OPS = (
         _lower_gather,
         (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
         moves="pick",
+        looks_up=1,
+        table_size=_rows_of_table,
     ),
     OpDef(
         "GatherV2",
@@ -284,5 +294,7 @@ OPS = (
             Attr("batch_dims", "int", 0, since="1.14", supported=False),
         ),
         moves="pick",
+        looks_up=1,
+        table_size=_rows_of_table,
     ),
 )
