@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.checks.draws import DEPENDENT, DRAWS, REPEATED, likely, repeated
+from exporter.verify.checks.draws import DEPENDENT, DRAWS, REPEATED, REPEATED_CALLS, STARTS, likely, repeated
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant
@@ -17,6 +17,8 @@ from signatures.sampling import Case
 
 #: Rows of policies without cameras, instead of ``DRAWS``: a spread that is a quarter too wide is seen.
 DENSITY_DRAWS = 4096
+#: Draws of which so many are one number may be it all by chance.
+_NEARLY_ALL = 0.95
 
 
 def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
@@ -36,21 +38,28 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
         return
     feeds = _rows(trial, case, count)
     samples = [run([feeds], names)[0] for run in runs]
-    if any((s[n] == s[n][:1]).all() for s in samples for n in names):
+    apart = {n: said for n in names if (said := _shared_otherwise(*(_columns(s[n]) for s in samples)))}
+    shared = [n for n in names if n not in apart and any((s[n] == s[n][:1]).all() for s in samples)]
+    if shared:
         # One draw for the whole batch, or none: as many runs as draws.
-        each = [run([_rows(trial, case, 1, i) for i in range(DRAWS)], names) for run in runs]
-        samples = [{n: np.concatenate([one[n] for one in every]) for n in names} for every in each]
+        each = [run([_rows(trial, case, 1, i) for i in range(DRAWS)], shared) for run in runs]
+        for sample, every in zip(samples, each, strict=True):
+            sample.update({n: np.concatenate([one[n] for one in every]) for n in shared})
     # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
     alike = {
         n
         for n in repeated(trial, participant, lambda run: run([feeds], names)[0])
         if (samples[1][n] != samples[1][n][:1]).any()
     }
+    again = _rows(trial, case, STARTS) if participant.runtime != "numpy" else None
+    calls = [] if again is None else participant.run([again, again], names)
+    called_alike = {n for n in names if calls and np.array_equal(calls[0][n], calls[1][n]) and _varies(samples[0][n])}
     for name in names:
-        if name in alike:
-            yield trial.finding(Draws, participant, name, wrong(REPEATED), case.name)
+        said = apart.get(name) or (REPEATED if name in alike else REPEATED_CALLS if name in called_alike else None)
+        if said is not None:
+            yield trial.finding(Draws, participant, name, wrong(said), case.name)
             continue
-        one, other = (s[name].reshape(len(s[name]), -1) for s in samples)
+        one, other = (_columns(s[name]) for s in samples)
         if one.shape == other.shape and (difference := _joint(one, other)) is not None:
             yield trial.finding(Draws, participant, name, difference, case.name)
             continue
@@ -58,6 +67,28 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
         pairs = zip(one.T, other.T, strict=True)
         p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in pairs]
         yield trial.finding(Draws, participant, name, likely(min(p_values, default=1.0)), case.name)
+
+
+def _columns(drawn: np.ndarray) -> np.ndarray:
+    return drawn.reshape(len(drawn), -1)
+
+
+def _varies(drawn: np.ndarray) -> bool:
+    """Whether rows drawn each for itself are never all the same: no number is nearly all there is."""
+    return any(np.unique(c, return_counts=True)[1].max() < _NEARLY_ALL * len(c) for c in _columns(drawn).T)
+
+
+def _shared_otherwise(reference: np.ndarray, drawn: np.ndarray) -> str | None:
+    """What is wrong with draws [rows, columns] of which all rows share one, where the reference's do not, or do."""
+    if reference.shape != drawn.shape:
+        return None
+    for one, other in zip(reference.T, drawn.T, strict=True):
+        alike = [bool((column == column[0]).all()) for column in (one, other)]
+        if alike == [False, True] and _varies(one):
+            return "all rows of a batch get one draw, and the reference draws for each row"
+        if alike == [True, False] and _varies(other):
+            return "each row is drawn for itself, and all rows of the reference's batch get one draw"
+    return None
 
 
 def _joint(reference: np.ndarray, drawn: np.ndarray) -> Difference | None:

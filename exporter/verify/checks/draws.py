@@ -29,6 +29,7 @@ FORBIDDEN = 4 * DRAWS
 #: Draws that two starts are compared by, where a run takes long.
 STARTS = 48
 REPEATED = "its draws are the same after every start: a sampler has a fixed seed"
+REPEATED_CALLS = "its draws are the same in every call: the sampler begins anew each time"
 #: Where all sessions of a process begin alike whatever the model, two processes are what tells.
 _ALIKE = frozenset(r.name for r in RUNTIMES if r.sessions_alike)
 DEPENDENT = "its draws are not independent: rows {} apart draw alike"
@@ -68,6 +69,9 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     for branch, row in _started_alike(trial, participant, action, rows, log_probs).items():
         which = f" (branch {branch} of {len(trial.signature.branches)})" if len(trial.signature.branches) > 1 else ""
         yield trial.finding(Draws, participant, action, wrong(REPEATED + which), cases[row].name)
+        return
+    if (anew := _called_alike(trial, participant, action, rows, log_probs)) is not None:
+        yield trial.finding(Draws, participant, action, wrong(REPEATED_CALLS), cases[anew].name)
         return
     drawn = _drawn(trial, participant, action, rows)
     p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
@@ -146,6 +150,24 @@ def _started_alike(
 
     alike = repeated(trial, participant, ask)
     return {branch: row for branch, row in shown.items() if str(branch) in alike}
+
+
+def _called_alike(
+    trial: Trial, participant: Participant, action: str, rows: Sequence[Feeds], log_probs: np.ndarray
+) -> int | None:
+    """The row that two calls in a row draw alike, None where they do not: the row whose draws can be told least."""
+    if participant.runtime == "numpy":  # its child draws from one seed
+        return None
+    parts = np.split(np.exp(log_probs.astype(np.float64)), np.cumsum(trial.signature.branches)[:-1], axis=1)
+    same = np.prod([np.square(p / p.sum(axis=1, keepdims=True)).sum(axis=1) for p in parts], axis=0)
+    row = int(same.argmin())
+    if same[row] ** STARTS >= FALSE_ALARM or not trial.allowance(participant, "draws").takes(
+        2 * STARTS, "two calls' draws"
+    ):
+        return None
+    single = _one_row_at_a_time(participant)
+    one, other = _of_rows(participant.run, action, [rows[row], rows[row]], STARTS, single=single)
+    return row if np.array_equal(one, other) else None
 
 
 def repeated(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays]) -> set[str]:
