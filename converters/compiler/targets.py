@@ -14,6 +14,7 @@ from converters.compiler.passes.clip_by_value import clip_by_value
 from converters.compiler.passes.constant_chains import merge_constants, share, square_differences
 from converters.compiler.passes.fuse import fuse
 from converters.compiler.passes.int8_products import multiply_products
+from converters.compiler.passes.layout_views import transpose_layout_views
 from converters.compiler.passes.lowering import lower_for_tfjs
 from converters.compiler.passes.slice_of_concat import parts_for_slices
 from converters.graph.nodes import Graph
@@ -55,7 +56,7 @@ TFJS = (*FEWER_OPS, *_LOWER_FOR_TFJS, _FUSE_ACTIVATIONS)
 TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_ACTIVATIONS)
 ONNX = (*FEWER_OPS, _FUSE)
 #: Models for one consumer stay as they were tried in it.
-CONSUMER_ONNX = (_FUSE,)
+CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)
 BARRACUDA = (_FUSE,)
 
 _OF_BRANCHES = (Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS, Role.PROBS)

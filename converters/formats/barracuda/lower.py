@@ -334,6 +334,12 @@ def _scores_behind(graph: Graph, reference: str, b: NnBuilder) -> list[str]:
 _AXES: dict[Role, Axes] = {Role.VISUAL: (N, C, H, W), Role.ENTITIES: (N, C, W), Role.MEMORY_IN: (N, None, W)}
 
 
+#: How a memory [N, 1, M, 1] becomes a row [N, 1, 1, M], and back. Barracuda 1.4.0 and 2.0.0 leave a Flatten of it as it
+#: is, so that what reads it throws (../shared/unity/r3/cases/recurrent_nn_barracuda-1.4); a Transpose of W and C is
+#: right in 1.4.0 to 3.0.0 (../shared/unity/onnx_rules, Squeeze_01 and Unsqueeze_01, which are imported as that layer).
+_SWAP_W_AND_C = (N, H, C, W)
+
+
 def dressed_model(policy: Policy) -> NnModel:
     """A policy in the names of API version 3 (ML-Agents from release 17 on), which Barracuda 1.4 to 3.0 load.
 
@@ -355,8 +361,7 @@ def dressed_model(policy: Policy) -> NnModel:
         row = as_row(b, values[policy.fetches[spec.name]])
         name = b.stored(row)
         if spec.role is Role.MEMORY_OUT:
-            dims: Dims = (FREE, 1, row.size, 1)
-            name = b.layer(LayerType.RESHAPE, [name], dims, pool=dims, label="rows")
+            name = b.layer(LayerType.TRANSPOSE, [name], (FREE, 1, row.size, 1), pool=_SWAP_W_AND_C, label="rows")
         b.named(spec.name, name)
     return assembled(b, inputs, [s.name for s in signature.outputs], constants)
 
@@ -374,5 +379,5 @@ def _input(b: NnBuilder, spec: TensorSpec) -> Value:
     if spec.role is not Role.MEMORY_IN:
         return b.made(spec.name, value.shape, value.axes)
     b.node = Node(spec.name, "Placeholder")
-    flat = b.layer(LayerType.FLATTEN, [spec.name], (FREE, 1, 1, value.size), label="row")
+    flat = b.layer(LayerType.TRANSPOSE, [spec.name], (FREE, 1, 1, value.size), pool=_SWAP_W_AND_C, label="row")
     return b.made(flat, value.shape, (N, None, C))
