@@ -233,9 +233,12 @@ REFUSED = {
     "corpus/onnx/AliBharwani+ml-agents__Dodge-18499955.onnx": "'entities_0' (Placeholder)",
     "genuine/0.3.0-bc-continuous-recurrent/MyEnv_ppo.bytes": "takes a memory and gives none",
     "foreign/clean_c51__legacy.onnx": "(ArgMax)",
+    "foreign/convlstm__legacy.onnx": "reshapes the memory",
     "foreign/sb3_recurrent_disc_own_forward__legacy_fixed.onnx": "(ArgMax)",
     "foreign/entity_attention__legacy.onnx": "'entities_0' (Placeholder)",
     "foreign/lidar_conv1d__dynamo.onnx": "'entities_0' (Placeholder)",
+    "foreign/rsl_lstm_2l__legacy_fixed.onnx": "reshapes the memory",
+    "foreign/sb3_recurrent_disc_2l__legacy_dyn.onnx": "reshapes the memory",
 }
 
 

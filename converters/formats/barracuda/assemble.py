@@ -10,6 +10,7 @@ import numpy as np
 from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
 from converters.formats.barracuda.lower_base import Draft, NnBuilder
 from converters.formats.barracuda.vocabulary import Activation, LayerType
+from signatures.errors import UnsupportedOpError
 
 #: Every Barracuda from 1.0 to 3.0 reads it, and none of the later ones is read by all.
 VERSION = 16
@@ -27,6 +28,8 @@ def assembled(
         b.constant(np.asarray(numbers, np.float32).reshape(1, 1, 1, -1), name)
     ends = {*outputs, *(m.output for m in memories)}
     drafts = _needed(b.drafts, ends | set(constants))
+    drafts = _reshape_flattened(b, drafts)
+    _check_memories(drafts, memories)
     drafts = _renamed(drafts, ends)
     drafts.sort(key=lambda d: d.type != LayerType.LOAD)  # constants first; sorting keeps the order otherwise
     layers, weights, offset = [], [], 0
@@ -61,6 +64,45 @@ def _needed(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
             needed.update(draft.inputs)
             kept.append(draft)
     return kept[::-1]
+
+
+#: What reads a Flatten rightly in every Barracuda, because it flattens by itself or counts the elements alone.
+_FLATTENS_ITSELF = (LayerType.DENSE, LayerType.RESHAPE)
+
+
+def _reshape_flattened(b: NnBuilder, drafts: Sequence[Draft]) -> list[Draft]:
+    """Each Flatten that another layer reads, or that is a result, as a Reshape.
+
+    Up to 2.0.0 Barracuda leaves a tensor as it is in a Flatten of a ``.nn``: slices, sums and joins behind one throw
+    (../shared/unity/r3/played.jsonl, 52 files), a Dense flattens by itself (52 files right), and so does a Reshape (1).
+    """
+    readers: dict[str, set[LayerType]] = {}
+    for draft in drafts:
+        for name in draft.inputs:
+            readers.setdefault(name, set()).add(draft.type)
+    return [
+        replace(d, type=LayerType.RESHAPE, pool=b.dims_of(d.name))
+        if d.type == LayerType.FLATTEN and not readers.get(d.name, {None}) <= {*_FLATTENS_ITSELF}
+        else d
+        for d in drafts
+    ]
+
+
+def _check_memories(drafts: Sequence[Draft], memories: Sequence[NnMemory]) -> None:
+    """Raise UnsupportedOpError where a memory that Barracuda keeps is reshaped.
+
+    Its length is not known where 1.0.4 to 1.3.2 plan their tensors: "Cannot reshape array of size 1"
+    (../shared/unity/r3/cases/other_nn_barracuda-1.0).
+    """
+    kept = {m.input for m in memories}
+    for draft in drafts:
+        if draft.type == LayerType.RESHAPE and kept.intersection(draft.inputs):
+            raise UnsupportedOpError(
+                f"node {draft.name!r} (Reshape) cannot be written to a .nn: it reshapes the memory {draft.inputs[0]}",
+                issues=[(draft.name, "Reshape")],
+                why="Barracuda 1.0 to 1.3 does not know a memory's length where it plans its tensors",
+                fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
+            )
 
 
 def _renamed(drafts: Sequence[Draft], ends: set[str]) -> list[Draft]:
