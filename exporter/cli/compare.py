@@ -73,3 +73,5 @@ def compare_command(
     )
     if report.passed is False:
         sys.exit(1)
+    if report.undecided and not allow_unverified:
+        sys.exit(3)

@@ -153,6 +153,8 @@ def export_command(
         sys.exit(2)
     if any(r.passed is False for r in results):
         sys.exit(1)
+    if any(r.report is not None and r.report.undecided for r in results):
+        sys.exit(3)
 
 
 def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:

@@ -84,6 +84,8 @@ def verify_command(
         console.write_reports(lambda: _bundle_entries(reports, places, options.steps))
     if any(r.passed is False for r in reports):
         sys.exit(1)
+    if any(r.undecided for r in reports) and not allow_unverified:
+        sys.exit(3)
 
 
 def _bundle_entries(

@@ -166,7 +166,7 @@ def compare_artefacts(
         report = verify(tested, used, known, pool, options, progress, participants=taking_part)
     notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
     report = replace(report, notes=(*report.notes, *notes))
-    if report.passed is None and not allow_unverified:
+    if report.passed is None and not report.undecided and not allow_unverified:
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",
             why=f"they are {', '.join(sorted({m.format.key for m in matched}))}",

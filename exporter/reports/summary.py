@@ -49,7 +49,7 @@ def verdict(report: ParityReport) -> str:
         said = [c.runtime for c in report.comparisons if isinstance(c, Accepted)]
         if said:
             return f"ACCEPTED by the checks of {', '.join(said)}; no numbers were compared"
-        return "NOT VERIFIED: no independent runtime ran"
+        return f"NOT VERIFIED: {report.undecided or 'no independent runtime ran'}"
     pairs = {
         (c.format, c.runtime)
         for c in report.comparisons

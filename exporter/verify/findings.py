@@ -83,6 +83,8 @@ class Finding:
     words: ClassVar[tuple[str, str] | None] = None
     #: What went wrong, where it is told otherwise than of a number.
     wrong: ClassVar[str] = ""
+    #: Whether one that did not pass is a disagreement; else nothing was decided.
+    judges: ClassVar[bool] = True
 
     format: str
     runtime: str
@@ -106,6 +108,11 @@ class Finding:
 
     def __repr__(self) -> str:
         return f"<{self.where}: {self.output} {self.cell()}, {'ok' if self.passed else 'FAIL'} [{self.kind}]>"
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether something is wrong with what was compared."""
+        return self.judges and not self.passed
 
     @property
     def where(self) -> str:
@@ -247,6 +254,16 @@ class Failure(Finding):
     wrong = "{0.where}: {0.reason}"
 
 
+class Undecided(Finding):
+    """Why nothing could be compared: the reference died, or it has no finite number; ``output`` "*" stands for all."""
+
+    __slots__ = ()
+    kind = "undecided"
+    words = ("decided", "not decided")
+    wrong = "not decided: {0.reason}"
+    judges = False
+
+
 class Accepted(Finding):
     """What a consumer's own checker says to a file; ``runtime`` is the release."""
 
@@ -270,6 +287,18 @@ def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -
     text = error.what if error.why is None else f"{error.what}: {error.why}"
     infinite = float("inf")
     return Failure(kind, runtime, output, infinite, infinite, Tolerance(), False, None, text.strip())
+
+
+def died(kind: str, runtime: str, error: RunFailedError) -> Undecided:
+    """A reference that gave no answer: nothing was held against it."""
+    text = error.what if error.why is None else f"{error.what}: {error.why}"
+    return undecided(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {text.strip()}")
+
+
+def undecided(kind: str, runtime: str, output: str, reason: str, where: str | None = None) -> Undecided:
+    """What could not be compared, and why."""
+    infinite = float("inf")
+    return Undecided(kind, runtime, output, infinite, infinite, Tolerance(), False, where, reason)
 
 
 def _number(value: float) -> float | str:

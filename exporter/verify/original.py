@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.compiler.passes.noise import laid_out
 from converters.files.children.process import LoadedModel, RunFailedError
-from signatures.memories import divided, joined
+from signatures.memories import SourcePart, divided, joined
 from signatures.roles import Role
 from signatures.spec import PolicySignature, SourceMap, TensorSpec
 
@@ -60,12 +60,26 @@ class Original:
 
     def run(self, feeds: Arrays) -> dict[str, np.ndarray]:
         """Every output it can answer for, for one set of canonical inputs."""
+        return self.run_all([feeds])[0]
+
+    def run_all(self, inputs: Sequence[Arrays]) -> list[dict[str, np.ndarray]]:
+        """The same for several, in few requests: a source of one row would take one for each."""
         wanted = self.source.rows
-        count = self.signature.rows(feeds)
-        if wanted is None or wanted == count:
-            return self._answers(feeds)
-        parts = [self._answers(self._some_rows(feeds, first, wanted)) for first in range(0, count, wanted)]
-        return {name: np.concatenate([p[name] for p in parts])[:count] for name in parts[0]}
+        counts = [self.signature.rows(feeds) for feeds in inputs]
+        parts: list[Arrays] = []
+        lengths = []
+        for feeds, count in zip(inputs, counts, strict=True):
+            whole = wanted is None or wanted == count
+            own = [feeds] if whole else [self._some_rows(feeds, i, wanted or 1) for i in range(0, count, wanted or 1)]
+            parts += own
+            lengths.append(len(own))
+        answers = iter(self._answers(parts))
+        results = []
+        for count, length in zip(counts, lengths, strict=True):
+            first, *rest = [next(answers) for _ in range(length)]
+            joint = {name: np.concatenate([first[name], *(r[name] for r in rest)])[:count] for name in first}
+            results.append(joint if wanted is not None and wanted != count else first)
+        return results
 
     def _some_rows(self, feeds: Arrays, first: int, count: int) -> dict[str, np.ndarray]:
         """``count`` rows from ``first`` on, the last one repeated where there are not as many."""
@@ -77,14 +91,27 @@ class Original:
             part[spec.name] = array
         return part
 
-    def _answers(self, feeds: Arrays) -> dict[str, np.ndarray]:
-        placed = self._feeds(feeds, zero_noise=False)
+    def _answers(self, inputs: Sequence[Arrays]) -> list[dict[str, np.ndarray]]:
+        placed = [self._feeds(feeds, zero_noise=False) for feeds in inputs]
         asked = self.source.fetches.items()
         fetches = {name: tensor for name, tensor in asked if self.signature.output(name).role is not Role.SAMPLED}
         logits = [b for b in self.source.branches if b is not None] if self._has_logits() else []
         parts = {s.name: self.source.parts[s.name] for s in self.signature.outputs if s.name in self.source.parts}
         tensors = [*fetches.values(), *(p.tensor for given in parts.values() for p in given), *logits]
-        values = dict(self.model.run(placed, list(dict.fromkeys(tensors))))
+        found = self.model.run_all(placed, list(dict.fromkeys(tensors)))
+        return [
+            self._answer(feeds, dict(values), fetches, parts, logits)
+            for feeds, values in zip(inputs, found, strict=True)
+        ]
+
+    def _answer(
+        self,
+        feeds: Arrays,
+        values: dict[str, np.ndarray],
+        fetches: Mapping[str, str],
+        parts: Mapping[str, Sequence[SourcePart]],
+        logits: Sequence[str],
+    ) -> dict[str, np.ndarray]:
         for given in parts.values():
             values.update({p.tensor: self._row(values[p.tensor], p.shape) for p in given})
         results = {n: self._row(values[tensor], self.signature.output(n).shape) for n, tensor in fetches.items()}

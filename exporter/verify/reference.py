@@ -12,7 +12,7 @@ from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.runtimes.pool import RuntimePool
-from exporter.verify.findings import Failure, failure
+from exporter.verify.findings import Undecided, died
 from exporter.verify.original import Original
 from exporter.verify.participants import PolicyUnderTest
 from signatures.roles import Role
@@ -34,7 +34,7 @@ class Reference(AbstractContextManager["Reference"]):
         #: outputs that a sampler in the graph decides
         self.drawn = random_outputs(tested.graph, [s.name for s in self.signature.outputs])
         #: what the source's own runtime refused
-        self.failures: list[Failure] = []
+        self.failures: list[Undecided] = []
         self.name = "numpy"
         #: the outputs that the source answered for
         self._given: frozenset[str] = frozenset()
@@ -51,7 +51,7 @@ class Reference(AbstractContextManager["Reference"]):
             with source.loadable() as (path, options):
                 model = pool.process(source.runtime).load(path, **options)
         except RunFailedError as error:
-            self.failures.append(failure("source", source.runtime, error))
+            self.failures.append(died("source", source.runtime, error))
             return
         self._loaded.append(model)
         self.original = Original(model, self.signature, tested.source_map)
@@ -64,7 +64,7 @@ class Reference(AbstractContextManager["Reference"]):
 
     def answers(self, inputs: Sequence[Arrays]) -> Answers:
         """The outputs that are not drawn; the numpy kernels answer for what the source cannot be asked."""
-        answers = [{} if self.original is None else self.original.run(feeds) for feeds in inputs]
+        answers: Answers = [{} for _ in inputs] if self.original is None else self.original.run_all(inputs)
         given = answers[0] if answers else {}
         self._given |= given.keys()
         rest = [s.name for s in self.signature.outputs if s.name not in given and s.name not in self.drawn]

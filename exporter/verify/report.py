@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Any
 
-from exporter.verify.findings import Failure, Finding, Shape
+from exporter.verify.findings import Failure, Finding, Shape, Undecided
 from signatures.records import dataclass
 
 
@@ -32,14 +32,14 @@ class Pair:
         """Output → the worst that was found of it; an output that has no answer is not in it."""
         worst: dict[str, Finding] = {}
         for c in self.findings:
-            if not isinstance(c, Failure):
+            if not isinstance(c, Failure | Undecided):
                 worst[c.output] = max(worst.get(c.output, c), c, key=_badness)
         return worst
 
     @property
     def worst_text(self) -> str:
         """The largest difference with its output, of what failed where anything did; else what there is to say."""
-        told = [c for c in self.findings if not isinstance(c, Failure)]
+        told = [c for c in self.findings if not isinstance(c, Failure | Undecided)]
         worst = max(told, key=_badness, default=None)
         if worst is None:
             return "no answer"
@@ -93,7 +93,7 @@ class ParityReport:
     @property
     def outputs(self) -> tuple[str, ...]:
         """The outputs that any runtime answered for."""
-        return tuple(dict.fromkeys(c.output for c in self.comparisons if not isinstance(c, Failure)))
+        return tuple(dict.fromkeys(c.output for c in self.comparisons if not isinstance(c, Failure | Undecided)))
 
     @property
     def verdict(self) -> str:
@@ -105,6 +105,12 @@ class ParityReport:
         return "self-consistent" if self.self_consistent else "passed"
 
     @property
+    def undecided(self) -> str:
+        """Why nothing was decided although runtimes ran; empty where something was, or none ran."""
+        why = [c.reason for c in self.comparisons if isinstance(c, Undecided)]
+        return why[0] if why and self.passed is None else ""
+
+    @property
     def failures(self) -> tuple[Finding, ...]:
         """The comparisons that did not pass."""
         return tuple(c for c in self.comparisons if not c.passed)
@@ -112,7 +118,7 @@ class ParityReport:
     def with_findings(self, found: Iterable[Finding]) -> ParityReport:
         """The report with further findings."""
         comparisons = (*self.comparisons, *found)
-        passed = False if any(not c.passed for c in comparisons) else self.passed
+        passed = False if any(c.disagrees for c in comparisons) else self.passed
         return replace(self, comparisons=comparisons, passed=passed)
 
     def to_dict(self) -> dict[str, Any]:

@@ -10,10 +10,11 @@ from converters.runtimes.registry import RuntimeInfo
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
+from exporter.verify.checks.finite import undefined
 from exporter.verify.checks.numbers import numbers, recorded
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.checks.size import check_budget, sizes
-from exporter.verify.findings import Finding, failure
+from exporter.verify.findings import Finding, died, failure
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import (
     Failure,
@@ -73,9 +74,9 @@ def _findings(
     try:
         trial.ask(reference)
     except RunFailedError as error:
-        kind = "reference" if reference.original is None else "source"
-        return [*findings, failure(kind, reference.runtime, error)]
+        return [*findings, died("reference" if reference.original is None else "source", reference.runtime, error)]
     findings += recorded(trial)
+    findings += undefined(trial)
 
     def failed(kind: str, runtime: str, error: RunFailedError, output: str) -> None:
         findings.append(failure(kind, runtime, error, output))
@@ -120,7 +121,8 @@ def _report(
     # A recording held against the source says nothing of what was written.
     independent = any(f.runtime in INDEPENDENT and f.format not in ("golden", "source") for f in findings)
     findings = [*findings, *sizes(options.budget, tested.sizes)]
-    passed = False if any(not f.passed for f in findings) else True if independent else None
+    open_ = any(not f.passed and not f.disagrees for f in findings)
+    passed = False if any(f.disagrees for f in findings) else True if independent and not open_ else None
     return ParityReport(
         tested.name,
         passed,

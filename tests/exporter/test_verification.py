@@ -72,7 +72,7 @@ def test_the_memory_is_fed_back(exporting: Exporting, tmp_path: Path) -> None:
     """``recurrent`` keeps its loop in the source, so its own .bytes is the source here: it is straight."""
     exporting("recurrent", ActingPool(refused=frozenset({("source", "tensorflow")})))
     straight = tmp_path / "recurrent.bytes"
-    straight.write_bytes((tmp_path / "out" / "recurrent.failed" / "recurrent.bytes").read_bytes())
+    straight.write_bytes((tmp_path / "out" / "recurrent" / "recurrent.bytes").read_bytes())
 
     def forgets(answer: Tensors) -> None:
         if "recurrent_out" in answer:
@@ -254,9 +254,10 @@ def test_a_runtime_that_refuses_a_model_is_a_failed_comparison(exporting: Export
     )
 
 
-def test_a_source_that_its_runtime_refuses_is_a_failed_comparison(exporting: Exporting) -> None:
+def test_a_source_that_its_runtime_refuses_decides_nothing(exporting: Exporting) -> None:
     result = exporting("continuous", ActingPool(refused=frozenset({("source", "tensorflow")})))
-    assert failures(result) == {("source", "tensorflow", "*", "failure")}
+    assert failures(result) == {("source", "tensorflow", "*", "undecided")}
+    assert report_of(result).passed is None
     assert report_of(result).reference == "numpy"
 
 
@@ -295,7 +296,8 @@ def test_a_source_that_fails_while_it_runs_ends_the_comparison(exporting: Export
 
     pool.spoil = spoiling("source", "tensorflow", die)
     result = exporting("continuous", pool)
-    assert failures(result) == {("source", "tensorflow", "*", "failure")}
+    assert failures(result) == {("source", "tensorflow", "*", "undecided")}
+    assert report_of(result).passed is None
     assert len(report_of(result).comparisons) == 1
 
 

@@ -200,9 +200,9 @@ def test_a_source_that_takes_some_rows_only_is_asked_in_parts(rows: int) -> None
     asked: list[int] = []
 
     class Model:
-        def run(self, feeds: Tensors, fetch: list[str]) -> Tensors:
-            asked.append(len(feeds["x:0"]))
-            return {"y:0": 2 * feeds["x:0"]}
+        def run_all(self, inputs: list[Tensors], fetch: list[str]) -> list[Tensors]:
+            asked.extend(len(feeds["x:0"]) for feeds in inputs)
+            return [{"y:0": 2 * feeds["x:0"]} for feeds in inputs]
 
     source = SourceMap({"state": "x:0"}, {"action": "y:0"}, rows=rows)
     original = Original(Model(), signature, source)  # type: ignore[arg-type]

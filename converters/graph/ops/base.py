@@ -184,6 +184,8 @@ class OpDef:
     #: The operand whose integers are looked up, and how many rows there are to find.
     looks_up: int | None = None
     table_size: TableSize | None = None
+    #: The result is where the largest or the smallest number is along an axis.
+    chooses: Literal["", "largest", "smallest"] = ""
     #: The result says which elements of two operands are equal.
     compares_equal: bool = False
     #: The op that computes this one, a bias and an activation in one.

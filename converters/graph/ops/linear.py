@@ -296,8 +296,12 @@ OPS = (
     _reduce("Min", np.min, "ReduceMin", "exact"),
     _reduce("All", np.all, "ReduceMin", "exact"),
     _reduce("Any", np.any, "ReduceMax", "exact"),
-    OpDef("ArgMax", _infer_arg, _arg(np.argmax), _lower_arg("ArgMax"), _ARG_ATTRS, precision="exact"),
-    OpDef("ArgMin", _infer_arg, _arg(np.argmin), _lower_arg("ArgMin"), _ARG_ATTRS, precision="exact"),
+    OpDef(
+        "ArgMax", _infer_arg, _arg(np.argmax), _lower_arg("ArgMax"), _ARG_ATTRS, precision="exact", chooses="largest"
+    ),
+    OpDef(
+        "ArgMin", _infer_arg, _arg(np.argmin), _lower_arg("ArgMin"), _ARG_ATTRS, precision="exact", chooses="smallest"
+    ),
     OpDef(
         "Softmax",
         same_as(0),

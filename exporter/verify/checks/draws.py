@@ -16,9 +16,10 @@ from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Feeds, Participant, Run
 from exporter.verify.statistics import FALSE_ALARM, dependent, fit, fit_all
+from exporter.verify.tolerances import Tolerance
 from exporter.verify.trial import Trial
 from signatures.roles import Role
-from signatures.sampling import ONE_ALLOWED, ONE_FORBIDDEN
+from signatures.sampling import ONE_ALLOWED, ONE_FORBIDDEN, Case
 
 Arrays = dict[str, np.ndarray]
 #: Draws for one input; all draws together, where a run takes long.
@@ -59,6 +60,7 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
         for row in range(2 if case.name == ONE_ALLOWED else 1)
         if case.name not in _LEFT_OUT and case.name != ONE_FORBIDDEN and not np.isnan(expected[scores][row]).any()
     ]
+    known = _decided(trial, scores, known)
     if not known:
         return
     cases = [case for case, _, _ in known]
@@ -89,6 +91,20 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
 
 
+def _decided(
+    trial: Trial, scores: str, known: list[tuple[Case, int, np.ndarray]]
+) -> list[tuple[Case, int, np.ndarray]]:
+    """Those of the inputs at which no choice that the odds hang on is open: another is right there too."""
+    if not known or not trial.choices.behind(scores):
+        return known
+    rows = [{n: a[row : row + 1] for n, a in case.feeds.items()} for case, row, _ in known]
+    return [
+        each
+        for each, feeds in zip(known, rows, strict=True)
+        if not trial.choices.tied(scores, feeds, Tolerance(), 1)[0]
+    ]
+
+
 def _with_one_forbidden(trial: Trial, participant: Participant, action: str, scores: str) -> Finding | None:
     """What is wrong where one action is forbidden, or two; None where nothing is, or nothing can be.
 
@@ -115,12 +131,17 @@ def _with_one_forbidden(trial: Trial, participant: Participant, action: str, sco
     drawn = np.concatenate([answer[action] for answer in participant.run(inputs, [action])])
     drawn = drawn.reshape(case.batch, count, -1)
     log_probs = np.asarray(expected[scores])
+    decided = np.flatnonzero(~trial.choices.tied(scores, case.feeds, Tolerance(), case.batch))
+    if not decided.size:
+        return None
+    drawn, log_probs = drawn[decided], log_probs[decided]
     if participant.runtime in _ZEROS:
         log_probs = with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
     p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
     difference = likely(p_value)
     if difference.passed:
         return None
+    worst = int(decided[worst])
     row = {n: a[worst : worst + 1] if n in batched else a for n, a in case.feeds.items()}
     begins = trial.bisected(participant, action, difference, row, branch)
     return trial.finding(Draws, participant, action, difference, case.name, bisection=begins)
