@@ -32,7 +32,8 @@ lines "${EXPORT_MODEL_ARGUMENTS:-}"
 arguments=("${ITEMS[@]}")
 
 if [ -n "${EXPORT_MODEL_INSTALL:-}" ]; then
-  python -m pip install --quiet --disable-pip-version-check "$EXPORT_MODEL_INSTALL"
+  # -I: the folder that the job stands in is the checked-out repository, whose pip.py would be run otherwise
+  python -I -m pip install --quiet --disable-pip-version-check "$EXPORT_MODEL_INSTALL"
 fi
 if [ "${EXPORT_MODEL_JAVASCRIPT:-false}" = true ]; then
   export-model runtimes install tfjs

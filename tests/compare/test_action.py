@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -112,3 +113,32 @@ def test_every_input_of_the_action_reaches_the_script() -> None:
     assert {name.lower() for name in passed} == set(passed.values()) == inputs
     script = (ROOT / ".ci" / "action.sh").read_text()
     assert all(f"EXPORT_MODEL_{name}" in script for name in passed)
+
+
+def test_nothing_of_the_checked_out_repository_is_run(job: Job, bundle: Path) -> None:
+    """The action installs with pip and runs export-model in that folder; its modules are a stranger's."""
+    marker = job.folder / "was-run"
+    text = f"from pathlib import Path\nPath({str(marker)!r}).write_text(__name__)\n"
+    names = ("pip", "json", "numpy", "onnxruntime", "click", "sitecustomize", "usercustomize", "struct", "runpy")
+    for name in names:
+        (job.folder / f"{name}.py").write_text(text)
+    for package in ("exporter", "converters", "signatures", "pip"):
+        (job.folder / package).mkdir()
+        (job.folder / package / "__init__.py").write_text(text)
+        (job.folder / package / "__main__.py").write_text(text)
+    (job.folder / "package.json").write_text('{"type": "module", "main": "./index.js"}')
+    (job.folder / "node_modules" / "@tensorflow" / "tfjs").mkdir(parents=True)
+    (job.folder / "node_modules" / "@tensorflow" / "tfjs" / "index.js").write_text(
+        f"require('fs').writeFileSync({json.dumps(str(marker))}, 'node')"
+    )
+    (job.folder / "pip.conf").write_text("[global]\nindex-url = file:///nowhere\n")
+    # pip itself is there already, so that nothing is fetched
+    done = job.run(paths=str(bundle), install="pip", runtimes="numpy,onnxruntime,js", arguments="--allow-unverified")
+    assert not marker.exists(), marker.read_text()
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_python_of_the_action_and_the_workflows_leaves_that_folder_out() -> None:
+    """``-m`` looks in the folder that a job stands in; workflows of this repository stand in their own."""
+    for line in (ROOT / ".ci" / "action.sh").read_text().splitlines():
+        assert not re.search(r"\bpython3? (?!-I\b)", line.split("#")[0]), line

@@ -6,7 +6,7 @@
 
 import process from "node:process";
 
-import { Generator } from "../../tfjs/js/policy.mjs";
+import { Generator } from "../../formats/tfjs/js/policy.mjs";
 import { takeStdout } from "../javascript/js/frames.mjs";
 import { endWithParent, serve } from "../javascript/js/serve.mjs";
 import { readArtifacts } from "../javascript/js/tfjs_node.mjs";
