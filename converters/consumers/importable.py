@@ -11,9 +11,9 @@ from converters.files.chunks import Pieces
 from signatures.errors import ProfileError
 
 
-def _other_format(profile: Profile) -> str:
+def other_format(profile: Profile, tried: str) -> str:
     """What to try first: a format of the same consumer whose layers are others."""
-    return "".join(f"write a .{key} for the same one (--to {key}), or " for key in profile.formats if key != "onnx")
+    return "".join(f"write a .{key} for the same one (--to {key}), or " for key in profile.formats if key != tried)
 
 
 def importable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None:
@@ -32,7 +32,7 @@ def importable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None
                 f"{name!r} cannot be made for {profile.name}: {first.importer} does not read its {first.construct.op}",
                 where=f"node {first.construct.name}",
                 why=f"{first.rule.reading.value}: {first.rule.says} (measured: {first.rule.evidence})",
-                fix=f"{_other_format(profile)}export for a later consumer (--for help lists them)",
+                fix=f"{other_format(profile, 'onnx')}export for a later consumer (--for help lists them)",
             )
         if unknown:
             raise ProfileError(

@@ -17,7 +17,8 @@ class Profile:
     ``formats`` are those that it loads, the usual one first. ``dress`` gives the policy under the names, dtypes and
     layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
     ``converters/consumers/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
-    releases of ``converters/consumers/unity/consumers.py`` that must accept it. ``opset`` is the ONNX opset.
+    releases of ``converters/consumers/unity/consumers.py`` whose checks must accept it, ``players`` those whose player
+    must play it. ``opset`` is the ONNX opset.
     ``own_names`` are formats whose writer gives a policy the consumer's names by itself (``.nn`` of API version 2).
     """
 
@@ -30,6 +31,7 @@ class Profile:
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()
+    players: tuple[str, ...] = ()
 
 
 def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:

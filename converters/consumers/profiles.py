@@ -38,6 +38,7 @@ PROFILES: tuple[Profile, ...] = (
         dress=partial(version3.dress, profile="unity6", feeds_previous=False),
         importers=("Sentis 2.1.3", "Inference Engine 2.2.2", "Inference Engine 2.4.0"),
         checkers=("R22", "R23", "R23-2.4"),
+        players=("R22", "R23", "R23-2.4"),
     ),
     Profile(
         name="barracuda-3",
@@ -48,6 +49,7 @@ PROFILES: tuple[Profile, ...] = (
         opset=12,
         importers=("Barracuda 3.0.0",),
         checkers=("R20",),
+        players=("R20",),
     ),
     Profile(
         name="barracuda-1.4",
@@ -57,6 +59,7 @@ PROFILES: tuple[Profile, ...] = (
         opset=12,
         importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),
         checkers=("R20",),
+        players=("2.0.1",),
     ),
     Profile(
         name="barracuda-1.0",
@@ -68,6 +71,7 @@ PROFILES: tuple[Profile, ...] = (
         opset=11,
         importers=("Barracuda 1.1.2", "Barracuda 1.4.0"),
         checkers=("R20",),
+        players=("1.9.1", "1.0.8"),
     ),
     *TFSHARP,
 )

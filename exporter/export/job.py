@@ -73,9 +73,11 @@ def artefacts_of(
         artifacts = [f.artifact(job.policy, how) for f in formats]
         if job.profile.importers:
             from converters.consumers.importable import importable
+            from converters.consumers.playable import playable
 
             for artifact in artifacts:
                 importable(job.profile, artifact.files, job.policy.name)
+                playable(job.profile, artifact.files, job.policy.name)
         return contract, artifacts, ()
 
 

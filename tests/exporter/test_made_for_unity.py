@@ -15,7 +15,10 @@ from fixtures import path as fixture
 from signatures.errors import UsageError
 
 
-@pytest.mark.parametrize(("name", "releases"), [("unity6", {"R22", "R23", "R23-2.4"}), ("barracuda-3", {"R20"})])
+@pytest.mark.parametrize(
+    ("name", "releases"),
+    [("unity6", {"R22", "R23", "R23-2.4"}), ("barracuda-3", {"R20"}), ("barracuda-1.4", {"R20", "2.0.1"})],
+)
 def test_a_bundle_that_was_made_for_a_consumer_is_held_to_its_checkers(
     name: str, releases: set[str], tmp_path: Path
 ) -> None:

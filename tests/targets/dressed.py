@@ -15,6 +15,7 @@ import onnxruntime
 
 from converters.compiler.options import CompileOptions
 from converters.consumers.importable import importable
+from converters.consumers.playable import playable
 from converters.consumers.profile import Profile
 from converters.consumers.unity.checker import UnityVerdict, check_file
 from converters.consumers.unity.consumers import consumer
@@ -82,6 +83,7 @@ class Pair:
         artifact = written(form).artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
         if profile.importers:
             importable(profile, artifact.files, policy.name)
+            playable(profile, artifact.files, policy.name)
         data = artifact.files[artifact.main].joined()
         made = onnx.ModelProto.FromString(data if form == "onnx" else b"")
         return cls(policy, profile, dressed, plain or Plain(policy), made, data, form)

@@ -42,7 +42,8 @@ def assumed_brain(model: CheckedModel, ranks: Sequence[int]) -> Brain:
         vector = view.channels if view.name == VECTOR else vector
         order = (0, int(numbered[1])) if numbered else (2 if view.name == VECTOR else 1, position)
         sensed.append((order, shapes[rank]))
-    continuous, branches = _actions(model)
+    previous = next((view.last for view in model.inputs if view.name == PREVIOUS), 1)
+    continuous, branches = _actions(model, previous)
     sensors = sensors_of([shape for _, shape in sorted(sensed)])
     return Brain(continuous, branches, vector, 1, sensors)
 
@@ -66,7 +67,8 @@ def nn_ranks(model: NnModel) -> list[int]:
     return [2 if shape[1:3] == (1, 1) else 3 if shape[1] == 1 else 4 for shape in shapes]
 
 
-def _actions(model: CheckedModel) -> tuple[int, tuple[int, ...]]:
+def _actions(model: CheckedModel, previous: int) -> tuple[int, tuple[int, ...]]:
+    """(continuous actions, branches); a file of version 2 says the sum of the latter, and by ``previous`` how many."""
     continuous = together = 0
     with contextlib.suppress(UnityThrows):
         continuous = max(model.continuous_size, 0)
@@ -76,4 +78,5 @@ def _actions(model: CheckedModel) -> tuple[int, tuple[int, ...]]:
     single = version is not None and bool(version.size) and truncated(version[0]) == FIRST_VERSION
     if not single and branches is not None:
         return continuous, tuple(max(truncated(n), 0) for n in branches)
-    return continuous, (together,) if together else ()
+    each, left = divmod(together, max(previous, 1))
+    return continuous, tuple(each + (i < left) for i in range(max(previous, 1))) if together >= previous else ()

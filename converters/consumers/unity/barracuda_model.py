@@ -176,13 +176,19 @@ def _kept_nhwc(file: OnnxFile, name: str) -> bool:
 
 
 def _keeps_all_nhwc(file: OnnxFile) -> bool:
-    """Whether Barracuda 1.3 takes a file for TensorFlow's: a Transpose to NCHW that a Conv reads
-    (cases/gray_camera_barracuda-1.0, where two cameras are NCHW and both are taken for NHWC).
+    """Whether Barracuda 1.3 takes a file for TensorFlow's: a Transpose to NCHW stands between an input, reshaped or
+    not, and a Conv (cases/gray_camera_barracuda-1.0, where two cameras are NCHW and both are taken for NHWC).
     """
+    declared = {i.name for i in file.inputs}
     for node in file.model.graph.node:
         perm = attributes(node).get("perm")
-        if node.op_type == "Transpose" and perm is not None and tuple(perm.ints) == _TO_NCHW:
-            return any(r.op_type == "Conv" and r.input[0] == node.output[0] for r in file.readers(node.output[0]))
+        if node.op_type != "Transpose" or perm is None or tuple(perm.ints) != _TO_NCHW:
+            continue
+        maker: Any = file.producers.get(node.input[0])
+        source = maker.input[0] if maker is not None and maker.op_type == "Reshape" else node.input[0]
+        readers = file.readers(node.output[0])
+        if source in declared and any(r.op_type == "Conv" and r.input[0] == node.output[0] for r in readers):
+            return True
     return False
 
 

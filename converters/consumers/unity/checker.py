@@ -150,7 +150,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
     """
     kind = recognised(Fetched(path)).key
     if kind == "nn" or (path.suffix.lower() == ".nn" and kind != "onnx"):
-        return _check_nn(path, consumer, brain)
+        return _check_nn_file(path, consumer, brain)
     if kind != "onnx":
         raise SourceError(
             "is no .onnx and no .nn",
@@ -158,7 +158,11 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
             why="Unity's importers read these two",
             fix=f"export it with --for {consumer.profile}, and check what that writes",
         )
-    file = read_onnx_file(path)
+    return check_onnx(read_onnx_file(path), path, consumer, brain)
+
+
+def check_onnx(file: OnnxFile, path: Path, consumer: Consumer, brain: Brain | None = None) -> UnityVerdict:
+    """The same of an ONNX that is parsed already; ``path`` is what the verdict names."""
     refused, wrong = importing.refusal(file, consumer), _misread(file, consumer)
     if refused is not None:
         return UnityVerdict(path, consumer, brain or Brain(), refused, misread=wrong, assumed=brain is None)
@@ -170,7 +174,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
     return _imported(path, consumer, brain, model, onnx_ranks(file, model), file, wrong)
 
 
-def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:
+def _check_nn_file(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:
     data = read_bytes(path)
     version = int.from_bytes(data[:8], "little", signed=True) % _MAGIC
     refused = None
@@ -182,7 +186,11 @@ def _check_nn(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdi
         refused = Thrown("NotSupportedException", f"Format version not supported: {version}", str(path), fix)
     if refused is not None:
         return UnityVerdict(path, consumer, brain or Brain(), refused, assumed=brain is None)
-    parsed = nn_format.parse(data)
+    return check_nn(nn_format.parse(data), path, consumer, brain)
+
+
+def check_nn(parsed: nn_format.NnModel, path: Path, consumer: Consumer, brain: Brain | None = None) -> UnityVerdict:
+    """The same of a ``.nn`` that is parsed already, by a release on Barracuda."""
     return _imported(path, consumer, brain, barracuda_model.of_nn(parsed, consumer), nn_ranks(parsed), nn=parsed)
 
 

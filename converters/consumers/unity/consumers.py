@@ -40,6 +40,7 @@ class Consumer:
     ``checks`` are ML-Agents' checks that are known (None: not these); ``deterministic``: there is Deterministic
     Inference; ``reads_version``: the player goes by ``version_number``, and refuses what it does not know;
     ``feeds_entities``: there are sensors of two axes; ``fetches_action_alone``: no other output has actions.
+    ``formats`` are those of which it is known what comes of them.
     ``refusals``: what its importer refuses is known (``importing``), not only what it misreads (``readings``).
     """
 
@@ -58,6 +59,7 @@ class Consumer:
     feeds_entities: bool = True
     fetches_action_alone: bool = False
     refusals: bool = True
+    formats: tuple[str, ...] = ("onnx", "nn")
 
     @property
     def title(self) -> str:
@@ -121,6 +123,7 @@ EARLIER = {
             feeds_entities=False,
             fetches_action_alone=True,
             refusals=False,
+            formats=("nn",),
         ),
     )
 }

@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterator
 
 from converters.consumers.unity.players import Outcome
+from converters.formats.barracuda.assemble import FLATTENS_ITSELF
 from converters.formats.barracuda.format import Layer, NnModel
-from converters.formats.barracuda.vocabulary import LayerType
+from converters.formats.barracuda.vocabulary import Activation, LayerType
 from signatures.records import dataclass
 
-_ANY_ORDER = frozenset({LayerType.DENSE, LayerType.RESHAPE, LayerType.FLATTEN})
+#: Activations that go by the channels.
+_BY_CHANNELS = frozenset({Activation.SOFTMAX, Activation.LOG_SOFTMAX})
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +39,16 @@ def trips(model: NnModel, consumer: str) -> Iterator[tuple[LayerRow, Layer]]:
 
 def _is_flatten_in_need(layer: Layer, model: NnModel) -> bool:
     """A Flatten that more than matrix products and other views read: dropped, they get the four axes before it."""
-    return layer.type == LayerType.FLATTEN and _minds(layer.name, model, {m.output for m in model.memories})
+    return layer.type == LayerType.FLATTEN and _is_missed(layer.name, model)
 
 
-def _minds(name: str, model: NnModel, kept: set[str]) -> bool:
-    if name in model.outputs and name not in kept:
-        return True
+def _is_missed(name: str, model: NnModel) -> bool:
+    """Whether a layer reads it, directly or behind activations, that goes by its axes; an output is kept flat."""
     for reader in model.layers:
-        if name not in reader.inputs or reader.type in _ANY_ORDER:
+        if name not in reader.inputs or reader.type in (*FLATTENS_ITSELF, LayerType.FLATTEN):
             continue
-        if reader.type != LayerType.ACTIVATION or _minds(reader.name, model, kept):
+        each = reader.type == LayerType.ACTIVATION and reader.activation not in _BY_CHANNELS
+        if not each or _is_missed(reader.name, model):
             return True
     return False
 

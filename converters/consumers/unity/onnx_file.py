@@ -131,6 +131,11 @@ class OnnxFile:
         return said or self._inferred[1]
 
 
+def parsed_onnx(data: bytes) -> OnnxFile:
+    """The model of an ONNX that we wrote: its weights are where they are, and not looked at."""
+    return OnnxFile(packaged(decoded(data)))
+
+
 def read_onnx_file(path: Path) -> OnnxFile:
     """Read the messages of a model. Raises SourceError, DamagedFileError."""
     try:

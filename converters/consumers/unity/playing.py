@@ -113,7 +113,8 @@ def _absent(scene: Scene, player: Player) -> Iterator[Played]:
         fix, evidence = f"name the output {name}; --for {scene.consumer.profile} does", _ABSENT
         if name == ACTION and {CONTINUOUS, DISCRETE}.intersection(scene.model.outputs):
             text += f": before ML-Agents 1.7 no player knows {CONTINUOUS} and {DISCRETE}"
-            fix, evidence = "play it in ML-Agents 1.7 or later", "cases/hybrid_nn_ml-agents-1.0.8"
+            fix = "play it in ML-Agents 1.7 or later (--to nn without --for writes for 1.7 to 1.9)"
+            evidence = "cases/hybrid_nn_ml-agents-1.0.8"
         yield Played(Outcome.FIRST, text, f"output {name}", fix, player.absent.format(name=name), evidence)
 
 

@@ -67,7 +67,7 @@ def _needed(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
 
 
 #: What reads a Flatten rightly in every Barracuda, because it flattens by itself or counts the elements alone.
-_FLATTENS_ITSELF = (LayerType.DENSE, LayerType.RESHAPE)
+FLATTENS_ITSELF = (LayerType.DENSE, LayerType.RESHAPE)
 
 
 def _reshape_flattened(b: NnBuilder, drafts: Sequence[Draft]) -> list[Draft]:
@@ -82,7 +82,7 @@ def _reshape_flattened(b: NnBuilder, drafts: Sequence[Draft]) -> list[Draft]:
             readers.setdefault(name, set()).add(draft.type)
     return [
         replace(d, type=LayerType.RESHAPE, pool=b.dims_of(d.name))
-        if d.type == LayerType.FLATTEN and not readers.get(d.name, {None}) <= {*_FLATTENS_ITSELF}
+        if d.type == LayerType.FLATTEN and not readers.get(d.name, {None}) <= {*FLATTENS_ITSELF}
         else d
         for d in drafts
     ]
