@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     "releases",
     multiple=True,
     metavar="RELEASE",
-    help="What Unity says about it: R20, R22, R23, R23-2.4, all; 2.0.1, 1.9.1, 1.0.8.",
+    help="Unity's answer: R20, R22, R23, R23-2.4, all; 2.0.1 … 1.0.8.",
 )
 @click.option("--actions", metavar="KINDS", help="With --unity: continuous:2, discrete:3,2, or both by +.")
 @click.option(

@@ -9,6 +9,8 @@ from exporter.tables import sized, table
 from exporter.verify.findings import Accepted, Decisions, Draws, Size
 from exporter.verify.report import ParityReport
 
+UNVERIFIED = "NOT VERIFIED: no independent runtime ran"
+
 
 def parity_table(report: ParityReport) -> str:
     """Verdict, format, runtime, size, and the worst difference with its output."""
@@ -49,7 +51,7 @@ def verdict(report: ParityReport) -> str:
         said = [c.runtime for c in report.comparisons if isinstance(c, Accepted)]
         if said:
             return f"ACCEPTED by the checks of {', '.join(said)}; no numbers were compared"
-        return f"NOT VERIFIED: {report.undecided or 'no independent runtime ran'}"
+        return f"NOT VERIFIED: {report.undecided}" if report.undecided else UNVERIFIED
     pairs = {
         (c.format, c.runtime)
         for c in report.comparisons

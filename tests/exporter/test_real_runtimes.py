@@ -95,7 +95,7 @@ ROOMS = {"bytes": "frozen_graph"}
 
 def plant(monkeypatch: pytest.MonkeyPatch, target: str, output: str = "action") -> None:
     """Let the writer of one format write a wrong weight."""
-    module = importlib.import_module(f"converters.{ROOMS.get(target, target)}.writer")
+    module = importlib.import_module(f"converters.formats.{ROOMS.get(target, target)}.writer")
     write = module.write
 
     def wrong(policy: Policy, options: WriteOptions) -> Any:
