@@ -20,6 +20,7 @@ from converters.compiler.passes.naming import name_ports
 from converters.compiler.passes.noise import settle_noise, settle_single_draws, unseeded
 from converters.compiler.passes.normalise import normalise
 from converters.compiler.passes.outputs import derive_outputs, leave_out_without_rows, without_chance
+from converters.compiler.passes.passed_through import drop_passed_through
 from converters.compiler.passes.ranks import settle_ranks
 from converters.compiler.passes.signature import sign, source_map, understand_actions
 from converters.compiler.passes.simplify import collapse_views, drop_identities
@@ -87,6 +88,7 @@ def compile_graph(
 def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> list[tuple[str, Compilation]]:
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
     options = _by_nodes(graph, options)
+    facts = drop_passed_through(graph, options, facts)
     graph, facts = _for_any_number(graph, options, facts)
     joined = join_memories(graph, options, facts)
     original, options, facts = joined.graph, joined.options, joined.facts

@@ -165,6 +165,14 @@ def depends_on_input(graph: Graph, left_out: Callable[[Node], bool] = lambda nod
     return fed
 
 
+def fed_through(graph: Graph, reference: str) -> str | None:
+    """Return the placeholder whose elements a tensor is, computed by nothing; None where it is computed."""
+    node = graph.producer(reference)
+    while not is_fed(node) and passes_on(node):
+        node = graph.producer(node.inputs[0])
+    return node.name if is_fed(node) else None
+
+
 def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None) -> tuple[Brain, ...]:
     outputs: list[tuple[str, Role, str]] = []
     for name, role in wanted.items():
@@ -222,6 +230,8 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
     read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
     fed = fed - set(known)
     sinks = [n for n in graph.nodes if n.name not in read and n.name in fed and not is_fed(n)]
+    echoes = [n for n in sinks if fed_through(graph, n.name) is not None]
+    sinks = [n for n in sinks if n not in echoes] or echoes
     if not sinks:
         raise NotAPolicyError(
             "there is no policy in this graph",
@@ -242,7 +252,7 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
     node = chosen[0]
     output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
     outputs = (output, *((name.rsplit("/", 1)[-1], role, name) for name, role in known.items()))
-    rest = [n.name for n in sinks if n is not node]
+    rest = [n.name for n in (*sinks, *(e for e in echoes if e not in sinks)) if n is not node]
     if declared:
         return Brain("", (*outputs, *_others(outputs, rest)), _constants(graph, ""))
     return Brain("", outputs, _constants(graph, ""), tuple(rest))

@@ -106,7 +106,12 @@ _STATE_WORDS = frozenset(
     )
 )
 #: Words that say no more than which end of the step it is.
-_ENDS = frozenset(("in", "out", "input", "output", "next", "new", "prev", "previous", "last", "old", "initial", "init"))
+_ENDS = frozenset(
+    (
+        *("in", "out", "ins", "outs", "input", "output", "inputs", "outputs"),
+        *("next", "new", "prev", "previous", "last", "old", "initial", "init"),
+    )
+)
 _CELL_WORDS, _HIDDEN_WORDS = frozenset(("c", "cx", "cell", "cells")), frozenset(("h", "hx", "hidden", "hiddens"))
 
 

@@ -209,6 +209,14 @@ def test_of_several_the_one_that_sounds_like_an_action_is_taken(name: str) -> No
     assert [tensor for _, tensor in outputs(g)[0].values()] == [name]
 
 
+def test_a_tensor_that_only_hands_an_input_on_is_not_the_action() -> None:
+    handed = op("state_outs", "Identity", "state_ins")
+    given = graph(placeholder("obs", (None, 3)), placeholder("state_ins", (None,)), op("y", "Tanh", "obs"), handed)
+    (brain,) = find_brains(given)
+    assert brain.outputs == (("y", Role.ACTION, "y"),)
+    assert brain.left_out == ("state_outs",)
+
+
 def test_several_candidates_are_listed_with_the_flag_that_decides() -> None:
     g = graph(placeholder("obs"), op("left", "Tanh", "obs"), op("right", "Neg", "obs"))
     with pytest.raises(SignatureError) as caught:

@@ -47,26 +47,34 @@ Import = Callable[[int | None, bool], Importer]
 
 
 def read_rows(
-    imported: Import, declared: Sequence[Any], outputs: Sequence[Any], axes: Mapping[str, int], ends: Mapping[str, int]
+    imported: Import,
+    declared: Sequence[Any],
+    outputs: Sequence[Any],
+    axes: Mapping[str, int],
+    ends: Mapping[str, int],
+    nodes: Sequence[Any],
 ) -> Reading:
-    """The reading that is right; ``axes`` and ``ends`` are the batch axes of memories, by input and by output. Raises
-    what ``imported`` raises, SignatureError where the model gives one row only and no reading gives more.
+    """Return the reading that is right of a model with ``nodes``; ``axes`` and ``ends`` are the batch axes of memories,
+    by input and by output. Inputs that are handed on as they came say nothing of rows: godot_rl's exporter may fix
+    ``state_ins`` alone to one number. Raises what ``imported`` raises, SignatureError where the model gives one row
+    only and no reading gives more.
     """
-    batch = _fixed_batch(declared, axes)
+    asked, judged = _computed(declared, outputs, nodes)
+    batch = _fixed_batch(asked, axes)
     importer = imported(batch, False)
-    if batch is None and not _static(declared):
-        if not _baked(importer, outputs):
+    if batch is None and not _static(asked):
+        if not _baked(importer, judged):
             return Reading(importer, importer.graph(), importer.types)
         importer, batch = imported(1, False), 1
-        fault = _fault(importer, outputs)
+        fault = _fault(importer, judged)
         if fault is None:
             return Reading(importer, importer.graph(), importer.types, batch)
         try:
             return _alone(imported, declared, outputs, axes, ends, leading=True)
         except ExportModelError:
             raise fault from None
-    has_rows = batch is not None and _has_rows(importer, outputs)
-    fault = _fault(importer, outputs, said=True) if has_rows else None
+    has_rows = batch is not None and _has_rows(importer, judged)
+    fault = _fault(importer, judged, said=True) if has_rows else None
     plain = Reading(importer, importer.graph(), importer.types, batch)
     if has_rows and fault is None and not _broken(importer, outputs):
         return plain
@@ -80,6 +88,21 @@ def read_rows(
         raise
     same = has_rows and fault is None and _broken(alone.importer, outputs) == _broken(importer, outputs)
     return plain if same else alone
+
+
+def _computed(
+    declared: Sequence[Any], outputs: Sequence[Any], nodes: Sequence[Any]
+) -> tuple[Sequence[Any], Sequence[Any]]:
+    """Return the inputs and outputs but for those that Identities alone connect, where any others are there."""
+    given = {v.name: v.name for v in declared}
+    for node in nodes:
+        if node.op_type == "Identity" and node.input[0] in given:
+            given[node.output[0]] = given[node.input[0]]
+    judged = [v for v in outputs if v.name not in given]
+    read = {given[name] for n in nodes if n.op_type != "Identity" for name in n.input if name in given}
+    echoed = {given[v.name] for v in outputs if v.name in given} - read
+    asked = [v for v in declared if v.name not in echoed]
+    return (asked, judged) if asked and judged else (declared, outputs)
 
 
 # ------------------------------------------------------------------ one agent at a time

@@ -82,7 +82,8 @@ def read_onnx(given: Fetched) -> OnnxModel:
     memories, axes = _memories(graph, declared)
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
     ends = {m.output: m.axis for m in memories}
-    reading = read_rows(partial(_imported, graph, detached, opsets, declared, axes), declared, graph.output, axes, ends)
+    imported = partial(_imported, graph, detached, opsets, declared, axes)
+    reading = read_rows(imported, declared, graph.output, axes, ends, graph.node)
     importer, types = reading.importer, reading.types
     outputs, left_out = _outputs(importer, [v.name for v in graph.output])
     return OnnxModel(
