@@ -29,7 +29,8 @@ class _Plan:
     """What is to be computed for some tensors, where some are fed."""
 
     constants: Mapping[str, np.ndarray]
-    steps: Sequence[tuple[OpDef, Node]]
+    #: each with the tensors that nothing after it reads
+    steps: Sequence[tuple[OpDef, Node, Sequence[str]]]
 
 
 def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
@@ -37,7 +38,7 @@ def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
     key = _plan, tuple(fed), tuple(fetch)
     if key not in graph.made:
         needed = _needed(graph, fetch, fed)
-        constants, steps = dict[str, np.ndarray](), list[tuple[OpDef, Node]]()
+        constants, steps = dict[str, np.ndarray](), list[Node]()
         for node in graph.nodes:
             if node.name not in needed:
                 continue
@@ -49,8 +50,14 @@ def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
                 assert node.value is not None
                 constants[node.name] = node.value
             else:
-                steps.append((op_of(node), node))
-        graph.made[key] = _Plan(constants, steps)
+                steps.append(node)
+        last = {r: number for number, node in enumerate(steps) for r in node.inputs}
+        kept = {*constants, *map(normal_ref, fetch)}
+        done: list[list[str]] = [[] for _ in steps]
+        for reference, number in last.items():
+            if reference not in kept:
+                done[number].append(reference)
+        graph.made[key] = _Plan(constants, [(op_of(n), n, d) for n, d in zip(steps, done, strict=True)])
     plan: _Plan = graph.made[key]
     return plan
 
@@ -74,7 +81,7 @@ def run_graph(
     plan = _plan(graph, values, fetch)
     values = {**plan.constants, **values}
     with np.errstate(all="ignore"):  # infinities and NaNs are numbers to a model
-        for entry, node in plan.steps:
+        for entry, node, done in plan.steps:
             arguments = [values[r] for r in node.inputs]
             if jitter is not None:
                 arguments = jitter.operands(entry, arguments)
@@ -83,4 +90,6 @@ def run_graph(
                 results = jitter.results(entry, node, arguments, results)
             for index, result in enumerate(results):
                 values.setdefault(ref(node.name, index), result)
+            for reference in done:  # thousands of rows of every tensor at once do not fit into a child
+                del values[reference]
     return {name: values[normal_ref(name)] for name in fetch}

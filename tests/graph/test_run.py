@@ -185,3 +185,18 @@ def test_rounding_moves_no_function_out_of_its_range(arithmetic: str) -> None:
         found = run_graph(Graph(tuple(nodes)), feeds, ["tanh", "softmax"], Jitter(seed, arithmetic))
         assert np.abs(found["tanh"]).max() <= 1 + 2**-23
         assert found["softmax"].min() >= 0 and found["softmax"].max() <= 1 + 2**-23
+
+
+def test_what_nothing_reads_any_more_is_let_go() -> None:
+    """A child may take so much memory; 4,096 rows of each tensor of an attention at once were more."""
+    steps = [node(f"y{i}", "Neg", f"y{i - 1}" if i else "x") for i in range(32)]
+    made = graph(placeholder("x", (None, 1 << 10)), *steps)
+    fed = np.ones((1 << 9, 1 << 10), np.float32)
+    run_graph(made, {"x": fed}, ["y31"])
+    tracemalloc.start()
+    given = run_graph(made, {"x": fed}, ["y3", "y31"])
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 6 * fed.nbytes
+    np.testing.assert_array_equal(given["y31"], fed)
+    np.testing.assert_array_equal(given["y3"], fed)
