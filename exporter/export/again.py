@@ -19,7 +19,7 @@ from converters.formats.source import OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from exporter.export.job import Job, tested_in
+from exporter.export.job import Job, own_in
 from exporter.export.options import storage_of
 from exporter.export.pipeline import Progress, consumer, joined
 from exporter.export.sources import Source, read_source
@@ -120,7 +120,7 @@ def verify_folder(
             decided = decisions(tested, held, kept, used or ("numpy",), pool, options or VerifyOptions())
             report = replace(report.with_findings(decided), self_consistent=False)
         if again is not None and again.own is not None:
-            under = tested_in(replace(again, policy=again.own, profile=None), formats, scratch / "own")
+            under = own_in(again, formats, scratch / "own")
             report = joined(report, verify(under, used or ("numpy",), known, pool, None, progress))
     if asked:
         note = (

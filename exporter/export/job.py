@@ -142,10 +142,15 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
     )
 
 
-def tested_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
-    """A policy written to a folder that is thrown away."""
+def own_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
+    """The policy of a consumer's job under its own names, written to a folder that is thrown away.
+
+    It is written in those of the formats that hold every policy; one of a consumer alone holds its names and no others.
+    """
+    assert job.own is not None
+    job = replace(job, policy=job.own, profile=None)
     contract = contract_of(job.policy, job.source, job.model, ReadOptions())
-    artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats]
+    artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats if f.default]
     for artifact in artifacts:
         artifact.write(folder)
     return under_test(job, folder, artifacts, folder)

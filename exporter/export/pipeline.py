@@ -19,9 +19,9 @@ from exporter.export.job import (
     Job,
     artefacts_of,
     check_weights,
+    own_in,
     sizes_unrounded,
     smaller,
-    tested_in,
     under_test,
 )
 from exporter.export.labels import check_labels, labelled, read_labels
@@ -197,8 +197,7 @@ class Exporter:
                 rules = replace(options.parity, rules=(), golden=None, budget={})
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
-                    plain = replace(job, policy=job.own, profile=None)
-                    under = tested_in(plain, self._formats, folder / "own")
+                    under = own_in(job, self._formats, folder / "own")
                     report = joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
