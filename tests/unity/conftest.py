@@ -19,6 +19,13 @@ def lines(name: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
+def document(name: str) -> list[dict[str, Any]]:
+    """The rows of a .json below ../shared/unity; where it is not there an empty one, whose test says why it skips."""
+    path = UNITY / name
+    rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else [{}]
+    return rows
+
+
 @pytest.fixture
 def unity_data() -> Path:
     if not UNITY.is_dir():

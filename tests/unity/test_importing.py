@@ -12,7 +12,7 @@ from converters.consumers.unity.checker import check_file
 from converters.consumers.unity.consumers import CONSUMERS
 from converters.consumers.unity.importing import refusal
 from converters.consumers.unity.onnx_file import read_onnx_file
-from tests.unity.conftest import lines
+from tests.unity.conftest import document, lines
 from tests.unity.policies import Draft
 
 ROWS = lines("onnx_rules/onnx_rules.jsonl")
@@ -32,6 +32,28 @@ def test_an_import_ends_as_recorded(row: dict[str, Any], unity_data: Path) -> No
         else:
             assert found is not None and found.exception == recorded["exception"], consumer.name
             assert recorded["message"].startswith(found.message.rstrip()), consumer.name
+
+
+ORIGINALS = document("r3/cases/import_not_foreseen/originals.json")
+
+
+@pytest.mark.corpus
+@pytest.mark.parametrize("row", ORIGINALS, ids=lambda row: row.get("source", "shared-is-absent"))
+def test_an_original_of_another_trainer_is_imported_or_refused_as_recorded(
+    row: dict[str, Any], unity_data: Path
+) -> None:
+    """These 26 were foreseen otherwise once: weights in a file of their own, a rank that is lost, a computed B."""
+    consumer = next(c for c in CONSUMERS.values() if c.runtime == row["runtime"])
+    found = refusal(read_onnx_file(unity_data.parent / row["source"]), consumer)
+    recorded = row["import_error"]
+    assert (None if found is None else f"{found.exception}: {found.message.strip()}") == recorded
+
+
+@pytest.mark.parametrize(("runtime", "refused"), [("R22", True), ("R23", False)])
+def test_an_operator_that_one_runtime_lacks_is_refused_by_that_one(runtime: str, refused: bool, tmp_path: Path) -> None:
+    nodes = [helper.make_node("Mish", ["obs_0"], ["mish"]), helper.make_node("Abs", ["mish"], ["left_out"])]
+    file = read_onnx_file(Draft(extra=nodes, opset=18).write(tmp_path))
+    assert (refusal(file, CONSUMERS[runtime]) is not None) == refused
 
 
 def test_what_is_read_wrongly_without_an_error_is_told(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from converters.consumers.unity.consumers import Consumer, Engine
 from converters.consumers.unity.findings import Thrown, null_reference
 from converters.consumers.unity.model import RECURRENT_IN
 from converters.consumers.unity.onnx_file import OnnxFile, attributes
+from converters.consumers.unity.readings import ELEMENTWISE
 
 #: The operators of Barracuda 3.0.0 (its manual, and the constructs that were run).
 _BARRACUDA = """
@@ -37,6 +38,8 @@ _LEFT_OUT = """
     StringConcat StringNormalizer StringSplit TfIdfVectorizer Unique
 """
 SENTIS_LEAVES_OUT = frozenset(_LEFT_OUT.split())
+#: Runtime → operators that it leaves out too (seen in an original of another trainer).
+LEFT_OUT_BY = {"Sentis 2.1.3": frozenset({"Mish"})}
 _STANDARD = ("", "ai.onnx")
 #: AttributeProto.AttributeType → the type's name in Unity's message.
 _TYPES = {1: "Float", 2: "Int", 3: "String", 4: "Tensor", 6: "Floats", 7: "Ints", 8: "Strings"}
@@ -61,6 +64,13 @@ def refusal(file: OnnxFile, consumer: Consumer) -> Thrown | None:
 
 
 def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
+    if file.beside:
+        yield Thrown(
+            "OnnxLayerImportException",
+            "Could not read tensor data for constant tensor.",
+            f"tensor {file.beside}",
+            "keep all weights in the .onnx itself; --for barracuda-3 does",
+        )
     for node in file.model.graph.node:
         layer = node.output[0] if node.output else node.name
         if node.op_type not in BARRACUDA_OPS or node.domain not in _STANDARD:
@@ -69,6 +79,13 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
                 f"Unknown type {node.op_type} encountered while parsing layer {layer}.\n",
                 f"node {layer} ({node.op_type})",
                 "Barracuda has no such operator: --for barracuda-3 writes the policy without it",
+            )
+        if node.op_type == "Flatten" and _loses_rank(file, node.input[0]):
+            yield Thrown(
+                "Exception",
+                f"Must have input rank for {node.input[0]} in order to convert Flatten to NHWC",
+                f"node {layer} (Flatten)",
+                "write a Reshape; --for barracuda-3 does",
             )
         why = _refused(file, node, layer)
         if why is not None:
@@ -80,13 +97,31 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
             )
 
 
+def _loses_rank(file: OnnxFile, name: str) -> bool:
+    """Whether a value comes, by sums, products and activations, from a Slice whose bounds are computed.
+
+    Barracuda does not know the rank of such a one (foreign/convlstm__legacy.onnx in r3/cases/import_not_foreseen).
+    """
+    waiting, seen = [name], set[str]()
+    while waiting:
+        node = file.producers.get(waiting.pop())
+        if node is None or node.output[0] in seen:
+            continue
+        seen.add(node.output[0])
+        if node.op_type == "Slice" and not all(file.is_stored(bound) for bound in node.input[1:] if bound):
+            return True
+        if node.op_type in ELEMENTWISE:
+            waiting.extend(node.input)
+    return False
+
+
 def _refused(file: OnnxFile, node: Any, layer: str) -> str | None:
     """What is said to an operator in a form that is not taken; None to every other."""
     held, given = attributes(node), dict(enumerate(node.input))
     match node.op_type:
         case "Split" if "split" not in held:
             return f"Unsupported default attribute `split` for node {layer} of type Split. Value is required."
-        case "Gemm" if not given.get(2) and file.is_constant(given.get(1, "")):
+        case "Gemm" if not given.get(2) and file.is_stored(given.get(1, "")):
             return "required Input 2 was not found."
         case "LSTM" if not given.get(3):
             return "required Input 3 was not found."
@@ -110,7 +145,8 @@ def _refused(file: OnnxFile, node: Any, layer: str) -> str | None:
 def _by_sentis(file: OnnxFile, consumer: Consumer) -> Iterator[Thrown]:
     left_out: set[str] = set()
     for node in file.model.graph.node:
-        if node.op_type in SENTIS_LEAVES_OUT or node.domain not in _STANDARD:
+        unknown = node.op_type in SENTIS_LEAVES_OUT or node.op_type in LEFT_OUT_BY.get(consumer.runtime, ())
+        if unknown or node.domain not in _STANDARD:
             left_out.update(n for n in node.output if n)
             continue
         for name in node.input:

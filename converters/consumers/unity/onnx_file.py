@@ -27,6 +27,8 @@ from signatures.records import dataclass
 
 #: TensorProto.DataType that Sentis holds as floats; everything else is held as int.
 _FLOATS = frozenset({1, 10, 11, 16})
+#: TensorProto.DataLocation of numbers in another file.
+_EXTERNAL = 1
 #: Inputs of more elements are not made for a trial run.
 _LARGEST_ZEROS = 1 << 16
 
@@ -44,9 +46,13 @@ class DeclaredInput:
 
 @dataclass(frozen=True)
 class OnnxFile:
-    """A model with what is asked of it again and again; ``model`` is the ModelProto."""
+    """A model with what is asked of it again and again; ``model`` is the ModelProto.
+
+    ``beside`` is the name of a tensor whose numbers lie in a file of their own, empty where there is none.
+    """
 
     model: Any
+    beside: str = ""
     _values: dict[str, np.ndarray | None] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -95,6 +101,17 @@ class OnnxFile:
         """Whether a value is the same whatever is fed."""
         return name not in self.fed and (name in self.initializers or name in self.producers)
 
+    def is_stored(self, name: str) -> bool:
+        """Whether Barracuda has a value when it imports: it looks through Identity and Transpose, and computes none."""
+        while name not in self.initializers:
+            node = self.producers.get(name)
+            if node is None or node.op_type not in ("Constant", "Identity", "Transpose"):
+                return False
+            if not node.input:
+                return True
+            name = node.input[0]
+        return True
+
     def value(self, name: str) -> np.ndarray | None:
         """A constant's value; None for what hangs on an input, or is not small."""
         if name not in self._values:
@@ -142,6 +159,7 @@ def read_onnx_file(path: Path) -> OnnxFile:
         model = decoded(read_bytes(path))
     except DamagedFileError as error:
         raise error.at(str(path)) from error.__cause__
+    beside = next((t.name for t in model.graph.initializer if t.data_location == _EXTERNAL), "")
     load_external([model.graph], path.parent)
     for tensor in model.graph.initializer:
         if min(tensor.dims, default=0) < 0:
@@ -151,7 +169,7 @@ def read_onnx_file(path: Path) -> OnnxFile:
                 why="no length is negative",
                 fix="export or download it again",
             )
-    return OnnxFile(packaged(model))
+    return OnnxFile(packaged(model), beside)
 
 
 def attributes(node: Any) -> Mapping[str, Any]:

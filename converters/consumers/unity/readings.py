@@ -172,14 +172,14 @@ def _not_zero_or_one(c: Construct) -> bool:
     return _cast_to("b")(c) and "mask" not in c.operand(0).name
 
 
-_PASSED = {"Relu", "LeakyRelu", "Elu", "Sigmoid", "Tanh", "Mul", "Add", "Clip", "Max", "Min", "Identity", "Selu"}
+ELEMENTWISE = {"Relu", "LeakyRelu", "Elu", "Sigmoid", "Tanh", "Mul", "Add", "Clip", "Max", "Min", "Identity", "Selu"}
 
 
 def _flattened_conv(c: Construct) -> bool:
     """Flatten of a convolution, read by a product; elementwise operators between them change nothing."""
     maker = c.maker()
     for _ in range(16):
-        if maker is None or maker.op not in _PASSED:
+        if maker is None or maker.op not in ELEMENTWISE:
             break
         maker = maker.maker()
     return maker is not None and maker.op == "Conv" and any(r.op in ("Gemm", "MatMul") for r in c.readers())
@@ -239,6 +239,11 @@ def _last_of_three(c: Construct) -> bool:
     """A constant vector added to the last axis of a tensor of rank 3."""
     other = next((o for o in c.operands if o.source is Source.CONSTANT and _rank(o) == 1 and o.shape != (1,)), None)
     return other is not None and any(_rank(o) == 3 for o in c.operands)
+
+
+def _uneven(*names: str) -> Callable[[Construct], bool]:
+    """Any of these lists has numbers that differ."""
+    return lambda c: any(len({*(c.attribute(name) or ())}) > 1 for name in names)
 
 
 def _constant_first(c: Construct) -> bool:
@@ -389,6 +394,11 @@ def _rules() -> Iterator[Rule]:
 
     yield Rule(("Conv",), fails, _BARRACUDA, "groups of several channels", "Conv_11", _groups)
     yield Rule(("Conv",), refused, _BARRACUDA, "computed weights", "Conv_14", _computed(1))
+    uneven_by = "lengths that differ by axis: heights are taken for widths"
+    played = "cases/rank2_barracuda-3"
+    yield Rule(("Conv",), fails, _BARRACUDA, f"strides of {uneven_by}", played, _uneven("strides"))
+    uneven = _uneven("strides", "kernel_shape")
+    yield Rule(("MaxPool", "AveragePool"), fails, _BARRACUDA, f"{uneven_by} (read, a Conv was run)", played, uneven)
     ceiling = _all(lambda c: bool(c.attribute("ceil_mode", 0)))
     yield Rule(("MaxPool", "AveragePool"), wrong, _NAMES, "ceil_mode is not read", "MaxPool_04", ceiling)
     padded = _all(lambda c: bool(c.attribute("count_include_pad", 0)))
