@@ -45,7 +45,8 @@ PROFILES: tuple[Profile, ...] = (
         aliases=("barracuda",),
         purpose="ML-Agents 2.3 (release 20) in Unity 2020 to 2022 (Barracuda 3.0)",
         formats=("onnx", "nn"),
-        dress=partial(version3.dress, profile="barracuda-3"),
+        # measured in releases 20 and 2.0.1: ../shared/unity/r3/minimal/rank2.jsonl
+        dress=partial(version3.dress, profile="barracuda-3", transposes_buffers=True),
         opset=12,
         importers=("Barracuda 3.0.0",),
         checkers=("R20",),
@@ -55,7 +56,7 @@ PROFILES: tuple[Profile, ...] = (
         name="barracuda-1.4",
         purpose="ML-Agents 2.0 to 2.2 (releases 17 to 19) in Unity 2019 to 2021 (Barracuda 1.4 to 2.3)",
         formats=("onnx", "nn"),
-        dress=partial(version3.dress, profile="barracuda-1.4"),
+        dress=partial(version3.dress, profile="barracuda-1.4", transposes_buffers=True),
         opset=12,
         importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),
         checkers=("R20",),

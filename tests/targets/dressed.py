@@ -18,7 +18,7 @@ from converters.consumers.importable import importable
 from converters.consumers.playable import playable
 from converters.consumers.profile import Profile
 from converters.consumers.unity.checker import UnityVerdict, check_file
-from converters.consumers.unity.consumers import consumer
+from converters.consumers.unity.consumers import Engine, consumer
 from converters.consumers.unity.settings import Brain, sensors_of
 from converters.formats.barracuda.format import NnModel, parse
 from converters.formats.barracuda.vocabulary import LayerType
@@ -30,7 +30,7 @@ from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.export.sources import read_source
-from signatures.roles import Role
+from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import TensorSpec
 from tests.barracuda.nn_safety import assert_safe
 from tests.barracuda.reference import evaluate
@@ -40,6 +40,12 @@ Feeds = dict[str, np.ndarray]
 Runner = Callable[[Mapping[str, np.ndarray], Sequence[str]], Mapping[str, np.ndarray]]
 ATOL = RTOL = 1e-5
 CONTRACT = '{"tool": {"version": "test"}}'
+
+
+def as_written(entities: np.ndarray) -> np.ndarray:
+    """[N, E, F] as a model of Barracuda sees it, which ML-Agents fills number by number: it lies there as [N, F, E]."""
+    rows, count, width = entities.shape
+    return entities.reshape(rows, width, count).transpose(0, 2, 1)
 
 
 def compiled(path: Path, options: CompileOptions | None = None) -> list[Policy]:
@@ -265,7 +271,12 @@ class Pair:
         if role is Role.MEMORY_IN and self.keeps_action:
             last = next(own[s.name] for s in self.policy.signature.inputs if s.role is Role.PREV_ACTION)
             value = np.concatenate([value.reshape(len(value), -1), last.reshape(len(value), -1)], 1)
-        return value.astype(spec.dtype).reshape([len(value), *(d or -1 for d in spec.shape[1:])])
+        value = value.astype(spec.dtype).reshape([len(value), *(d or -1 for d in spec.shape[1:])])
+        return as_written(value) if value.ndim == 3 and self._transposes_buffers(spec) else value
+
+    def _transposes_buffers(self, spec: TensorSpec) -> bool:
+        released = {consumer(name).engine for name in self.profile.players}
+        return spec.role in OBSERVATIONS and released == {Engine.BARRACUDA}
 
     def _compared(
         self, expected: Feeds, actual: Feeds, scores: list[str], *, drawn: bool, atol: float = ATOL

@@ -22,7 +22,7 @@ from exporter import export_model
 from exporter.verify.checks.consumer import consumers
 from signatures.contract import EMBEDDED
 from signatures.errors import ProfileError, UsageError
-from signatures.roles import OBSERVATIONS, Role
+from signatures.roles import Role
 from tests import commands, known
 from tests.handmade import NodeDef, constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, Plain, compiled, runner_of
@@ -42,6 +42,8 @@ CANNOT_IN = {
     ("norms__legacy.onnx", "barracuda-1.0"): "ReduceMean",
     ("clean_c51__legacy.onnx", "barracuda-1.0"): "Add",
     ("entity_attention__legacy.onnx", "barracuda-3"): "Reshape",
+    ("lidar_conv1d__dynamo.onnx", "barracuda-3"): "Conv",
+    ("lidar_conv1d__dynamo.onnx", "barracuda-1.4"): "Conv",
     ("entity_attention__legacy.onnx", "barracuda-1.4"): "Reshape",
     ("autoregressive__legacy.onnx", "barracuda-1.0"): "ArgMax",
     ("autoregressive__dynamo.onnx", "barracuda-1.0"): "ArgMax",
@@ -72,10 +74,6 @@ def is_held(path: Path, plain: Plain, wanted: Profile, folder: Path) -> bool:
         named = "it has a memory"
     elif memory is not None and memory.output is None:
         named = "not given back"
-    elif wanted.name in ("barracuda-3", "barracuda-1.4") and named is None and _has_entities(policy):
-        named = (
-            "cannot play its .onnx"  # Barracuda lays a list of entities out transposed, and ML-Agents writes it flat
-        )
     elif wanted.name == "barracuda-1.0" and any(s.role is Role.ENTITIES for s in policy.signature.inputs):
         named = "list of entities"
     if named:
@@ -91,10 +89,6 @@ def is_held(path: Path, plain: Plain, wanted: Profile, folder: Path) -> bool:
         said = verdict.accepted if name in wanted.players else verdict.checked
         assert all(said[mode] for mode in modes), (policy.name, name, verdict.to_dict())
     return True
-
-
-def _has_entities(policy: Policy) -> bool:
-    return any(len(s.shape) == 3 and s.role in OBSERVATIONS for s in policy.signature.inputs)
 
 
 #: Exported by the trainers themselves.

@@ -75,7 +75,8 @@ def test_the_exceptions_are_recorded_as_right_and_called_wrong_by_us() -> None:
 @needs_rows
 def test_every_rule_comes_from_a_construct_that_was_measured() -> None:
     known = {row["id"] for row in ROWS}
-    beside = {r.evidence for r in RULES if r.evidence not in known}
+    played = RULES_FOLDER.parent / "r3"
+    beside = {r.evidence for r in RULES if r.evidence not in known and not (played / r.evidence).is_dir()}
     assert beside == {"beside the 352"}  # the Identity of a reshaped output, which the README of the data tells of
 
 

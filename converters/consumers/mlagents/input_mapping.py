@@ -36,15 +36,26 @@ def observation_names(dressing: Dressing) -> list[tuple[str, TensorSpec]]:
     return [(f"obs_{i}", s) for i, s in enumerate(ranked)]
 
 
-def take_observation(dressing: Dressing, name: str, spec: TensorSpec) -> None:
-    """An input of the consumer for an observation: vectors [B, n], buffers [B, a, b], images [B, C, H, W]."""
+def take_observation(dressing: Dressing, name: str, spec: TensorSpec, *, transposed: bool = False) -> None:
+    """An input of the consumer for an observation: vectors [B, n], buffers [B, a, b], images [B, C, H, W].
+
+    ``transposed``: the consumer writes a buffer's numbers one after the other into a tensor that holds [B, a, b] with
+    its last two axes exchanged, so the model is given [B, a, b] back by a Transpose and a Reshape behind the input.
+    """
     if spec.role is Role.VISUAL:
         take_image(dressing, name, spec, "NCHW")
         return
     shape = spec.shape if len(spec.shape) > 1 else (None, 1)
-    if None in shape[1:]:
+    sizes = [d for d in shape[1:] if d is not None]
+    if len(sizes) < len(shape) - 1:
         _unknown_length(dressing, spec)
-    dressing.give_in(spec, dressing.take(name, spec, (None, *shape[1:])))
+    taken = dressing.take(name, spec, (None, *sizes))
+    if transposed and len(sizes) == 2 and min(sizes) > 1:
+        builder = dressing.builder
+        flat = builder.transpose(taken, (0, 2, 1))
+        taken = builder.add("Reshape", [flat, builder.ints([-1, *sizes], "shape")], f"{spec.name}/as_written")
+        dressing.notes.append(f"{name} is put in order behind the input, as this consumer writes it transposed")
+    dressing.give_in(spec, taken)
 
 
 #: Layout that the consumer has → the axes of an image of the other one in it, and the way back.

@@ -22,15 +22,16 @@ _VERSION = 3
 _DETERMINISTIC = "deterministic_"
 
 
-def dress(policy: Policy, profile: str, *, feeds_previous: bool = True) -> Policy:
+def dress(policy: Policy, profile: str, *, feeds_previous: bool = True, transposes_buffers: bool = False) -> Policy:
     """The policy under the names of API version 3; the last action is kept with the memory unless it is fed.
 
-    Raises ProfileError where it cannot be held.
+    ``transposes_buffers``: observations of two axes arrive transposed (``input_mapping.take_observation``). Raises
+    ProfileError where it cannot be held.
     """
     dressing = Dressing(policy, profile)
     feeding.refuse_parameters(dressing)
     for name, spec in feeding.observation_names(dressing):
-        feeding.take_observation(dressing, name, spec)
+        feeding.take_observation(dressing, name, spec, transposed=transposes_buffers)
     masks = feeding.take_masks(dressing)
     carried = None if feeds_previous else previous_action(dressing)
     if carried is None:

@@ -18,7 +18,8 @@ def reads_flat(name: str, file: OnnxFile | None, nn: NnModel | None) -> bool:
     """Whether every reader of input ``name`` takes its numbers one after the other, or in no order at all.
 
     ML-Agents writes [E, F] flat; Barracuda holds an ONNX input [N, E, F] transposed. Transpose (0, 2, 1) undoes that,
-    once a Reshape or Flatten says so (measured: rank2_transposed_first and rank2_transposed_flat in release 20).
+    once a Reshape or Flatten says so (measured: rank2_transposed_first and rank2_transposed_flat in release 20), which
+    as many entities as numbers need not.
     """
     if file is not None:
         (raw,) = {i.name for i in file.inputs if i.name.removesuffix(":0") == name} or {name}
@@ -32,7 +33,9 @@ def _undoes(file: OnnxFile, node: Any) -> bool:
     perm = attributes(node).get("perm")
     if node.op_type != "Transpose" or perm is None or tuple(perm.ints) != _SWAPPED:
         return False
-    return all(reader.op_type in _VIEWS for reader in file.readers(node.output[0]))
+    shape = file.shapes.get(node.output[0], ())
+    square = len(shape) == len(_SWAPPED) and shape[1] == shape[2] is not None  # a Reshape would say nothing
+    return square or all(reader.op_type in _VIEWS for reader in file.readers(node.output[0]))
 
 
 def _is_orderless(file: OnnxFile, node: Any) -> bool:
