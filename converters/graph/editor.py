@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,11 @@ import numpy as np
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.base import Shape
-from converters.graph.ops.table import is_fed
+from converters.graph.ops.table import is_fed, op_of
 from converters.graph.shapes import add_types
 from converters.graph.size_limits import Allowance
 from converters.graph.types import Symbols, TensorType
-from signatures.errors import ExportModelError
+from signatures.errors import ExportModelError, UnsupportedOpError
 
 
 class Editor(Builder):
@@ -51,13 +52,43 @@ class Editor(Builder):
 
     def shape_of(self, reference: str) -> Shape:
         """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
+        kind = self._kind_of(reference)
+        return None if kind is None else kind.shape
+
+    def known_value(self, reference: str, meaning: str) -> np.ndarray:
+        """The value of a tensor of the old graph that no input changes; raises UnsupportedOpError."""
+        kind = self._kind_of(reference)
+        if kind is None or kind.constant is None:
+            why = f"{meaning} must be known before, in every target"
+            raise UnsupportedOpError(f"{meaning} is computed while the graph runs", why=why)
+        return kind.constant
+
+    def write(self, operands: Sequence[str], layer: Callable[..., Sequence[str]], name: str) -> Sequence[str]:
+        """What a layer of ``graph/nn`` makes of tensors of the old graph. Raises UnsupportedOpError."""
+        typed = Builder(self.names)
+        typed.prefix, typed.symbols = name, self._symbols
+        for reference in operands:
+            kind = self._kind_of(reference)
+            if kind is None:
+                raise UnsupportedOpError("the shape of its operand is not known")
+            typed.types[self.resolve(reference)] = kind
+        made = layer(typed, *map(self.resolve, operands))
+        for node in typed.nodes:
+            older = op_of(node).older
+            if older is None:
+                self.append(self._fed(node))
+            else:
+                attrs = {**node.attrs, "T": typed.dtype(node.inputs[-1])}
+                self.redirect(node.name, older(self, replace(node, attrs=attrs)))
+        return [self.resolve(reference) for reference in made]
+
+    def _kind_of(self, reference: str) -> TensorType | None:
         while self._told < len(self.nodes):
             node = self._fed(self.nodes[self._told])
             self._told += 1
             with contextlib.suppress(ExportModelError, KeyError):  # of a loop, or of what nothing may need: not known
                 add_types(self._shapes, node, self._symbols, self._allowance)
-        kind = self._shapes.get(self.resolve(reference))
-        return None if kind is None else kind.shape
+        return self._shapes.get(self.resolve(reference))
 
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""

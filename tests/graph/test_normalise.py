@@ -150,6 +150,21 @@ def summed(equation: str, *operands: Array) -> Case:
     return [*nodes, made], dict(zip(names, operands, strict=True)), None
 
 
+def largest(x: Array, k: int, **attrs: Any) -> Case:
+    """Both results of TopKV2 in one: the values, and under them the places."""
+    made = node("top", "TopKV2", "x", "k", T=x.dtype, sorted=True, **attrs)
+    places = node("places", "Cast", "top:1", SrcT=attrs.get("index_type", np.int32), DstT=x.dtype)
+    joined = node("y", "ConcatV2", "top", "places", "axis", T=x.dtype, N=2, Tidx=np.int32)
+    fed = placeholder("x", (None, *x.shape[1:]), x.dtype)
+    return [fed, constant("k", k), made, places, constant("axis", -1), joined], {"x": x}, None
+
+
+def largest_of_old(x: Array, k: int) -> Case:
+    read, feeds, _ = largest(x, k)
+    old = [node("top", "TopK", "x", T=x.dtype, sorted=True, k=k) if n.name == "top" else n for n in read]
+    return [n for n in old if n.name != "k"], feeds, read
+
+
 def shape_of_both(a: Array, b: Array) -> Case:
     nodes = [placeholder(n, (None, *x.shape[1:])) for n, x in (("a", a), ("b", b))]
     shapes = [node(f"s{n}", "Shape", n, T=F32, out_type=np.int32) for n in "ab"]
@@ -201,6 +216,23 @@ CASES: Mapping[str, Case] = {
     "Einsum, of attention": summed("aecd,abcd->acbe", floats(2, 3, 2, 4), floats(2, 5, 2, 4)),
     "Einsum, no result but a sum": summed("ab,ab->", floats(2, 3), floats(2, 3, seed=1)),
     "Einsum, one operand": summed("abc->ca", floats(2, 3, 4)),
+    "Einsum, all axes before": summed("...ij,...jk->...ik", floats(2, 3, 4, 2), floats(2, 3, 2, 5, seed=1)),
+    "Einsum, axes of one operand": summed("...i,ij->...j", floats(2, 3, 4), floats(4, 5, seed=1)),
+    "Einsum, axes behind": summed("ij...->...ji", floats(2, 3, 4, 5)),
+    "Einsum, no axes": summed("...ij,...jk->...ik", floats(2, 3), floats(3, 4, seed=1)),
+    "Einsum, fewer axes and one of length 1": summed("i...,i...->i...", floats(2, 3, 4), floats(2, 1, seed=1)),
+    "IsNan": unary("IsNan"),
+    "IsInf": unary("IsInf"),
+    "IsFinite": unary("IsFinite", np.append(ODD, f32(3.4028235e38, -3.4028235e38, 1e-45)[None], axis=0)),
+    "IsFinite, float64": unary("IsFinite", np.array([[1e300, np.inf, np.nan]])),
+    "IsInf, float64": unary("IsInf", np.array([[1e300, -np.inf, np.nan]])),
+    "TopKV2": largest(floats(3, 6), 4),
+    "TopKV2, one": largest(floats(3, 6), 1),
+    "TopKV2, equal ones": largest(f32(1, 3, 3, 2, 3, 1).reshape(1, 6), 5),
+    "TopKV2, int32": largest(ints(2, 3, 5), 2),
+    "TopKV2, float64": largest(floats(2, 5).astype(np.float64), 2),
+    "TopKV2, int64 places": largest(floats(2, 5), 3, Tk=np.int32, index_type=np.int64),
+    "TopK": largest_of_old(floats(3, 6), 2),
     "Erfc": unary("Erfc"),
     "ReverseV2": turned(1),
     "ReverseV2, two axes": turned(2, 0),

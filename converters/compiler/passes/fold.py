@@ -34,6 +34,9 @@ def fold(graph: Graph) -> Graph:
                     editor.redirect(ref(node.name, i), editor.const(np.asarray(constant), f"{node.name}/{i}"))
         elif node.op == "Reshape" and (target := types[node.inputs[1]].value) is not None and target.dtype == object:
             cells = target.reshape(-1).tolist()
+            if -1 in cells and graph.producer(node.inputs[1]).op != "Pack":
+                # What is left of the operand may be known. tf.layers.flatten packs it, which Unity has played as it is.
+                cells = list(types[node.name].shape or cells)
             open_axes = [c for c in cells if isinstance(c, str)]
             if len(open_axes) == 1 and -1 not in cells:
                 shape = np.array([-1 if isinstance(c, str) else int(c) for c in cells], INT32)

@@ -6,13 +6,15 @@ them has an op for these that all the others have. Definitions: onnx/docs/Operat
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from converters.graph.builder import Builder
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import UnsupportedOpError
+
+if TYPE_CHECKING:  # the op table, which the builder asks, writes TopKV2 with these
+    from converters.graph.builder import Builder
 
 #: Elements of a table, per row. A policy's lists have some hundreds, and a table has that squared.
 MAX_TABLE = 1 << 20

@@ -87,6 +87,12 @@ class GraphBuilder(NodeBuilder, Protocol):
     def shape_of(self, reference: str) -> Shape:
         """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
 
+    def known_value(self, reference: str, meaning: str) -> np.ndarray:
+        """The value of a tensor of the old graph that no input changes; raises UnsupportedOpError."""
+
+    def write(self, operands: Sequence[str], layer: Callable[..., Sequence[str]], name: str) -> Sequence[str]:
+        """What a layer of ``graph/nn`` makes of tensors of the old graph. Raises UnsupportedOpError."""
+
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from string import ascii_letters
 
 import numpy as np
 
-from converters.graph.ops.base import NodeBuilder
-from converters.graph.types import INT32
+from converters.graph.ops.base import NodeBuilder, Shape
+from converters.graph.types import INT32, Dim
 from signatures.errors import UnsupportedOpError
 
 _OPERANDS = 2
 
 
-def einsum(b: NodeBuilder, equation: str, tensors: Sequence[str], name: str = "einsum") -> str:
-    """One or two tensors, each label at most once per operand; nothing need be known of their shapes.
+def einsum(
+    b: NodeBuilder,
+    equation: str,
+    tensors: Sequence[str],
+    name: str = "einsum",
+    *,
+    shape_of: Callable[[str], Shape],
+) -> str:
+    """One or two tensors, each label at most once per operand; their shapes are asked for where there is a ``…`` alone.
 
     Raises UnsupportedOpError for other equations.
     """
@@ -22,9 +30,12 @@ def einsum(b: NodeBuilder, equation: str, tensors: Sequence[str], name: str = "e
     left, arrow, result = equation.partition("->")
     terms, tensors = left.split(","), [*tensors]
     if not arrow:
-        letters = sorted(set(left) - {","})
-        result = "".join(c for c in letters if left.count(c) == 1)
-    simple = "." not in equation and all(len(set(t)) == len(t) for t in (*terms, result))
+        letters = sorted(set(left) - {",", "."})
+        result = ("..." if "..." in left else "") + "".join(c for c in letters if left.count(c) == 1)
+    if len(terms) == len(tensors) and "..." in left and set(map(_dots, (*terms, result))) <= {0, 3}:
+        terms, tensors, result = _written_out(b, terms, tensors, result, name, [shape_of(t) for t in tensors])
+    left = ",".join(terms)
+    simple = "." not in left + result and all(len(set(t)) == len(t) for t in (*terms, result))
     if not simple or len(terms) != len(tensors) or len(terms) > _OPERANDS or set(result) - set(left):
         raise UnsupportedOpError(
             f"the equation {equation[:80]!r} is no plain product",
@@ -39,6 +50,51 @@ def einsum(b: NodeBuilder, equation: str, tensors: Sequence[str], name: str = "e
     if len(terms) == 1:
         return _turned(b, tensors[0], terms[0], result, name)
     return _contracted(b, tensors, terms, result, name)
+
+
+def _dots(term: str) -> int:
+    """The dots of a term: three in a row, or another number."""
+    return 3 if term.count("...") == 1 and term.count(".") == 3 else len(term) if "." in term else 0
+
+
+def labels_of(term: str, shape: Sequence[Dim]) -> list[tuple[str, Dim]]:
+    """Each label of a term with the length of its axis; the axes of a ``…`` are left out."""
+    before, _, after = term.partition("...")
+    return [*zip(before, shape, strict=False), *zip(after[::-1], reversed(shape), strict=False)]
+
+
+def _written_out(
+    b: NodeBuilder, terms: Sequence[str], tensors: Sequence[str], result: str, name: str, shapes: Sequence[Shape]
+) -> tuple[list[str], list[str], str]:
+    """(terms, tensors, result) with a label for each axis of a ``…``. The axes are counted from the last, as numpy
+    broadcasts; one of length 1 is taken off where another operand has it longer.
+    """
+    axes: list[Sequence[Dim]] = []
+    for term, shape in zip(terms, shapes, strict=True):
+        if shape is None and "." in term:
+            raise UnsupportedOpError("the rank of an operand is not known", why="the axes of its '...' must be counted")
+        begin = term.find("...")
+        count = len(shape or ()) - len(term) + 3
+        if begin >= 0 and count < 0:
+            raise UnsupportedOpError(f"an operand of rank {len(shape or ())} does not fit {term!r}")
+        axes.append(() if begin < 0 else (shape or ())[begin : begin + count])
+    most = max(map(len, axes))
+    if most and "." not in result:
+        raise UnsupportedOpError("the axes of its '...' are not in its result")
+    labels = [c for c in ascii_letters if c not in "".join((*terms, result))][:most]
+    if len(labels) < most:
+        raise UnsupportedOpError("there are more axes than letters")
+    longer = {c for own in axes for c, d in zip(labels[most - len(own) :], own, strict=True) if d != 1}
+    made, written = [], []
+    for term, tensor, own in zip(terms, tensors, axes, strict=True):
+        mine = labels[most - len(own) :]
+        single = [i for i, (c, d) in enumerate(zip(mine, own, strict=True)) if d == 1 and c in longer]
+        if single:
+            dropped = tuple(term.index("...") + i for i in single)
+            tensor = b.add("Squeeze", [tensor], f"{name}/single", squeeze_dims=dropped)
+        made.append(tensor)
+        written.append(term.replace("...", "".join(c for i, c in enumerate(mine) if i not in single)))
+    return written, made, result.replace("...", "".join(labels))
 
 
 def _contracted(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], result: str, name: str) -> str:

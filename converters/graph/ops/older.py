@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from converters.graph.nn.choosing import top_k
 from converters.graph.nodes import Node, TensorShape, normal_ref, ref
-from converters.graph.ops.base import Attr, GraphBuilder, Older, OpDef, written_as_older
+from converters.graph.ops.base import Attr, GraphBuilder, Older, OpDef, Shape, written_as_older
 from converters.graph.ops.einsum import einsum
 from converters.graph.types import BOOL, FLOAT32, INT32
 from signatures.errors import UnsupportedOpError
@@ -184,8 +185,12 @@ def broadcast_to(builder: GraphBuilder, node: Node) -> str:
 
 def _einsum(builder: GraphBuilder, node: Node) -> str:
     """Einsum (TF 1.15)."""
+
+    def shape(reference: str) -> Shape:
+        return builder.shape_of(normal_ref(reference))
+
     try:
-        return einsum(builder, str(node.attrs.get("equation", "")), node.inputs, f"{node.name}/einsum")
+        return einsum(builder, str(node.attrs.get("equation", "")), node.inputs, f"{node.name}/einsum", shape_of=shape)
     except UnsupportedOpError as error:
         what = f"cannot convert Einsum (node {node.name!r}): {error.what}"
         raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
@@ -195,6 +200,37 @@ def _erfc(builder: GraphBuilder, node: Node) -> str:
     """Erfc, which Keras' gelu is made of, as 1 − erf(x)."""
     one = builder.const(np.ones((), _dtype(node)), f"{node.name}/one")
     return builder.add("Sub", [one, builder.add("Erf", node.inputs, f"{node.name}/Erf")], f"{node.name}/rest")
+
+
+def _is_nan(builder: GraphBuilder, node: Node) -> str:
+    """IsNan, which TensorFlow.js and older Barracudas lack: a NaN alone is not what it is."""
+    return builder.add("NotEqual", [node.inputs[0], node.inputs[0]], f"{node.name}/is_nan", node.origin)
+
+
+def _compared_with_largest(comparison: str) -> Older:
+    """IsFinite and IsInf: the absolute value against the largest number; of a NaN every comparison is false."""
+
+    def older(builder: GraphBuilder, node: Node) -> str:
+        dtype = _dtype(node)
+        size = builder.add("Abs", [node.inputs[0]], f"{node.name}/abs")
+        largest = builder.const(np.array(np.finfo(dtype).max, dtype), f"{node.name}/largest")
+        return builder.add(comparison, [size, largest], f"{node.name}/compared", node.origin)
+
+    return older
+
+
+def _top_k(builder: GraphBuilder, node: Node) -> str:
+    """TopKV2, which not all targets have: each compared with each, in order whether that is asked for or not."""
+    tensor, *count = (normal_ref(r) for r in node.inputs)
+    try:
+        k = int(builder.known_value(count[0], "k").reshape(())) if count else int(node.attrs["k"])
+        best, places = builder.write([tensor], lambda b, x: top_k(b, x, k), node.name)
+    except UnsupportedOpError as error:
+        what = f"cannot convert {node.op} (node {node.name!r}): {error.what}"
+        raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
+    wanted = node.attrs.get("index_type", INT32)
+    builder.redirect(ref(node.name, 1), builder.add("Cast", [places], f"{node.name}/places", node.origin, DstT=wanted))
+    return best
 
 
 def _reversed(builder: GraphBuilder, node: Node) -> str:
@@ -258,6 +294,10 @@ OPS = (
     _spelt("IdentityN", _identity_n),
     _spelt("Einsum", _einsum),
     _spelt("Erfc", _erfc),
+    _spelt("IsNan", _is_nan),
+    _spelt("IsFinite", _compared_with_largest("LessEqual")),
+    _spelt("IsInf", _compared_with_largest("Greater")),
+    _spelt("TopKV2", _top_k, "TopK"),
     _spelt("ReverseV2", _reversed),
     _spelt("BroadcastArgs", _broadcast_args),
     _spelt("RandomUniformInt", _uniform_int),

@@ -15,6 +15,7 @@ from converters.graph.ops import (
     linear,
     logic,
     older,
+    places,
     samplers,
     slicing,
 )
@@ -83,7 +84,7 @@ CALLING = CALLS | WHILES | IFS
 
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
-    for module in (elementwise, logic, linear, convolution, arrays, joining, slicing, filling, samplers, older):
+    for module in (elementwise, logic, linear, convolution, arrays, joining, slicing, filling, places, samplers, older):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")

@@ -9,8 +9,11 @@ import numpy as np
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.types import INT32, INT64
 from tests.graph.samples.base import (
+    INF,
+    NAN,
     NO_LOWERING,
     NO_SUCH_OP,
+    TFJS,
     UNKNOWN_BATCH,
     Array,
     Operand,
@@ -208,6 +211,37 @@ def _one_hots() -> Iterator[Sample]:
     yield sample("OneHot", "one column of a matrix", np.array([[0], [2], [1]], np.int32), const(3), on, off)
 
 
+#: Places of a matrix, in order.
+ROWS = np.array([[0, 1], [1, 3], [2, 0]], np.int32)
+
+
+def _places() -> Iterator[Sample]:
+    at_once = dict.fromkeys((*TFJS, "js"), "how many it finds is known only when the model runs")
+    yield sample("Where", "booleans", bools(3, 4), differs=at_once)
+    yield sample("Where", "numbers, NaN among them", f32(0, -0.0, NAN, 1, INF, 0).reshape(3, 2), differs=at_once)
+    yield sample("Where", "int32, rank 3", ints(2, 3, 2, low=-1, high=1), differs=at_once)
+    yield sample("Where", "nothing found", np.zeros((2, 2), bool), differs=at_once)
+    zero = const(f32(0).reshape(()))
+    yield sample("SparseToDense", "a vector of places", const(1, 3), const(np.array([5], np.int32)), floats(2), zero)
+    yield sample("SparseToDense", "places of a matrix", const(ROWS), const(3, 4), floats(3), const(f32(-1).reshape(())))
+    yield sample("SparseToDense", "one value", const(ROWS), const(3, 4), fixed(f32(2.5).reshape(())), zero)
+    yield sample(
+        "SparseToDense", "one place", const(2), const(np.array([4], np.int32)), fixed(f32(7).reshape(())), zero
+    )
+    yield sample(
+        "SparseToDense", "places that are fed, int64", np.array([0, 2], np.int64), const(np.array([4])), f32(1, 2), zero
+    )
+    yield sample(
+        "SparseToDense",
+        "int32 values, out of order",
+        const(3, 0),
+        const(np.array([4], np.int32)),
+        ints(2),
+        const(9),
+        validate_indices=False,
+    )
+
+
 def samples() -> Iterator[Sample]:
     yield from _sources()
     yield from _shapes()
@@ -216,6 +250,7 @@ def samples() -> Iterator[Sample]:
     yield from _gathers()
     yield from _fills()
     yield from _one_hots()
+    yield from _places()
 
 
 def random_slices(count: int, seed: int) -> tuple[Graph, dict[str, Array], list[str]]:

@@ -27,13 +27,7 @@ def _dense(step: Step) -> str:
 def _einsum_dense(step: Step) -> str:
     b, equation = step.net, str(step.get("equation"))
     step.refuse_unless("quantization_config", None)
-    rank = b.rank(step.x)
-    left, _, right = equation.partition(",")
-    if left.startswith("..."):
-        kernel, _, result = right.partition("->")
-        spare = [*"ABCDEFGH"][: rank - len(left) + 3]
-        equation = f"{''.join(spare)}{left[3:]},{kernel}->{''.join(spare)}{result.removeprefix('...')}"
-    value = einsum(b, equation, [step.x, b.const(step.take(), "kernel")])
+    value = einsum(b, equation, [step.x, b.const(step.take(), "kernel")], shape_of=b.shape)
     if step.get("bias_axes"):
         value = b.add("Add", [value, b.const(step.take(), "bias")])
     return activated(step, value)
@@ -151,7 +145,7 @@ def _dot(step: Step) -> str:
     letters = [f"a{'bcdefg'[: b.rank(x) - 1]}", f"a{'tuvwxyz'[: b.rank(y) - 1]}"]
     letters[1] = letters[1].replace(letters[1][second], letters[0][first])
     result = "a" + "".join(c for c in letters[0][1:] + letters[1][1:] if c != letters[0][first])
-    value = einsum(b, f"{letters[0]},{letters[1]}->{result}", [x, y])
+    value = einsum(b, f"{letters[0]},{letters[1]}->{result}", [x, y], shape_of=b.shape)
     return b.reshape(value, (b.shape(x)[0], 1)) if len(result) == 1 else value
 
 

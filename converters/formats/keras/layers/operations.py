@@ -152,5 +152,5 @@ OPERATIONS: Mapping[str, Translate] = {
     "Squeeze": _squeezed,
     "ExpandDims": _expanded,
     "Matmul": lambda s: matmul(s.net, *s.tensors[:2]),
-    "Einsum": lambda s: einsum(s.net, str(s.get("subscripts")), s.tensors),
+    "Einsum": lambda s: einsum(s.net, str(s.get("subscripts")), s.tensors, shape_of=s.net.shape),
 }

@@ -10,7 +10,7 @@ from converters.formats.onnx.importer.node import Op, Translate
 from converters.graph.nn import reduction
 from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import matmul
-from converters.graph.ops.einsum import einsum
+from converters.graph.ops.einsum import einsum, labels_of
 from converters.graph.types import INT64, Dim, product
 
 _MATRIX = 2
@@ -51,11 +51,11 @@ def _einsum(op: Op, net: Importer) -> str:
     equation, tensors = op.text("equation", "").replace(" ", ""), [op.need(i) for i in range(len(op.inputs))]
     lengths: dict[str, set[Dim]] = {}
     for term, tensor in zip(equation.partition("->")[0].split(","), tensors, strict=False):
-        for label, dim in zip(term if "." not in term else "", net.shape(tensor), strict=False):
+        for label, dim in labels_of(term, net.shape(tensor)):
             lengths.setdefault(label, set()).add(dim)
     if repeated := [label for label, dims in lengths.items() if 1 in dims and len(dims) > 1]:
         raise op.refused(f"{repeated[0]!r} has length 1 in one operand, and is repeated", "no policy needs that")
-    return einsum(net, equation, tensors)
+    return einsum(net, equation, tensors, shape_of=net.shape)
 
 
 # ------------------------------------------------------------------ reductions

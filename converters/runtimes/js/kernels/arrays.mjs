@@ -152,6 +152,21 @@ function oneHot({ axis = -1 }, indices, depth, on, off) {
   return each(on.dtype, (i, k) => (i === k ? on.data[0] : off.data[0]), index, classes);
 }
 
+/** A tensor of `otherwise` with `values` (or one value) at places [n] or [n, rank]. */
+function sparseToDense(_, places, shape, values, otherwise) {
+  const result = zeros(values.dtype, numbers(shape));
+  result.data.fill(otherwise.data[0]);
+  const strides = stridesOf(result.shape);
+  for (let i = 0; i * strides.length < places.data.length; i++) {
+    const index = places.data.subarray(i * strides.length, (i + 1) * strides.length);
+    const outside = index.findIndex((n, axis) => !(n >= 0 && n < result.shape[axis]));
+    if (outside !== -1) throw new Error(`place ${index[outside]} is outside of 0 to ${result.shape[outside] - 1}`);
+    const place = strides.reduce((sum, stride, axis) => sum + stride * index[axis], 0);
+    result.data[place] = values.data[values.data.length === 1 ? 0 : i];
+  }
+  return result;
+}
+
 export const MOVING = {
   ...Object.fromEntries(["Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"].map((name) => [name, same])),
   Shape: (_, x) => vector(x.shape),
@@ -175,4 +190,5 @@ export const MOVING = {
   Tile: tile,
   Range: range,
   OneHot: oneHot,
+  SparseToDense: sparseToDense,
 };
