@@ -1,4 +1,4 @@
-"""Formats: a room each (frozen_graph, checkpoint, saved_model, tfjs, onnx, barracuda), the compiler, the runners.
+"""Formats: a room each (frozen_graph, saved_model, tfjs, onnx, barracuda, litert, …), the compiler, the runners.
 
 May import ``signatures``; never ``exporter``.
 """

@@ -48,12 +48,6 @@ REFUSED = (
         sniff=lambda file: file.starts(b"version https://git-lfs"),
     ),
     Format(
-        key="tflite",
-        label="a TensorFlow Lite model",
-        advice="give the graph it was converted from",
-        sniff=lambda file: file.head[4:8] == b"TFL3",
-    ),
-    Format(
         key="unity_asset",
         label="a Unity asset, which only refers to a model or wraps it",
         advice="give the .nn, .onnx or .bytes file itself, as it lies in the project's Assets folder",

@@ -16,6 +16,7 @@ ROOMS = (
     "tfjs",
     "onnx",
     "barracuda",
+    "litert",
     "stable_baselines3",
     "torch_checkpoint",
     "keras",

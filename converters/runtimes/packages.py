@@ -11,19 +11,28 @@ from converters.runtimes.base import Runtime, RuntimeInfo
 
 
 def package_runtime(
-    name: str, how: str, distributions: tuple[str, ...], *, independent: bool = True, originals: bool = False
+    name: str,
+    how: str,
+    distributions: tuple[str, ...],
+    *,
+    independent: bool = True,
+    originals: bool = False,
+    package: str = "",
+    child: tuple[str, ...] = (),
 ) -> Runtime:
-    """The runtime of the package ``name``, whose child is the module ``child`` of the folder of that name here.
+    """The runtime of the ``package`` (which is called as it is), whose child is the module ``child`` of the folder of
+    that name here; ``child`` names another folder and what its module is told.
 
     Several of the ``distributions`` may provide the package: the first that is installed tells the version.
     """
-    command = partial(child_command, f"converters.runtimes.{name}.child")
-    find = partial(_find, name, how, distributions)
+    folder, *told = child or (name,)
+    command = partial(child_command, f"converters.runtimes.{folder}.child", *told)
+    find = partial(_find, name, package or name, how, distributions)
     return Runtime(name, find, command, independent=independent, originals=originals)
 
 
-def _find(name: str, how: str, distributions: tuple[str, ...]) -> RuntimeInfo:
-    origin = module_origin(name)
+def _find(name: str, package: str, how: str, distributions: tuple[str, ...]) -> RuntimeInfo:
+    origin = module_origin(package)
     return RuntimeInfo(name, origin is not None, None if origin is None else _version(origin, distributions), how)
 
 

@@ -88,6 +88,15 @@ class Runtimes:
         model.unload()
         return [results[name] for name in names]
 
+    def litert(self, runtime: str, policy: Policy, feeds: Mapping[str, Array]) -> list[Array]:
+        """The outputs of a policy as a LiteRT model, with XNNPACK (``litert``) or without (``litert-plain``)."""
+        self.need(runtime)
+        model = self._load(runtime, policy, "litert")
+        names = [s.name for s in policy.signature.outputs]
+        results = model.run(dict(feeds), names)
+        model.unload()
+        return [results[name] for name in names]
+
     def _load(self, runtime: str, policy: Policy, target: str, opset: int = 15) -> LoadedModel:
         artifact = WRITTEN[target].artifact(policy, WriteOptions('{"tool": {"version": "test"}}', opset))
         root = self._folder / str(next(self._numbers))

@@ -1,7 +1,7 @@
 """Every op of the table: its kernel, its inferred type and its lowerings against TensorFlow and the other runtimes.
 
-TensorFlow is the oracle of the kernels; onnxruntime and TensorFlow.js judge what the writers make of an op. A sample
-that says a runtime ``differs`` is held to that: where the runtime agrees by now, the test fails and the line can go.
+TensorFlow is the oracle of the kernels; onnxruntime, TensorFlow.js and LiteRT judge what the writers make of an op. A
+sample that says a runtime ``differs`` is held to that: where it agrees by now, the test fails and the line can go.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from converters.graph.ops.samplers import reseed
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
-from signatures.errors import ExportModelError
+from signatures.errors import ExportModelError, UnsupportedOpError
 from tests.graph.harness import Array, Bindings, Runtimes, difference, policy_of
 from tests.graph.samples import DRAWS, PROBABILITIES, SAMPLES, TFJS, Sample, random_slices
 
 pytestmark = pytest.mark.xdist_group("graph-ops")
 
 OPSETS = (13, 15, 18, 21)
+LITERT = ("litert", "litert-plain")
 #: Ops that a graph may hold, by the passes' making or by an importer's; the others are only spellings.
 OPS = [op.name for op in TABLE.values() if op.infer is not written_as_older]
 BY_OP: Mapping[str, list[Sample]] = {op: [s for s in SAMPLES if s.op == op] for op in OPS}
@@ -80,6 +81,21 @@ def test_tensorflow_js(op: str, backend: str, runtimes: Runtimes) -> None:
         lambda sample: runtimes.tfjs(backend, policy_of(sample.graph, sample.fetches), sample.feeds),
         narrowed=True,
     ) == []  # fmt: skip
+
+
+@pytest.mark.parametrize("runtime", LITERT)
+@pytest.mark.parametrize("op", [op for op in OPS if TABLE[op].older is None])
+def test_litert(op: str, runtime: str, runtimes: Runtimes) -> None:
+    """With XNNPACK and without; an op that has no lowering is refused by its name."""
+    if TABLE[op].litert is None and not TABLE[op].start:
+        for sample in BY_OP[op]:
+            with pytest.raises(UnsupportedOpError, match=rf"'op' \({op}\) is not written to \.tflite"):
+                runtimes.litert(runtime, policy_of(sample.graph, sample.fetches), sample.feeds)
+        return
+    found = problems(
+        op, runtime, lambda sample: runtimes.litert(runtime, policy_of(sample.graph, sample.fetches), sample.feeds)
+    )
+    assert found == []
 
 
 @each_op

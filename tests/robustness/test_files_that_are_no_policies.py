@@ -63,7 +63,7 @@ NEVER_READ = {
     "a graph as text": ("a.pbtxt", b'node {\n  name: "state"\n  op: "Placeholder"\n}\n', "text_graph", [".pbtxt"]),
     "a pickle": ("a.bytes", pickle.dumps({"a": [1.5] * 3}), "torch_checkpoint", ["is a pickle"]),
     "a torch checkpoint": ("a.pt", zipped("a/data.pkl", "a/data/0"), "torch_checkpoint", ["pickle"]),
-    "TFLite": ("a.tflite", b"\x1c\0\0\0TFL3" + bytes(100), "tflite", ["TensorFlow Lite"]),
+    "TFLite": ("a.tflite", b"\x1c\0\0\0TFL3" + bytes(100), "litert", ["TensorFlow Lite"]),
     "a Unity asset": ("a.asset", UNITY_YAML, "unity_asset", ["a Unity asset"]),
     "an asset bundle": ("a.bytes", b"UnityFS\0\0\0\0\x08" + bytes(100), "unity_asset", ["a Unity asset"]),
     "Sentis": ("a.sentis", b"\x18\0\0\0\0\0\x12\0\xff" + bytes(100), "sentis", ["Sentis"]),

@@ -15,7 +15,6 @@ from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
-    axes_within,
     by_shape,
     constant_input,
     direct,
@@ -28,6 +27,8 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.litert import arrays as litert
+from converters.graph.ops.litert.base import LitertBuilder, Value, same, without
 from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
 
 T = type_attr()
@@ -152,7 +153,7 @@ def _open_length(
 def _squeeze_axes(node: Node, shape: Sequence[Dim]) -> tuple[int, ...]:
     wanted = node.attrs["squeeze_dims"]
     if wanted:
-        return axes_within(wanted, len(shape))
+        return tuple(sorted({int(a) % len(shape) for a in wanted}))
     return tuple(i for i, d in enumerate(shape) if d == 1)
 
 
@@ -174,6 +175,13 @@ def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
     axes = _squeeze_axes(node, shape)
     kept = [d for i, d in enumerate(shape) if i not in axes]
     return squeezed(builder, builder.value(node.inputs[0]), axes, kept)
+
+
+def _litert_squeeze(node: Node, builder: LitertBuilder) -> Value:
+    kind = builder.type_of(node.inputs[0])
+    assert kind.shape is not None
+    axes = _squeeze_axes(node, kind.shape)
+    return without(builder, builder.value(node.inputs[0]), kind.dtype, kind.shape, axes)
 
 
 @by_shape
@@ -234,17 +242,21 @@ OPS = (
             lambda node, x: x,
             lambda node, builder: builder.value(node.inputs[0]),
             (T, Attr("message", "str", "")) if name in ("PreventGradient", "CheckNumerics") else (T,),
+            litert=same,
             moves="same",
         )
         for name in ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
     ),
-    OpDef("Shape", _infer_shape, _shape, _lower_measure, _SHAPE_OF, precision="exact", of_shape=True),
+    OpDef(
+        "Shape", _infer_shape, _shape, _lower_measure, _SHAPE_OF, litert=litert.shape, precision="exact", of_shape=True
+    ),
     OpDef(
         "Size",
         _infer_size,
         lambda node, x: np.array(x.size, node.attrs["out_type"]),
         _lower_measure,
         _SHAPE_OF,
+        litert=litert.size,
         precision="exact",
         of_shape=True,
     ),
@@ -257,16 +269,34 @@ OPS = (
         lambda node, x, shape: x.reshape([int(d) for d in shape.reshape(-1)]),
         direct("Reshape", shape_at=1),
         (T, type_attr("Tshape", "in:1")),
+        litert=litert.reshape,
         moves="view",
     ),
-    OpDef("Squeeze", _infer_squeeze, _squeeze, _lower_squeeze, (T, Attr("squeeze_dims", "int", ())), moves="view"),
+    OpDef(
+        "Squeeze",
+        _infer_squeeze,
+        _squeeze,
+        _lower_squeeze,
+        (T, Attr("squeeze_dims", "int", ())),
+        litert=_litert_squeeze,
+        moves="view",
+    ),
     OpDef(
         "ExpandDims",
         _infer_expand_dims,
         lambda node, x, axis: np.expand_dims(x, int(axis.reshape(()))),
         _lower_expand_dims,
         (T, type_attr("Tdim", "in:1")),
+        litert=litert.expand_dims,
         moves="view",
     ),
-    OpDef("Transpose", _infer_transpose, _transpose, _lower_transpose, (T, type_attr("Tperm", "in:1")), moves="turn"),
+    OpDef(
+        "Transpose",
+        _infer_transpose,
+        _transpose,
+        _lower_transpose,
+        (T, type_attr("Tperm", "in:1")),
+        litert=litert.transpose,
+        moves="turn",
+    ),
 )

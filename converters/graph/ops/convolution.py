@@ -24,6 +24,8 @@ from converters.graph.ops.base import (
     type_attr,
 )
 from converters.graph.ops.linear import FUSED, activated, lower_activated
+from converters.graph.ops.litert.base import Litert
+from converters.graph.ops.litert.layers import conv2d, depthwise, pad, pool
 from converters.graph.types import INT32, Dim, Symbols, TensorType
 
 T = type_attr()
@@ -237,21 +239,38 @@ _CONV = (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT)
 _POOL = (T, Attr("ksize", "int", REQUIRED), _STRIDES, _PADDING, _FORMAT, _EXPLICIT)
 
 
-def _convolution(name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], **traits: Any) -> OpDef:
-    attrs = (*_CONV, *attrs)
-    return OpDef(
-        name, _infer_window, kernel, lower, attrs, foldable=False, precision="summed", layer="convolution", **traits
-    )
+def _convolution(
+    name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], litert: Litert, **traits: Any
+) -> OpDef:
+    traits |= {"litert": litert, "foldable": False, "precision": "summed", "layer": "convolution"}
+    return OpDef(name, _infer_window, kernel, lower, (*_CONV, *attrs), **traits)
 
 
 OPS = (
-    _convolution("Conv2D", _conv2d, _lower_conv2d, [_CUDNN], tfjs=_tfjs_convolution, fused="_FusedConv2D"),
-    _convolution("_FusedConv2D", _fused_conv2d, _lower_conv2d, [_CUDNN, *FUSED], since="1.13"),
-    _convolution("DepthwiseConv2dNative", _depthwise, _lower_depthwise, [], tfjs=_tfjs_convolution),
-    OpDef("MaxPool", _infer_window, _max_pool, _lower_pool("MaxPool"), _POOL, precision="exact", layer="pool"),
-    OpDef("AvgPool", _infer_window, _avg_pool, _lower_pool("AveragePool"), _POOL[:-1], layer="pool"),
+    _convolution("Conv2D", _conv2d, _lower_conv2d, [_CUDNN], conv2d, tfjs=_tfjs_convolution, fused="_FusedConv2D"),
+    _convolution("_FusedConv2D", _fused_conv2d, _lower_conv2d, [_CUDNN, *FUSED], conv2d, since="1.13"),
+    _convolution("DepthwiseConv2dNative", _depthwise, _lower_depthwise, [], depthwise, tfjs=_tfjs_convolution),
+    OpDef(
+        "MaxPool",
+        _infer_window,
+        _max_pool,
+        _lower_pool("MaxPool"),
+        _POOL,
+        litert=pool("MAX_POOL_2D"),
+        precision="exact",
+        layer="pool",
+    ),
+    OpDef(
+        "AvgPool",
+        _infer_window,
+        _avg_pool,
+        _lower_pool("AveragePool"),
+        _POOL[:-1],
+        litert=pool("AVERAGE_POOL_2D"),
+        layer="pool",
+    ),
     *(
-        OpDef(name, _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1")), precision="exact")
+        OpDef(name, _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1")), litert=pad, precision="exact")
         for name in ("Pad", "PadV2")
     ),
 )

@@ -21,10 +21,11 @@ from converters.graph.ops.base import (
     inserted,
     not_constant,
     require_constant,
-    shape_error,
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.litert import arrays as litert
+from converters.graph.ops.litert.base import builtin
 from converters.graph.ops.older import broadcast_to
 from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
 
@@ -81,9 +82,7 @@ def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
     if shape is None:
         return [TensorType(args[2].dtype, None)]
     depth, axis = int(require_constant(node, args, 1, "a depth")), int(node.attrs["axis"])
-    if axis < -1:  # TensorFlow counts none from the end but the last
-        raise shape_error(node, args, f"its axis must be from -1 to {len(shape)}, and is {axis}")
-    return [TensorType(args[2].dtype, inserted(shape, axis, depth))]
+    return [TensorType(args[2].dtype, inserted(shape, max(axis, -1), depth))]
 
 
 def _depth(node: Node, args: Sequence[TensorType]) -> int | None:
@@ -147,6 +146,7 @@ OPS = (
         _fill,
         direct("Expand", 1, 0, shape_at=0),
         (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
+        litert=litert.fill,
         precision="exact",
     ),
     OpDef(
@@ -157,8 +157,16 @@ OPS = (
         older=broadcast_to,
         moves="repeat",
     ),
-    OpDef("Tile", _infer_tile, _tile, direct("Tile", shape_at=1), (T, type_attr("Tmultiples", "in:1")), moves="repeat"),
-    OpDef("Range", _infer_range, _range, direct("Range"), (type_attr("Tidx"),)),
+    OpDef(
+        "Tile",
+        _infer_tile,
+        _tile,
+        direct("Tile", shape_at=1),
+        (T, type_attr("Tmultiples", "in:1")),
+        litert=litert.tile,
+        moves="repeat",
+    ),
+    OpDef("Range", _infer_range, _range, direct("Range"), (type_attr("Tidx"),), litert=builtin("RANGE")),
     OpDef(
         "OneHot",
         _infer_one_hot,
@@ -166,6 +174,7 @@ OPS = (
         _lower_one_hot,
         (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
         tfjs=_tfjs_one_hot,
+        litert=litert.one_hot,
         precision="exact",
         looks_up=0,
         table_size=_depth,

@@ -16,7 +16,6 @@ from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
-    axis_within,
     constant_input,
     inserted,
     not_constant,
@@ -25,6 +24,7 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.litert import arrays as litert
 from converters.graph.types import BATCH, Dim, Symbols, TensorType
 
 T = type_attr()
@@ -44,12 +44,12 @@ def _infer_concat(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
         if not known:
             return [TensorType(parts[0].dtype, None)]
         # A part of unknown rank: the others tell all but the joined axis.
-        axis = axis_within(axis, len(known[0]))
+        axis %= len(known[0])
         return [TensorType(parts[0].dtype, (*known[0][:axis], symbols.fresh(), *known[0][axis + 1 :]))]
     rank = len(known[0])
-    if any(len(s) != rank for s in known):
-        raise shape_error(node, args, "its parts are of different rank")
-    axis = axis_within(axis, rank)
+    if not -rank <= axis < rank or any(len(s) != rank for s in known):
+        raise shape_error(node, args, f"parts of different rank, or axis {axis} out of range")
+    axis %= rank
     dims = list(known[0])
     for shape in known[1:]:
         for i, (a, b) in enumerate(zip(dims, shape, strict=True)):
@@ -88,10 +88,8 @@ def _lower_pack(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _unpack(node: Node, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    axis, count = node.attrs["axis"], node.attrs["num"]
-    if x.shape[axis] != count:
-        raise ValueError(f"axis {axis} has the length {x.shape[axis]}, and {count} pieces are made of it")
-    return tuple(np.take(x, i, axis=axis) for i in range(count))
+    axis = node.attrs["axis"]
+    return tuple(np.take(x, i, axis=axis) for i in range(x.shape[axis]))
 
 
 def _pieces(node: Node, args: Sequence[TensorType], attribute: str) -> int:
@@ -106,9 +104,7 @@ def _infer_unpack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
     shape, axis, count = args[0].shape, node.attrs["axis"], _pieces(node, args, "num")
     if shape is None:
         return [TensorType(args[0].dtype, None)] * count
-    axis = axis_within(axis, len(shape))
-    if isinstance(shape[axis], int) and shape[axis] != count:
-        raise shape_error(node, args, f"a length of {shape[axis]} does not come apart into {count}")
+    axis %= len(shape)
     return [TensorType(args[0].dtype, shape[:axis] + shape[axis + 1 :])] * count
 
 
@@ -148,7 +144,7 @@ def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
     data, axis_at = (args[1], 0) if node.op == "Split" else (args[0], 2)
     if data.shape is None:
         return [TensorType(data.dtype, None)] * _pieces(node, args, "num_split")
-    axis = axis_within(int(require_constant(node, args, axis_at, "an axis")), len(data.shape))
+    axis = int(require_constant(node, args, axis_at, "an axis")) % len(data.shape)
     sizes = _split_sizes(node, data.shape[axis], args)
     return [TensorType(data.dtype, (*data.shape[:axis], size, *data.shape[axis + 1 :])) for size in sizes]
 
@@ -160,7 +156,7 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
     kind = builder.type_of(node.inputs[data_at])
     assert kind.shape is not None
-    axis = axis_within(int(constant_input(node, builder, axis_at, "an axis")), len(kind.shape))
+    axis = int(constant_input(node, builder, axis_at, "an axis")) % len(kind.shape)
     sizes = _split_sizes(node, kind.shape[axis], [builder.type_of(r) for r in node.inputs])
     if any(not isinstance(s, int) for s in sizes):
         raise not_constant(node, "a length to split")
@@ -183,6 +179,7 @@ OPS = (
         _concat,
         _lower_concat,
         (Attr("N", "int", derive="count:1"), T, type_attr("Tidx", "in:-1")),
+        litert=litert.concat,
         moves="join",
         data=(0, -1),
     ),
@@ -192,6 +189,7 @@ OPS = (
         _pack,
         _lower_pack,
         (Attr("N", "int", derive="count"), T, Attr("axis", "int", 0)),
+        litert=litert.pack,
         moves="join",
         data=(0, None),
     ),
@@ -202,6 +200,7 @@ OPS = (
         _lower_unpack,
         (Attr("num", "int"), T, Attr("axis", "int", 0)),
         outputs=-1,
+        litert=litert.unpack,
         spellings=("Unstack",),
         moves="pick",
     ),
@@ -211,6 +210,7 @@ OPS = (
         _split,
         _lower_split,
         (Attr("num_split", "int"), type_attr("T", "in:1")),
+        litert=litert.split,
         outputs=-1,
         moves="pick",
         data=(1, 2),
@@ -221,6 +221,7 @@ OPS = (
         _split_v,
         _lower_split,
         (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
+        litert=litert.split_v,
         outputs=-1,
         moves="pick",
     ),

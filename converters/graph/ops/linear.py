@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,8 +17,6 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     Precision,
-    axes_within,
-    axis_within,
     by_shape,
     constant_input,
     direct,
@@ -29,6 +27,8 @@ from converters.graph.ops.base import (
     squeezed,
     type_attr,
 )
+from converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, refused
+from converters.graph.ops.litert.layers import matmul as litert_matmul
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
 
 T = type_attr()
@@ -167,8 +167,9 @@ def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
 # ------------------------------------------------------------------ reductions
 
 
-def _axes(axes: np.ndarray, rank: int) -> tuple[int, ...]:
-    return axes_within(np.atleast_1d(axes), rank)
+def _axes(node: Node, axes: np.ndarray, rank: int) -> tuple[int, ...]:
+    wanted = [int(a) for a in np.atleast_1d(axes)]
+    return tuple(sorted({a + rank if a < 0 else a for a in wanted}))
 
 
 def _mean(x: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
@@ -181,7 +182,7 @@ def _mean(x: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
 def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[..., np.ndarray]:
     def kernel(node: Node, x: np.ndarray, axes: np.ndarray) -> np.ndarray:
         work = x.astype(np.float64) if wide and x.dtype.kind == "f" else x
-        chosen = _axes(axes, x.ndim)
+        chosen = _axes(node, axes, x.ndim)
         with np.errstate(all="ignore"):
             result = function(work, axis=chosen, keepdims=bool(node.attrs["keep_dims"])) if chosen else work
         return np.asarray(result).astype(x.dtype)
@@ -192,7 +193,9 @@ def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[.
 @by_shape
 def _infer_reduction(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     keep = bool(node.attrs["keep_dims"])
-    axes = _axes(require_constant(node, args, 1, "the axes to reduce over"), len(shape))
+    axes = _axes(node, require_constant(node, args, 1, "the axes to reduce over"), len(shape))
+    if any(a >= len(shape) or a < 0 for a in axes):
+        raise shape_error(node, args, f"axes {axes} are outside the tensor's rank")
     return [1 if i in axes else d for i, d in enumerate(shape) if keep or i not in axes]
 
 
@@ -200,7 +203,7 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
     def lower(node: Node, builder: OnnxBuilder) -> Any:
         kind = builder.type_of(node.inputs[0])
         assert kind.shape is not None
-        axes = _axes(constant_input(node, builder, 1, "the axes to reduce over"), len(kind.shape))
+        axes = _axes(node, constant_input(node, builder, 1, "the axes to reduce over"), len(kind.shape))
         value = builder.value(node.inputs[0])
         keep = bool(node.attrs["keep_dims"])
         if kind.dtype == BOOL:  # ONNX does not reduce booleans
@@ -211,12 +214,28 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
     return lower
 
 
-def _reduce(name: str, function: Callable[..., Any], onnx_op: str, precision: Precision) -> OpDef:
+def _litert_reduction(op: str) -> Callable[[Node, LitertBuilder], Any]:
+    def lower(node: Node, builder: LitertBuilder) -> Any:
+        rank, axes = builder.type_of(node.inputs[0]).rank, builder.type_of(node.inputs[1]).constant
+        if axes is None or rank is None:
+            raise refused(node, "the axes that it reduces over are computed while the graph runs")
+        value, chosen = builder.value(node.inputs[0]), _axes(node, axes, rank)
+        return (
+            builder.emit(op, [value, ints(builder, *chosen)], keep_dims=bool(node.attrs["keep_dims"]))
+            if chosen
+            else value
+        )
+
+    return lower
+
+
+def _reduce(name: str, function: Callable[..., Any], onnx_op: str, precision: Precision, litert_op: str) -> OpDef:
     attrs: tuple[Attr, ...] = (Attr("keep_dims", "bool", False), type_attr("Tidx", "in:1"))
     if name not in ("All", "Any"):
         attrs = (T, *attrs)
     kernel = _reduction(function, wide=precision != "exact")
-    return OpDef(name, _infer_reduction, kernel, _lower_reduction(onnx_op), attrs, precision=precision)
+    lower, litert = _lower_reduction(onnx_op), _litert_reduction(litert_op)
+    return OpDef(name, _infer_reduction, kernel, lower, attrs, litert=litert, precision=precision)
 
 
 def _arg(function: Callable[..., Any]) -> Callable[..., np.ndarray]:
@@ -231,7 +250,9 @@ def _infer_arg(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list
     if shape is None:
         return [TensorType(node.attrs["output_type"], None)]
     axis = int(require_constant(node, args, 1, "an axis"))
-    axis = axis_within(axis, len(shape))
+    if not -len(shape) <= axis < len(shape):
+        raise shape_error(node, args, f"axis {axis} is outside the tensor's rank")
+    axis %= len(shape)
     return [TensorType(node.attrs["output_type"], shape[:axis] + shape[axis + 1 :])]
 
 
@@ -244,7 +265,19 @@ def _lower_arg(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
     return lower
 
 
+def _litert_arg(op: str) -> Callable[[Node, LitertBuilder], Any]:
+    def lower(node: Node, builder: LitertBuilder) -> Any:
+        values = [builder.value(node.inputs[0]), as_int32(builder, node.inputs[1])]
+        return builder.emit(op, values, output_type=node.attrs["output_type"])
+
+    return lower
+
+
 _ARG_ATTRS = (T, type_attr("Tidx", "in:1"), Attr("output_type", "type", INT64))
+_CHOICES: tuple[tuple[str, Callable[..., Any], str, Literal["largest", "smallest"]], ...] = (
+    ("ArgMax", np.argmax, "ARG_MAX", "largest"),
+    ("ArgMin", np.argmin, "ARG_MIN", "smallest"),
+)
 
 
 # ------------------------------------------------------------------ softmax
@@ -267,7 +300,18 @@ def _log_softmax(node: Node, x: np.ndarray) -> np.ndarray:
 
 def _dense(name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], **traits: Any) -> OpDef:
     attrs = (T, *attrs)
-    return OpDef(name, _infer_matmul, kernel, lower, attrs, foldable=False, precision="summed", layer="dense", **traits)
+    return OpDef(
+        name,
+        _infer_matmul,
+        kernel,
+        lower,
+        attrs,
+        litert=litert_matmul,
+        foldable=False,
+        precision="summed",
+        layer="dense",
+        **traits,
+    )
 
 
 _TRANSPOSED = (Attr("transpose_a", "bool", False), Attr("transpose_b", "bool", False))
@@ -285,19 +329,27 @@ OPS = (
         plain(np.add),
         direct("Add"),
         (T, Attr("data_format", "str", "NHWC")),
+        litert=builtin("ADD"),
     ),
-    _reduce("Sum", np.sum, "ReduceSum", "summed"),
-    _reduce("Mean", _mean, "ReduceMean", "rounded"),
-    _reduce("Prod", np.prod, "ReduceProd", "rounded"),
-    _reduce("Max", np.max, "ReduceMax", "exact"),
-    _reduce("Min", np.min, "ReduceMin", "exact"),
-    _reduce("All", np.all, "ReduceMin", "exact"),
-    _reduce("Any", np.any, "ReduceMax", "exact"),
-    OpDef(
-        "ArgMax", _infer_arg, _arg(np.argmax), _lower_arg("ArgMax"), _ARG_ATTRS, precision="exact", chooses="largest"
-    ),
-    OpDef(
-        "ArgMin", _infer_arg, _arg(np.argmin), _lower_arg("ArgMin"), _ARG_ATTRS, precision="exact", chooses="smallest"
+    _reduce("Sum", np.sum, "ReduceSum", "summed", "SUM"),
+    _reduce("Mean", _mean, "ReduceMean", "rounded", "MEAN"),
+    _reduce("Prod", np.prod, "ReduceProd", "rounded", "REDUCE_PROD"),
+    _reduce("Max", np.max, "ReduceMax", "exact", "REDUCE_MAX"),
+    _reduce("Min", np.min, "ReduceMin", "exact", "REDUCE_MIN"),
+    _reduce("All", np.all, "ReduceMin", "exact", "REDUCE_ALL"),
+    _reduce("Any", np.any, "ReduceMax", "exact", "REDUCE_ANY"),
+    *(
+        OpDef(
+            name,
+            _infer_arg,
+            _arg(function),
+            _lower_arg(name),
+            _ARG_ATTRS,
+            litert=_litert_arg(operator),
+            precision="exact",
+            chooses=chosen,
+        )
+        for name, function, operator, chosen in _CHOICES
     ),
     OpDef(
         "Softmax",
@@ -305,6 +357,7 @@ OPS = (
         lambda node, x: softmax64(x).astype(x.dtype),
         direct("Softmax", axis=-1),
         (T,),
+        litert=builtin("SOFTMAX", beta=1.0),
         precision="approximate",
         activation="softmax",
         finite="always",
@@ -315,6 +368,7 @@ OPS = (
         _log_softmax,
         direct("LogSoftmax", axis=-1),
         (T,),
+        litert=builtin("LOG_SOFTMAX"),
         precision="approximate",
         activation="softmax",
     ),

@@ -23,13 +23,15 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.litert.base import Litert, builtin
+from converters.graph.ops.litert.elementwise import select
 from converters.graph.ops.older import select_v2
 from converters.graph.types import BOOL, FLOAT32, INT32, TensorType
 
 T = type_attr()
 
 
-def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower) -> OpDef:
+def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower, litert: Litert) -> OpDef:
     attrs: tuple[Attr, ...] = (T,)
     if name in ("Equal", "NotEqual"):
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
@@ -40,6 +42,7 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower)
         kernel,
         lowering,
         attrs,
+        litert=litert,
         precision="exact",
         elementwise=True,
         compares_equal=name == "Equal",
@@ -80,15 +83,23 @@ def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorTy
 
 
 OPS = (
-    _comparison("Less", np.less, direct("Less")),
-    _comparison("LessEqual", np.less_equal, direct("LessOrEqual")),
-    _comparison("Greater", np.greater, direct("Greater")),
+    _comparison("Less", np.less, direct("Less"), builtin("LESS")),
+    _comparison("LessEqual", np.less_equal, direct("LessOrEqual"), builtin("LESS_EQUAL")),
+    _comparison("Greater", np.greater, direct("Greater"), builtin("GREATER")),
     # The other way round: Barracuda has no GreaterOrEqual.
-    _comparison("GreaterEqual", np.greater_equal, direct("LessOrEqual", 1, 0)),
-    _comparison("Equal", np.equal, direct("Equal")),
-    _comparison("NotEqual", np.not_equal, chain(("Equal", None), ("Not", None))),
+    _comparison("GreaterEqual", np.greater_equal, direct("LessOrEqual", 1, 0), builtin("GREATER_EQUAL")),
+    _comparison("Equal", np.equal, direct("Equal"), builtin("EQUAL")),
+    _comparison("NotEqual", np.not_equal, chain(("Equal", None), ("Not", None)), builtin("NOT_EQUAL")),
     *(
-        OpDef(name, broadcast_of(BOOL, count=2), plain(function), direct(onnx), precision="exact", elementwise=True)
+        OpDef(
+            name,
+            broadcast_of(BOOL, count=2),
+            plain(function),
+            direct(onnx),
+            litert=builtin(f"LOGICAL_{onnx.upper()}"),
+            precision="exact",
+            elementwise=True,
+        )
         for name, function, onnx in (("LogicalAnd", np.logical_and, "And"), ("LogicalOr", np.logical_or, "Or"))
     ),
     OpDef(
@@ -96,6 +107,7 @@ OPS = (
         same_as(0, count=1),
         plain(np.logical_not),
         direct("Not"),
+        litert=builtin("LOGICAL_NOT"),
         precision="exact",
         elementwise=True,
     ),
@@ -108,6 +120,7 @@ OPS = (
         _lower_select,
         (type_attr("T", "in:1"),),
         tfjs=_tfjs_select,
+        litert=select,
         precision="exact",
     ),
     OpDef(  # of no policy's graph, but of a TensorFlow.js model's

@@ -14,6 +14,8 @@ import numpy as np
 from converters.graph.nodes import Node
 from converters.graph.ops.arrays import target_dims
 from converters.graph.ops.base import Attr, GraphBuilder, OnnxBuilder, OpDef, as_int64, not_constant, type_attr
+from converters.graph.ops.litert.arrays import sparse_to_dense
+from converters.graph.ops.litert.base import builtin
 from converters.graph.types import INT64, Symbols, TensorType
 from signatures.errors import UnsupportedOpError
 
@@ -83,6 +85,7 @@ OPS = (
         _lower_where,
         (type_attr(),),
         tfjs=_tfjs_where,
+        litert=builtin("WHERE"),
         precision="exact",
     ),
     OpDef(
@@ -91,6 +94,7 @@ OPS = (
         _sparse_to_dense,
         _lower_sparse_to_dense,
         (type_attr("T", "in:2"), type_attr("Tindices", "in:0"), Attr("validate_indices", "bool", True)),
+        litert=sparse_to_dense,
         precision="exact",
     ),
 )

@@ -13,9 +13,9 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
-    axis_within,
     by_shape,
     constant_input,
+    inserted,
     not_constant,
     require_constant,
     reshaped,
@@ -24,6 +24,8 @@ from converters.graph.ops.base import (
     type_attr,
     unsqueezed,
 )
+from converters.graph.ops.litert.arrays import gather
+from converters.graph.ops.litert.base import LitertBuilder, Value, as_int32, ints, with_axis
 from converters.graph.types import Dim, Symbols, TensorType
 
 T = type_attr()
@@ -233,6 +235,38 @@ def _tfjs_strided_slice(builder: GraphBuilder, node: Node, types: Mapping[str, T
     return Node(node.name, "Squeeze", (kept,), {"squeeze_dims": tuple(shrunk)}, origin=node.origin)
 
 
+def _litert_slice(node: Node, builder: LitertBuilder) -> Value:
+    return builder.emit("SLICE", [builder.value(node.inputs[0]), *(as_int32(builder, r) for r in node.inputs[1:])])
+
+
+def _litert_strided_slice(node: Node, builder: LitertBuilder) -> Value:
+    """A bound for each axis, as TensorFlow's masks are resolved; an axis that is put in is a RESHAPE behind it."""
+    kind, operands = builder.type_of(node.inputs[0]), _strided_operands([builder.type_of(r) for r in node.inputs])
+    if operands is None or kind.shape is None:
+        raise not_constant(node, "the bounds of a slice")
+    steps = strided_steps(node, len(kind.shape), *operands)
+    taken = [s for s in steps if s[0] != "new"]
+    bounds = [(s[1], s[1] + 1, 1) if s[0] == "take" else s[1:] for s in taken]
+    open_begin = sum(1 << i for i, (first, _, _) in enumerate(bounds) if first is None)
+    open_end = sum(1 << i for i, (_, last, _) in enumerate(bounds) if last is None)
+    shrunk = sum(1 << i for i, s in enumerate(taken) if s[0] == "take")
+    vectors = [ints(builder, *(0 if b[i] is None else b[i] for b in bounds)) for i in range(3)]
+    value, result = builder.value(node.inputs[0]), builder.result
+    new, position = [], 0
+    for step in steps:
+        new += [position] if step[0] == "new" else []
+        position += step[0] != "take"
+    dims = None if result.shape is None else tuple(d for i, d in enumerate(result.shape) if i not in new)
+    if any(b != (None, None, 1) for b in bounds):
+        masks = {"begin_mask": open_begin, "end_mask": open_end, "shrink_axis_mask": shrunk}
+        value = builder.emit("STRIDED_SLICE", [value, *vectors], TensorType(kind.dtype, dims), **masks)
+    for count, axis in enumerate(new, 1):
+        last = count == len(new) or dims is None
+        dims = inserted(dims, axis)
+        value = with_axis(builder, value, result if last else TensorType(kind.dtype, dims), axis)
+    return value
+
+
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
     """An index that is outside its axis is an error, as in TensorFlow on a CPU; numpy counts some from the end."""
     if indices.size and indices.dtype.kind in "iu" and indices.min() < 0:
@@ -243,7 +277,7 @@ def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | N
 def _infer_gather(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     if args[0].shape is None or args[1].shape is None:
         return [TensorType(args[0].dtype, None)]
-    axis = 0 if len(args) < 3 else axis_within(int(require_constant(node, args, 2, "an axis")), len(args[0].shape))
+    axis = 0 if len(args) < 3 else int(require_constant(node, args, 2, "an axis")) % len(args[0].shape)
     return [TensorType(args[0].dtype, args[0].shape[:axis] + args[1].shape + args[0].shape[axis + 1 :])]
 
 
@@ -263,7 +297,15 @@ def _lower_gather(node: Node, builder: OnnxBuilder) -> Any:
 _MASKS = tuple(Attr(f"{k}_mask", "int", 0) for k in ("begin", "end", "ellipsis", "new_axis", "shrink_axis"))
 
 OPS = (
-    OpDef("Slice", _infer_slice, _slice, _lower_slice, (T, type_attr("Index", "in:1")), moves="pick"),
+    OpDef(
+        "Slice",
+        _infer_slice,
+        _slice,
+        _lower_slice,
+        (T, type_attr("Index", "in:1")),
+        litert=_litert_slice,
+        moves="pick",
+    ),
     OpDef(
         "StridedSlice",
         _infer_strided_slice,
@@ -271,6 +313,7 @@ OPS = (
         _lower_strided_slice,
         (T, type_attr("Index", "in:1"), *_MASKS),
         tfjs=_tfjs_strided_slice,
+        litert=_litert_strided_slice,
         moves="pick",
     ),
     OpDef(
@@ -279,6 +322,7 @@ OPS = (
         _gather,
         _lower_gather,
         (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
+        litert=gather,
         moves="pick",
         looks_up=1,
         table_size=_rows_of_table,
@@ -294,6 +338,7 @@ OPS = (
             type_attr("Taxis", "in:2"),
             Attr("batch_dims", "int", 0, since="1.14", supported=False),
         ),
+        litert=gather,
         moves="pick",
         looks_up=1,
         table_size=_rows_of_table,

@@ -66,6 +66,8 @@ TFJS = ("tfjs-cpu", "tfjs-wasm")
 NO_SUCH_OP = dict.fromkeys(TFJS, "TensorFlow.js has no such op")
 NAN_LOST = "a NaN comes out as a number"
 UNKNOWN_BATCH = {"onnxruntime": "the length of the batch is not known when the model is written"}
+#: LiteRT's own kernels keep the sums and products of floats between -3.4e38 and 3.4e38, XNNPACK does not.
+KEPT_FINITE = {"litert-plain": "an infinite number comes out as the largest one"}
 NO_LOWERING = {"onnxruntime": "it has no lowering"}
 
 

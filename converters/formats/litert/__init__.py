@@ -1,0 +1,30 @@
+"""LiteRT (TensorFlow Lite): written with its signatures, for phones, boards and pages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.formats.litert import artifact as _artifact
+    from converters.formats.litert import writer as _writer
+else:
+    _artifact, _writer = deferred(__name__, "artifact", "writer")
+
+FORMATS = (
+    Format(
+        key="litert",
+        label="a LiteRT (TensorFlow Lite) model",
+        advice="give the graph it was converted from",
+        sniff=lambda file: file.head[4:8] == b"TFL3",
+        write=_writer.write,
+        main="{name}.tflite",
+        held=_artifact.held,
+        ports=_artifact.ports,
+        vetted=_artifact.vetted,
+        inner=_artifact.inner,
+        runtimes=("litert", "litert-plain"),
+        signatures=True,
+    ),
+)

@@ -1,0 +1,148 @@
+"""An artefact that is a LiteRT model: the contract that it holds, its inner tensors, and what of it may be run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from converters.files.fetch import read_bytes
+from converters.files.folders import scratch_folder
+from converters.formats.format import Port, Ports
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
+from converters.formats.litert.flatbuffer import Table, decoded, encoded
+from converters.formats.litert.schema import BUILTINS, TYPES
+from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
+from signatures.contract import EMBEDDED
+from signatures.errors import DamagedFileError, UnsupportedOpError
+
+_OPERATORS = {builtin.code: name for name, builtin in BUILTINS.items()}
+_DTYPES = {number: dtype for dtype, (number, _) in TYPES.items()}
+
+
+def ports(path: Path) -> Ports:
+    """The ports of a file: those of its first signature, or its tensors' own where it has none.
+
+    Raises SourceError, DamagedFileError.
+    """
+    model = decoded(read_bytes(path))
+    signatures = {str(s.get("signature_key", "")): s for s in model.get("signature_defs", ())}
+    key = next((k for k in ("serving_default", *signatures) if k in signatures), "")
+    signature = signatures.get(key, {})
+    subgraph = _entry(model, "subgraphs", signature.get("subgraph_index", 0))
+
+    def side(name: str) -> tuple[Port, ...]:
+        named = [(e.get("name", ""), e.get("tensor_index", 0)) for e in signature.get(name, ())]
+        return tuple(_port(n, subgraph, i) for n, i in named or [("", int(i)) for i in subgraph.get(name, ())])
+
+    return Ports(path, side("inputs"), side("outputs"), {"kind": "litert", "signature": key})
+
+
+def _port(name: str, subgraph: Table, number: int) -> Port:
+    tensor = _entry(subgraph, "tensors", number)
+    dtype = _DTYPES.get(tensor.get("type", 0))
+    shape: list[int] = list(tensor["shape_signature"] if "shape_signature" in tensor else tensor.get("shape", ()))
+    dims = tuple(None if n < 0 else int(n) for n in shape)
+    return Port(name or str(tensor.get("name", "")), None if dtype is None else dtype.name, dims)
+
+
+def _entry(table: Table, vector: str, number: int) -> Table:
+    """An entry of a vector of a file that anyone may have made."""
+    entries = table.get(vector, ())
+    if not 0 <= number < len(entries):
+        raise DamagedFileError(
+            "the .tflite file is damaged", why=f"it has no {vector}[{number}]", fix="export it again"
+        )
+    found: Table = entries[number]
+    return found
+
+
+def held(path: Path) -> str | None:
+    """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
+    return _note(decoded(read_bytes(path)), EMBEDDED)
+
+
+def _note(model: Table, name: str) -> str | None:
+    """A text of the metadata."""
+    for entry in model.get("metadata", ()):
+        if entry.get("name") == name:
+            return _buffer(model, entry.get("buffer", 0)).decode("utf-8", "replace")
+    return None
+
+
+def _buffer(model: Table, number: int) -> bytes:
+    return bytes(_entry(model, "buffers", number).get("data", b""))
+
+
+def operator_of(code: Table) -> str:
+    """The name of an operator of the list; of one that is not written here its number, or what it calls itself."""
+    number = max(code.get("deprecated_builtin_code", 0), code.get("builtin_code", 0))
+    return str(code.get("custom_code") or _OPERATORS.get(number) or f"operator {number}")
+
+
+def vetted(path: Path, signatures: Sequence[str], folder: Path) -> Path:
+    """A copy that has no operators but those that are written here: they compute.
+
+    Raises UnsupportedOpError, DamagedFileError.
+    """
+    model = decoded(read_bytes(path))
+    others = [name for name in map(operator_of, model.get("operator_codes", ())) if name not in BUILTINS]
+    if others:
+        raise UnsupportedOpError(
+            f"the .tflite file has {others[0]}",
+            issues=[("", name) for name in others],
+            why="it is none of the operators that policies are written with here, and may do more than compute",
+            fix="convert the policy with builtin operators alone",
+        )
+    copy = folder / path.name
+    encoded(model).write(copy)
+    return copy
+
+
+@contextmanager
+def inner(loaded: Loaded) -> Iterator[InnerTensors]:
+    """Those of a signature, in the same runtime: a copy gives them as further outputs."""
+    key = loaded.signature or "serving_default"
+    model = decoded(loaded.path.read_bytes())
+    signature = next(s for s in model["signature_defs"] if s["signature_key"] == key)
+    subgraph = model["subgraphs"][signature.get("subgraph_index", 0)]
+    tensors = subgraph["tensors"]
+    numbers = {t["name"]: i for i, t in enumerate(tensors) if t.get("name")}
+    made = {int(i) for operator in subgraph["operators"] for i in operator["outputs"]}
+    fed = {entry["name"]: entry.get("tensor_index", 0) for entry in signature["inputs"]}
+
+    names = loads(_note(model, TENSORS_KEY) or "")
+
+    def view(tensor: str) -> View | None:
+        found = names.view(tensor)
+        return found if found is not None and found.name in numbers else None
+
+    def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        given = {name: array for name, array in feeds.items() if name in fed}
+        wanted = [name for name in fetch if numbers[name] in made]
+        values = {n: given[n] for n in fetch if n in given}
+        values |= {n: _constant(model, tensors[numbers[n]]) for n in fetch if n not in values and n not in wanted}
+        if wanted:
+            more = [{"name": name, "tensor_index": numbers[name]} for name in wanted]
+            opened = {**signature, "outputs": more}
+            wider = {**subgraph, "outputs": list(dict.fromkeys([*subgraph["outputs"], *(numbers[n] for n in wanted)]))}
+            copy = {
+                **model,
+                "subgraphs": [wider if s is subgraph else s for s in model["subgraphs"]],
+                "signature_defs": [opened if s is signature else s for s in model["signature_defs"]],
+            }
+            encoded(copy).write(file)
+            with loaded.pool.process(loaded.runtime).load(str(file), kind="litert", signature=key) as one:
+                values.update(one.run(given, wanted))
+        return values
+
+    with scratch_folder() as folder:
+        file = folder / loaded.path.name
+        yield InnerTensors(view, run)
+
+
+def _constant(model: Table, tensor: Table) -> np.ndarray:
+    shape = [int(n) for n in tensor.get("shape", ())]
+    return np.frombuffer(_buffer(model, tensor.get("buffer", 0)), _DTYPES[tensor.get("type", 0)]).reshape(shape)

@@ -1,0 +1,215 @@
+"""The operators and tensors of a LiteRT model in the making."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.files.chunks import equal
+from converters.files.external_data import LARGE
+from converters.formats.intermediate_tensors import View
+from converters.formats.litert.flatbuffer import Table
+from converters.formats.litert.schema import ACTIVATIONS, BUILTINS, OPTIONS, PADDINGS, TABLES, TYPES
+from converters.graph.nodes import Graph, NameScope, Node, ref
+from converters.graph.ops.litert.base import NONE, Value, refused, reshaped
+from converters.graph.ops.table import op_of
+from converters.graph.shapes import infer_types
+from converters.graph.types import TensorType, of_array
+from signatures.spec import TensorSpec
+
+
+class Shared:
+    """What all subgraphs of a model have in common: the bytes of constants, the list of operators."""
+
+    def __init__(self) -> None:
+        #: the first is empty: the buffer of what is computed
+        self.buffers: list[Table] = [{}]
+        self.operators: dict[tuple[str, int], int] = {}
+        self._known: dict[tuple[Any, ...], list[tuple[np.ndarray, int]]] = {}
+
+    def buffer(self, array: np.ndarray) -> int:
+        """The number of the buffer that holds an array; of what has no bytes there is none."""
+        if not array.size:
+            return 0
+        beginning = array if array.nbytes < LARGE else array[(0,) * (array.ndim - 1)][:16]
+        alike = self._known.setdefault((array.dtype.str, array.shape, beginning.tobytes()), [])
+        for known, number in alike:
+            if array.nbytes < LARGE or equal(known, array):
+                return number
+        alike.append((array, len(self.buffers)))
+        self.buffers.append({"data": array})
+        return len(self.buffers) - 1
+
+    def text(self, text: str) -> int:
+        """The number of a buffer that holds a text."""
+        self.buffers.append({"data": text.encode()})
+        return len(self.buffers) - 1
+
+    def operator(self, name: str, version: int) -> int:
+        """The number of an operator in a version."""
+        return self.operators.setdefault((name, version), len(self.operators))
+
+    def codes(self) -> list[Table]:
+        """The list of operators; a reader from before 2.4 has the numbers up to 127 alone, in a field of their own."""
+        rows = ((BUILTINS[name].code, version) for name, version in self.operators)
+        return [{"deprecated_builtin_code": min(c, 127), "builtin_code": c, "version": v} for c, v in rows]
+
+
+class Subgraph:
+    """One function of a model (implements converters.graph.ops.litert.base.LitertBuilder)."""
+
+    def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared) -> None:
+        self.graph, self.shared = graph, shared
+        self.types = infer_types(graph)
+        self.tensors: list[Table] = []
+        self.operators: list[Table] = []
+        self.kinds: list[TensorType] = []
+        #: constants that have their axes in another order
+        self.turned: dict[str, View] = {}
+        self.result = TensorType(np.dtype(np.float32), None)
+        self._values: dict[str, Value] = {}
+        self._constants: dict[tuple[int, str, tuple[int, ...]], Value] = {}
+        self._made: dict[Value, Table] = {}
+        self._names = NameScope(())
+        self._node = Node("", "")
+        wanted = list(outputs)
+        self._outputs = frozenset(wanted)
+        self._reads = Counter([*wanted, *(r for n in graph.nodes for r in n.inputs)])
+
+    def value(self, reference: str) -> Value:
+        """The tensor that stands for one of the graph."""
+        if reference not in self._values:  # a constant is put in for who reads it
+            node = self.graph.producer(reference)
+            assert node.value is not None
+            self._bound(reference, self.const(np.asarray(node.value)))
+        return self._values[reference]
+
+    def type_of(self, reference: str) -> TensorType:
+        """What is known of a tensor of the graph."""
+        return self.types[reference]
+
+    def emit(self, op: str, inputs: Sequence[Value], of: TensorType | None = None, **options: Any) -> Value:
+        """An operator more; returns its result."""
+        (value,) = self.emit_several(op, inputs, [self.result if of is None else of], **options)
+        return value
+
+    def emit_several(
+        self, op: str, inputs: Sequence[Value], of: Sequence[TensorType], **options: Any
+    ) -> tuple[Value, ...]:
+        """An operator more; returns its results, of the types ``of``."""
+        values = tuple(self._tensor(kind) for kind in of)
+        entry = {"opcode_index": self._version(op, inputs, options), "inputs": list(inputs), "outputs": list(values)}
+        told = BUILTINS[op].options
+        if told:
+            entry |= {"builtin_options_type": OPTIONS[told], "builtin_options": _encoded(options)}
+        self.operators.append({k: v for k, v in entry.items() if v != 0})
+        self._made.update(dict.fromkeys(values, self.operators[-1]))
+        return values
+
+    def _version(self, op: str, inputs: Sequence[Value], options: dict[str, Any]) -> int:
+        builtin = BUILTINS[op]
+        kinds = [self.kinds[value] for value in inputs if value != NONE]
+        dtype = kinds[builtin.operand].dtype
+        alike = len({k.shape for k in kinds}) == 1 and len(kinds) > 1
+        axes = 0 if alike else max((k.rank or 0 for k in kinds), default=0)
+        version = builtin.version(TYPES[dtype][1], axes) if dtype in TYPES else None
+        if version is None:
+            wide = f" that is broadcast over {axes} axes" if axes > 4 else ""
+            raise refused(self._node, f"its {op} does not take {dtype}{wide}")
+        if op == "DEPTHWISE_CONV_2D" and (options["dilation_h_factor"], options["dilation_w_factor"]) != (1, 1):
+            version = 2
+        return self.shared.operator(op, version)
+
+    def const(self, array: np.ndarray, holds: str = "", axes: Sequence[int] = ()) -> Value:
+        """A constant; equal ones are one tensor."""
+        buffer = self.shared.buffer(array)
+        key = (buffer, array.dtype.str, array.shape)
+        if key not in self._constants:
+            self._constants[key] = self._tensor(of_array(array), buffer)
+        value = self._constants[key]
+        if holds:
+            if "name" not in self.tensors[value]:
+                self.tensors[value]["name"] = self._names.fresh(holds)
+            self.turned[holds] = View(self.tensors[value]["name"], tuple(axes))
+        return value
+
+    def _tensor(self, kind: TensorType, buffer: int = 0) -> Value:
+        if kind.dtype not in TYPES:
+            raise refused(self._node, f"LiteRT has no {kind.dtype}")
+        entry: Table = {"type": TYPES[kind.dtype][0], "buffer": buffer}
+        if kind.shape is not None:
+            entry["has_rank"] = True
+            if kind.shape:
+                entry["shape"] = [d if isinstance(d, int) else 1 for d in kind.shape]
+            if any(isinstance(d, str) for d in kind.shape):
+                entry["shape_signature"] = [d if isinstance(d, int) else -1 for d in kind.shape]
+        self.tensors.append(entry)
+        self.kinds.append(kind)
+        return len(self.tensors) - 1
+
+    def activated(self, reference: str, function: str) -> Value | None:
+        """A tensor whose operator now applies ``function``; None where it cannot, or its own result is read."""
+        value = self.value(reference)
+        made = self._made.get(value)
+        if self._reads[reference] != 1 or reference in self._outputs or made is None or made["outputs"] != [value]:
+            return None
+        name = next(n for (n, _), i in self.shared.operators.items() if i == made.get("opcode_index", 0))
+        told = {f.name for f in TABLES[BUILTINS[name].options]} if BUILTINS[name].options else set()
+        # CONCATENATION has the field, and a kernel that takes none (concatenation.cc)
+        if "activation" not in told or name == "CONCATENATION" or made["builtin_options"].get("activation"):
+            return None
+        made["builtin_options"]["activation"] = ACTIVATIONS[function]
+        self.tensors[value].pop("name", None)
+        return value
+
+    def input(self, spec: TensorSpec, reference: str) -> Value:
+        """A tensor that is fed."""
+        self._node = self.graph.producer(reference)
+        dims = tuple(f"?{i}" if d is None else d for i, d in enumerate(spec.shape))
+        return self._bound(reference, self._tensor(TensorType(np.dtype(spec.dtype), dims)))
+
+    def lower(self, node: Node) -> None:
+        """Append what a node of the graph becomes, its result under the node's own name."""
+        self._node = node
+        if node.name in self._values or node.value is not None:
+            return
+        entry = op_of(node)
+        if entry.litert is None:
+            raise refused(node, "LiteRT has no operator that computes it")
+        self.result = self.types[node.name]
+        found = entry.litert(node, self)
+        for index, value in enumerate(found if isinstance(found, tuple) else (found,)):
+            self._bound(ref(node.name, index), value)
+
+    def _bound(self, reference: str, value: Value) -> Value:
+        self._values[reference] = value
+        if "name" not in self.tensors[value] and reference not in self._names:
+            self.tensors[value]["name"] = self._names.fresh(reference)
+        return value
+
+    def output(self, spec: TensorSpec, reference: str, taken: Iterable[Value]) -> Value:
+        """A tensor that is given, of its own: what is fed, a constant or another output as well is copied."""
+        value = self.value(reference)
+        if value in self._made and value not in taken:
+            return value
+        self._node, self.result = self.graph.producer(reference), self.types[reference]
+        copied = reshaped(self, value, self.result)
+        if copied is None:
+            copied = self.emit("CAST", [value], in_data_type=self.result.dtype, out_data_type=self.result.dtype)
+        self.tensors[copied]["name"] = self._names.fresh(spec.name)
+        return copied
+
+
+def _encoded(options: dict[str, Any]) -> Table:
+    found: Table = {}
+    for name, value in options.items():
+        if isinstance(value, np.dtype):
+            found[name] = TYPES[value][0]
+        elif isinstance(value, str):
+            found[name] = PADDINGS[value] if name == "padding" else ACTIVATIONS[value]
+        else:
+            found[name] = value
+    return found

@@ -1,0 +1,103 @@
+"""Products, convolutions, pooling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from converters.graph.nodes import Node
+from converters.graph.ops.litert.base import NONE, Litert, LitertBuilder, Value, as_int32, refused
+
+#: The axes of a kernel as LiteRT has them.
+_FIRST = (3, 0, 1, 2)
+#: What LiteRT calls the activations that a fused op may carry: those that its operators apply, those behind them.
+_APPLIED = {"Relu": "RELU", "Relu6": "RELU6"}
+_BEHIND = {"Elu": "ELU", "Sigmoid": "LOGISTIC"}
+
+
+def matmul(node: Node, builder: LitertBuilder) -> Value:
+    """FULLY_CONNECTED where the matrix is a constant, which it has a row of for each result; else BATCH_MATMUL."""
+    kinds = [builder.type_of(r) for r in node.inputs]
+    flags = (("transpose_a", "adj_x"), ("transpose_b", "adj_y"))
+    turned = [any(node.attrs.get(flag) for flag in both) for both in flags]
+    weights = kinds[1].constant
+    if weights is not None and weights.ndim == 2 and kinds[0].rank == 2 and not turned[0]:
+        bias = builder.value(node.inputs[2]) if len(node.inputs) > 2 else NONE
+        rows = builder.value(node.inputs[1]) if turned[1] else builder.const(weights.T, node.inputs[1], (1, 0))
+        values = [builder.value(node.inputs[0]), rows, bias]
+        return _activated(node, builder, "FULLY_CONNECTED", values)
+    value = builder.emit("BATCH_MATMUL", [builder.value(r) for r in node.inputs[:2]], adj_x=turned[0], adj_y=turned[1])
+    if len(node.inputs) > 2:
+        return _activated(node, builder, "ADD", [value, builder.value(node.inputs[2])])
+    return value
+
+
+def _activated(node: Node, builder: LitertBuilder, op: str, values: Sequence[Value], **options: Any) -> Value:
+    """An operator and the activations that the fused op carries."""
+    names = list(node.attrs.get("fused_ops", ())[1:])
+    first = _APPLIED[names.pop(0)] if names and names[0] in _APPLIED else ""
+    value = builder.emit(op, values, activation=first, **options)
+    for name in names:
+        value = builder.emit({**_APPLIED, **_BEHIND}[name], [value])
+    return value
+
+
+def _kernel(node: Node, builder: LitertBuilder) -> np.ndarray:
+    kernel = builder.type_of(node.inputs[1]).constant
+    if kernel is None:
+        raise refused(node, "its kernel is computed while the graph runs")
+    return kernel
+
+
+def _windows(node: Node) -> dict[str, Any]:
+    strides, (down, across) = node.attrs["strides"], node.attrs.get("dilations", (1, 1, 1, 1))[1:3]
+    found = {"padding": node.attrs["padding"], "stride_h": int(strides[1]), "stride_w": int(strides[2])}
+    return {**found, "dilation_h_factor": int(down), "dilation_w_factor": int(across)}
+
+
+def _convolved(
+    node: Node, builder: LitertBuilder, op: str, weights: np.ndarray, axes: Sequence[int] = (), **options: Any
+) -> Value:
+    """Its operator asks for a bias: a policy's layer without one is given zeros."""
+    if len(node.inputs) > 2:
+        bias = builder.value(node.inputs[2])
+    else:
+        bias = builder.const(np.zeros(weights.shape[0] if op == "CONV_2D" else weights.shape[-1], weights.dtype))
+    kernel = builder.const(weights, node.inputs[1] if axes else "", axes)
+    values = [builder.value(node.inputs[0]), kernel, bias]
+    return _activated(node, builder, op, values, **_windows(node), **options)
+
+
+def conv2d(node: Node, builder: LitertBuilder) -> Value:
+    """CONV_2D, whose kernel begins with the results' axis."""
+    return _convolved(node, builder, "CONV_2D", _kernel(node, builder).transpose(_FIRST), _FIRST)
+
+
+def depthwise(node: Node, builder: LitertBuilder) -> Value:
+    """DEPTHWISE_CONV_2D."""
+    kernel = _kernel(node, builder)
+    weights = kernel.reshape(1, *kernel.shape[:2], -1)
+    return _convolved(node, builder, "DEPTHWISE_CONV_2D", weights, depth_multiplier=kernel.shape[3])
+
+
+def pool(op: str) -> Litert:
+    """A pooling operator."""
+
+    def lower(node: Node, builder: LitertBuilder) -> Value:
+        height, width = node.attrs["ksize"][1:3]
+        options = {k: v for k, v in _windows(node).items() if not k.startswith("dilation")}
+        return builder.emit(
+            op, [builder.value(node.inputs[0])], filter_height=int(height), filter_width=int(width), **options
+        )
+
+    return lower
+
+
+def pad(node: Node, builder: LitertBuilder) -> Value:
+    """PAD with zeros, PADV2 with a number."""
+    values = [builder.value(node.inputs[0]), as_int32(builder, node.inputs[1])]
+    if len(node.inputs) > 2:
+        return builder.emit("PADV2", [*values, builder.value(node.inputs[2])])
+    return builder.emit("PAD", values)

@@ -1,0 +1,224 @@
+"""Policies as .tflite files in LiteRT, with XNNPACK and without: they act as their sources do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.files.children.process import RunFailedError
+from converters.formats.format import WriteOptions
+from converters.formats.litert.artifact import vetted
+from converters.formats.litert.flatbuffer import decoded, encoded
+from converters.formats.litert.schema import BUILTINS
+from converters.formats.registry import WRITTEN
+from converters.graph.nodes import Node
+from converters.graph.ops.table import TABLE
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import available_runtimes
+from exporter.api import verify_bundle
+from exporter.compare.comparison import compare_artefacts
+from exporter.export.pipeline import ExportOptions, ExportResult, export
+from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
+from exporter.verify.options import VerifyOptions
+from fixtures import FIXTURES, path
+from signatures.contract import parse
+from signatures.errors import UnsupportedOpError
+from tests import known
+from tests.conftest import Chosen
+from tests.graph.harness import policy_of
+from tests.graph.making import const, graph, node, placeholder
+
+LITERT = ("litert", "litert-plain")
+pytestmark = pytest.mark.xdist_group("litert")
+
+#: What TensorFlow 2.21's converter makes of our SavedModels with both signatures, in bytes (measured 2026-11-23).
+THEIR_SIZES = {"continuous": 51_344, "discrete": 39_772, "recurrent": 36_824, "visual": 86_696}
+
+
+@pytest.fixture(scope="module")
+def here(processes: RuntimePool) -> RuntimePool:
+    missing = [i for i in available_runtimes() if i.name in LITERT and not i.installed]
+    if missing:
+        pytest.skip(f"{missing[0].name} is not installed: {missing[0].how}")
+    return processes
+
+
+def exported(source: Path, folder: Path, pool: RuntimePool, *targets: str) -> list[ExportResult]:
+    options = ExportOptions(folder, targets=("litert", *targets), verify=(*LITERT, "onnxruntime"))
+    return list(export([source], options, pool=pool))
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_fixtures_agree_under_both_signatures(name: str, tmp_path: Path, here: RuntimePool) -> None:
+    for result in exported(path(name), tmp_path, here, "onnx"):
+        report = result.report
+        assert report is not None
+        assert report.passed is True, "\n".join(failure_lines(report))
+        ran = {(c.format, c.runtime) for c in report.comparisons}
+        assert ran >= {("litert", runtime) for runtime in LITERT}
+        assert ran >= {("litert:deterministic", runtime) for runtime in LITERT}
+        assert {p.name for p in result.folder.iterdir()} >= {f"{result.policy.name}.tflite", "policy.json"}
+
+
+@pytest.mark.parametrize("name", THEIR_SIZES)
+def test_files_are_no_larger_than_those_of_tensorflow_s_converter(name: str) -> None:
+    (policy,) = read_source(path(name)).policies()
+    artefact = WRITTEN["litert"].artifact(policy, WriteOptions(json.dumps(policy.signature.to_dict())))
+    assert artefact.size <= THEIR_SIZES[name]
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("source", known.params(known.sources()))
+def test_every_policy_that_is_written_as_onnx_acts_alike(
+    source: Path, tmp_path: Path, here: RuntimePool, is_new: Chosen
+) -> None:
+    """All 449 were written and agreed on 23 November 2026; here those run that have something that none before had."""
+    policies = known.policies_or_skip(source)
+    for policy in policies:
+        WRITTEN["litert"].artifact(policy, WriteOptions("{}"))
+    if not is_new("litert", policies):  # type: ignore[call-arg, arg-type]
+        return
+    parity = VerifyOptions(seed=3)
+    for result in export([source], ExportOptions(tmp_path, ("litert",), verify=LITERT, parity=parity), pool=here):
+        assert result.report is not None
+        assert result.report.passed is True, "\n".join(failure_lines(result.report))
+
+
+# ------------------------------------------------------------------ what stands in a file
+
+
+def test_a_file_tells_its_contract_and_both_signatures(tmp_path: Path) -> None:
+    (result,) = export([path("continuous")], ExportOptions(tmp_path, ("litert",), verify="none"))
+    file = result.folder / "continuous.tflite"
+    held = WRITTEN["litert"].held
+    assert held is not None
+    assert parse(json.loads(held(file) or "")).signature == result.policy.signature
+    model = decoded(file.read_bytes())
+    names = {s["signature_key"]: [e["name"] for e in s["inputs"]] for s in model["signature_defs"]}
+    assert names == {"serving_default": ["state", "epsilon"], "deterministic": ["state"]}
+    ports = WRITTEN["litert"].ports
+    assert ports is not None
+    found = ports(file)
+    assert [(p.name, p.dtype, p.shape) for p in found.inputs] == [
+        ("state", "float32", (None, 8)),
+        ("epsilon", "float32", (None, 2)),
+    ]
+    assert "action" in [p.name for p in found.outputs]
+
+
+def test_there_is_one_buffer_for_a_constant_and_no_operator_that_a_fused_one_does() -> None:
+    weights, bias = np.ones((8, 8), np.float32), np.ones(8, np.float32)
+    layers = [placeholder("x", (None, 8)), const("w", weights), const("b", bias)]
+    last = "x"
+    for i in range(3):
+        layers += [node(f"m{i}", "MatMul", last, "w"), node(f"a{i}", "BiasAdd", f"m{i}", "b")]
+        layers.append(node(f"r{i}", "Relu", f"a{i}"))
+        last = f"r{i}"
+    (data,) = WRITTEN["litert"].artifact(policy_of(graph(*layers), [last]), WriteOptions("{}")).files.values()
+    model = decoded(data.joined())
+    (subgraph,) = model["subgraphs"]
+    # the last is the copy that gives the output its name
+    names = [model["operator_codes"][o.get("opcode_index", 0)]["builtin_code"] for o in subgraph["operators"]]
+    assert names[:3] == [BUILTINS["FULLY_CONNECTED"].code] * 3
+    assert [o["builtin_options"]["activation"] for o in subgraph["operators"][:3]] == [1, 1, 1]
+    assert sorted(len(b["data"]) for b in model["buffers"][1:])[-2:] == [32, 256]
+
+
+def test_signatures_of_the_same_tensors_share_a_function() -> None:
+    (policy,) = read_source(path("recurrent")).policies()
+    (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
+    model = decoded(data.joined())
+    assert len(model["signature_defs"]) == 2
+    assert len(model["subgraphs"]) == 1
+
+
+def test_outputs_that_are_inputs_constants_or_one_another_are_copies(here: RuntimePool, tmp_path: Path) -> None:
+    made = graph(placeholder("x", (None, 3)), const("c", np.ones((1, 3), np.float32)), node("y", "Tanh", "x"))
+    artefact = WRITTEN["litert"].artifact(policy_of(made, ["x", "c", "y", "y"]), WriteOptions("{}"))
+    artefact.write(tmp_path)
+    x = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
+    for runtime in LITERT:
+        with here.process(runtime).load(str(tmp_path / artefact.main), kind="litert") as model:
+            got = model.run({"x": x}, ["y0", "y1", "y2", "y3"])
+        assert np.array_equal(got["y0"], x)
+        assert np.array_equal(got["y1"], [[1, 1, 1]])
+        np.testing.assert_allclose(got["y2"], np.tanh(x), rtol=1e-5)
+        assert np.array_equal(got["y2"], got["y3"])
+
+
+# ------------------------------------------------------------------ refused by name
+
+
+def test_what_litert_has_no_operator_for_is_refused_by_its_name() -> None:
+    lacking = sorted(op.name for op in TABLE.values() if op.kernel is not None and op.litert is None and not op.older)
+    assert lacking == ["Const", "Rank", "TruncatedNormal"]
+    drawn = Node("draw", "TruncatedNormal", ("size",), {"dtype": np.dtype(np.float32), "seed": 0, "seed2": 0})
+    made = graph(placeholder("x", (None, 3)), node("size", "Shape", "x", out_type=np.dtype(np.int32)), drawn)
+    with pytest.raises(UnsupportedOpError, match=r"node 'draw' \(TruncatedNormal\) is not written to \.tflite"):
+        WRITTEN["litert"].artifact(policy_of(made, ["draw"]), WriteOptions("{}"))
+
+
+def test_a_dtype_that_an_operator_lacks_is_refused_with_its_name() -> None:
+    kind = np.dtype(np.int64)
+    made = graph(placeholder("x", (None, 3), kind), const("c", np.ones(3, np.int64)), node("y", "RealDiv", "x", "c"))
+    with pytest.raises(UnsupportedOpError) as caught:
+        WRITTEN["litert"].artifact(policy_of(made, ["y"]), WriteOptions("{}"))
+    assert "its DIV does not take int64" in str(caught.value)
+
+
+# ------------------------------------------------------------------ bundles, files of others
+
+
+def test_a_bundle_is_verified_again_and_a_changed_weight_is_found(here: RuntimePool, tmp_path: Path) -> None:
+    (result,) = exported(path("continuous"), tmp_path, here, "bytes")
+    assert verify_bundle(result.folder, runtimes=list(LITERT)).passed
+    file = result.folder / "continuous.tflite"
+    model = decoded(file.read_bytes())
+    weights = max(model["buffers"], key=lambda b: len(b.get("data", b"")))
+    array = np.frombuffer(bytes(weights["data"]), np.float32).copy()
+    array[7] += 0.5
+    weights["data"] = array
+    data = encoded(model).joined()
+    report = compare_artefacts(path("continuous"), _file(tmp_path / "theirs.tflite", data), runtimes=list(LITERT))
+    assert not report.passed
+    assert any("kernel" in str(f.bisection) for f in report.failures if f.bisection is not None)
+
+
+def _file(place: Path, data: bytes) -> Path:
+    place.write_bytes(data)
+    return place
+
+
+def test_a_stranger_s_operator_is_not_handed_to_the_runtime(tmp_path: Path) -> None:
+    (policy,) = read_source(path("continuous")).policies()
+    (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
+    model = decoded(data.joined())
+    custom = {"builtin_code": 32, "deprecated_builtin_code": 32, "custom_code": "FlexReadFile"}
+    for code, name in ((custom, "FlexReadFile"), ({"builtin_code": 129}, "operator 129")):
+        changed = {**model, "operator_codes": [*model["operator_codes"], code]}
+        file = _file(tmp_path / "theirs.tflite", encoded(changed).joined())
+        with pytest.raises(UnsupportedOpError, match=name):
+            vetted(file, [], tmp_path)
+
+
+def test_a_file_without_signatures_is_called_by_its_tensors(here: RuntimePool, tmp_path: Path) -> None:
+    """As ``tf.lite`` of 2019 wrote them."""
+    made = graph(placeholder("x", (None, 3)), node("y", "Tanh", "x"))
+    (data,) = WRITTEN["litert"].artifact(policy_of(made, ["y"]), WriteOptions("{}")).files.values()
+    model = decoded(data.joined())
+    del model["signature_defs"]
+    file = _file(tmp_path / "old.tflite", encoded(model).joined())
+    ports = WRITTEN["litert"].ports
+    assert ports is not None
+    found = ports(file)
+    x = np.ones((2, 3), np.float32)
+    with here.process("litert").load(str(file), **found.options) as loaded:
+        (name,) = [p.name for p in found.outputs]
+        np.testing.assert_allclose(loaded.run({"x": x}, [name])[name], np.tanh(x), rtol=1e-6)
+        with pytest.raises(RunFailedError, match="nothing"):
+            loaded.run({"x": x}, ["nothing"])
