@@ -17,7 +17,7 @@ from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
-from fixtures.sb3_zip import FOLDER, ROWS, WHOLE
+from fixtures.sb3_zip import FOLDER, ROWS, WHOLE, weight
 from fixtures.torch_checkpoint.cases import waves
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UsageError
 from tests.torch_checkpoint.pt_files import Writer, zipped
@@ -35,7 +35,7 @@ def saved(name: str, folder: Path) -> Path:
     writer = Writer()
     state = {}
     for key, entry in about["tensors"].items():
-        state[key] = waves(entry["waves"], entry["shape"]) * np.float32(0.3 if key.endswith("log_std") else 1)
+        state[key] = weight(key, waves(entry["waves"], entry["shape"]))
     path = folder / f"{name}.zip"
     path.write_bytes(
         zipped({"data": json.dumps(about["data"]).encode(), "policy.pth": writer.zip(writer.state(state))})
@@ -165,6 +165,21 @@ def test_weights_that_no_layer_reads_are_refused(tmp_path: Path) -> None:
 def test_data_that_does_not_fit_is_an_error_and_no_traceback(data: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(ExportModelError):
         compiled(changed(tmp_path, "a2c_discrete", **data))
+
+
+@pytest.mark.parametrize(
+    ("state", "kwargs", "said"),
+    [
+        ({"actor.latent_pi.7.weight": np.ones((6, 6), np.float32)}, {}, "by turns are expected"),
+        ({"actor.latent_pi.3.scale": np.ones(5, np.float32)}, {}, r"\[5\], and \[8\] fits"),
+        ({}, {"batch_norm_eps": "much"}, "batch_norm_eps must be a number"),
+    ],
+)
+def test_other_renormalised_layers_are_refused(
+    state: dict[str, Any], kwargs: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match=said):
+        compiled(changed(tmp_path, "crossq_box", state, policy_kwargs={"net_arch": [8, 6], **kwargs}))
 
 
 def test_a_bomb_is_refused_before_it_unfolds_and_nothing_in_a_pickle_is_run(tmp_path: Path) -> None:

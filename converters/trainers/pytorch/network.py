@@ -54,13 +54,13 @@ class Network(Builder):
 
     # ------------------------------------------------------------------ layers
 
-    def linear(self, x: str, module: str, out: int | None = None) -> str:
+    def linear(self, x: str, module: str, out: int | None = None, *, biased: bool = True) -> str:
         """``nn.Linear``: x·Wᵀ + b over the last axis."""
         self.at(module)
         weight = self.state.array(f"{module}.weight", out, self.width(x))
-        bias = self.state.array(f"{module}.bias", len(weight))
+        bias = self.state.array(f"{module}.bias", len(weight)) if biased else None
         product = matmul(self, x, self.const(weight.T, "kernel"))
-        return self.add("BiasAdd", [product, self.const(bias, "bias")])
+        return product if bias is None else self.add("BiasAdd", [product, self.const(bias, "bias")])
 
     def normalised(self, x: str, module: str) -> str:
         """``Normalizer``: clamp((x − mean) / sqrt(variance / steps), −5, 5)."""
@@ -80,7 +80,7 @@ class Network(Builder):
         x, after = self.recurrent(x, self.reshape(memory, (-1, 2 * hidden)), module)
         return x, self.reshape(after, (-1, 1, 2 * hidden))
 
-    def mlp(self, x: str, module: str, activation: Activation, *, ends: bool = False) -> str:
+    def mlp(self, x: str, module: str, activation: Activation, *, ends: bool = False, biased: bool = True) -> str:
         """``nn.Sequential`` of linear layers with an activation after each, not after the last where it ``ends``.
 
         Raises SourceError where something else that has weights stands between them.
@@ -92,7 +92,7 @@ class Network(Builder):
                 "a linear layer and an activation by turns are expected",
             )
         for index in found:
-            x = self.linear(x, f"{module}.{index}")
+            x = self.linear(x, f"{module}.{index}", biased=biased)
             if index != found[-1] or not ends:
                 x = activation(self, x)
         return x
@@ -186,9 +186,10 @@ class Network(Builder):
         origin = f"{module}/RandomStandardNormal"
         return self.add("RandomStandardNormal", [shape], origin=origin, dtype=FLOAT32)
 
-    def highest(self, values: str) -> None:
-        """The outputs of a network of values per action: ``q_values``, and as ``action`` the one of the highest."""
-        self.output("q_values", values)
+    def highest(self, values: str, name: str | None = "q_values") -> None:
+        """The outputs of a network of values per action: these by their name, and as ``action`` the highest's."""
+        if name is not None:
+            self.output(name, values)
         self.at("action")
         best = self.add("ArgMax", [values, self.ints(1, "axis")], output_type=INT64)
         self.output("action", self.reshape(best, (-1, 1)))

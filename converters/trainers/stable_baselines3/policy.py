@@ -1,7 +1,7 @@
 """A policy of Stable-Baselines3 as a graph: what ``predict`` computes of an observation.
 
 Source: stable_baselines3/common/{policies,torch_layers,distributions,preprocessing}.py, {dqn,sac,td3}/policies.py, and
-sb3_contrib/common/{maskable,recurrent}/policies.py, {qrdqn,tqc}/policies.py. The class tells the family,
+sb3_contrib/common/{maskable,recurrent}/policies.py, {qrdqn,tqc,crossq,ars}/policies.py. The class tells the family,
 ``policy_kwargs`` what differs from its defaults (which no version changed), the weights everything else.
 """
 
@@ -22,6 +22,7 @@ from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.activations import named, told
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights, pytorch_alone
+from converters.trainers.stable_baselines3.layers import renormalised_mlp
 from converters.trainers.stable_baselines3.spaces import Space, space_of
 from signatures.errors import DamagedFileError, SourceError, UsageError
 from signatures.records import dataclass
@@ -124,7 +125,7 @@ def _family(data: Mapping[str, Any]) -> _Family:
         raise SourceError(
             "its policy is none that is built here",
             why=f"{said}; what a class of one's own computes is not in the file. Policies of PPO, A2C, TRPO, SAC, TD3, "
-            "DDPG, DQN, and of sb3-contrib's MaskablePPO, RecurrentPPO, QRDQN, TQC are",
+            "DDPG, DQN, and of sb3-contrib's MaskablePPO, RecurrentPPO, QRDQN, TQC, CrossQ, ARS are",
             fix=_EXPORT_ONNX,
         )
     return found
@@ -138,6 +139,17 @@ def _on_policy(data: Mapping[str, Any]) -> str:
 def _flag(kwargs: Mapping[str, Any], name: str, *, default: bool = False) -> bool:
     """A truth value, which may stand as text beside values that JSON lacks."""
     return str(kwargs.get(name, default)) == "True"
+
+
+def _number(kwargs: Mapping[str, Any], name: str, default: float) -> float:
+    """A number of ``policy_kwargs``. Raises DamagedFileError."""
+    text = str(kwargs.get(name, default))
+    try:
+        return float(text)
+    except ValueError as error:
+        raise DamagedFileError(
+            f"{name} must be a number", why=f"its policy_kwargs have {text[:40]!r}", fix="save the model again"
+        ) from error
 
 
 def _activation(kwargs: Mapping[str, Any], family: _Family, wanted: str | None) -> Activation:
@@ -252,15 +264,17 @@ def _actor_critic(made: _Built, observed: Observed) -> None:
 
 
 def _gaussian_actor(made: _Built, observed: Observed) -> None:
-    """``Actor`` of SAC and TQC: a mean and a deviation that depends on the observation, squashed by tanh."""
+    """``Actor`` of SAC, TQC and CrossQ: a mean and a deviation that depends on the observation, squashed by tanh."""
     net = made.net
-    x = net.mlp(_features(made, observed, "actor.features_extractor"), "actor.latent_pi", made.activation)
+    epsilon = _number(made.kwargs, "batch_norm_eps", 1e-3)
+    x = _features(made, observed, "actor.features_extractor")
+    x = renormalised_mlp(net, x, "actor.latent_pi", made.activation, epsilon)
     if "actor.log_std.weight" in net.state:
         mean = net.linear(x, "actor.mu")
         logarithm = clip(net, net.linear(x, "actor.log_std", net.width(mean)), -20, 2)
         _continuous(made, mean, net.add("Exp", [logarithm]))
         return
-    limit = float(str(made.kwargs.get("clip_mean", 2.0)))
+    limit = _number(made.kwargs, "clip_mean", 2.0)
     mean = net.linear(x, "actor.mu.0" if "actor.mu.0.weight" in net.state else "actor.mu")
     mean = clip(net, mean, -limit, limit) if limit > 0 else mean
     _continuous(made, mean, _state_dependent(made, x, "actor.log_std", net.width(mean)))
@@ -270,6 +284,22 @@ def _actor(made: _Built, observed: Observed) -> None:
     """``Actor`` of TD3 and DDPG: tanh of a mean; what they add to explore belongs to training."""
     x = _features(made, observed, "actor.features_extractor")
     _continuous(made, made.net.mlp(x, "actor.mu", made.activation, ends=True), None)
+
+
+def _searched(made: _Built, observed: Observed) -> None:
+    """``ARSPolicy``, and ``ARSLinearPolicy``, whose default is neither to squash nor to have hidden layers."""
+    net = made.net
+    x = _features(made, observed, "features_extractor")
+    linear = len(net.state.indices("action_net.")) == 1 and "net_arch" not in made.kwargs
+    out = net.mlp(x, "action_net", made.activation, ends=True, biased="action_net.0.bias" in net.state)
+    if made.actions.kind == "Discrete":
+        if net.width(out) != made.actions.size:
+            raise _mixed(f"its network has {net.width(out)} logits, and its space {made.actions.size} actions")
+        net.highest(out, None)
+        made.outputs["action"] = Role.ACTION
+        return
+    made.squashed = _flag(made.kwargs, "squash_output", default=not linear)
+    _continuous(made, out, None)
 
 
 def _values(made: _Built, observed: Observed) -> None:
@@ -400,6 +430,8 @@ _FAMILIES = {
     "sb3_contrib.common.recurrent.policies": _Family("RecurrentPPO", "Tanh", _actor_critic),
     "stable_baselines3.sac.policies": _Family("SAC", "ReLU", _gaussian_actor, True),
     "sb3_contrib.tqc.policies": _Family("TQC", "ReLU", _gaussian_actor, True),
+    "sb3_contrib.crossq.policies": _Family("CrossQ", "ReLU", _gaussian_actor, True),
+    "sb3_contrib.ars.policies": _Family("ARS", "ReLU", _searched),
     "stable_baselines3.td3.policies": _Family("TD3", "ReLU", _actor, True),
     "stable_baselines3.dqn.policies": _Family("DQN", "ReLU", _values),
     "sb3_contrib.qrdqn.policies": _Family("QRDQN", "ReLU", _quantiles),
