@@ -27,6 +27,9 @@ from converters.formats.read import ports_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from converters.runtimes.registry import RuntimeInfo
+from exporter.compare.fit import misfit
+from exporter.compare.weights import compare_rounded, merge_reports, rounded_to
 from exporter.export.sources import read_source
 from exporter.remote.fetching import nearby
 from exporter.verify.checks.size import check_budget
@@ -148,22 +151,27 @@ def compare_artefacts(
         reference_file = folder / "reference.bytes"
         frozen(policy).write(reference_file)
         copies = [_vetted(m, folder / str(number)) for number, m in enumerate(matched)]
-        tested = PolicyUnderTest(
-            policy.name,
-            policy.signature,
-            policy.graph,
-            {},
-            {m.label: size_of(m.ports.path) for m in matched},
-            reference_file,
-            source,
-            policy.source,
-        )
-
-        def taking_part(numpy_model: LoadedModel, failure: Failure) -> Iterator[Participant]:
-            for candidate, copy in zip(matched, copies, strict=True):
-                yield from _participants(candidate, copy, policy, numpy_model, used, pool, failure)
-
-        report = verify(tested, used, known, pool, options, progress, participants=taking_part)
+        own = rounded_to(reference)
+        kept = [None if (storage := rounded_to(path)) == own else storage for path, *_ in artefacts]
+        reports = []
+        for storage in dict.fromkeys(kept):
+            chosen = [(m, copy) for m, copy, of in zip(matched, copies, kept, strict=True) if of == storage]
+            tested = PolicyUnderTest(
+                policy.name,
+                policy.signature,
+                policy.graph,
+                {},
+                {m.label: size_of(m.ports.path) for m, _ in chosen},
+                reference_file,
+                source,
+                policy.source,
+            )
+            compared = partial(_compared, policy, chosen, used, known, pool, options, progress)
+            if storage is None:
+                reports.append(compared(tested))
+            else:
+                reports.append(compare_rounded(tested, policy, storage, folder, compared, used, pool, options))
+        report = merge_reports(reports)
     notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
     report = replace(report, notes=(*report.notes, *notes))
     if report.passed is None and not report.undecided and not allow_unverified:
@@ -173,6 +181,23 @@ def compare_artefacts(
             fix="export-model runtimes lists the runtimes and how to install each; or --allow-unverified",
         )
     return report
+
+
+def _compared(
+    policy: Policy,
+    candidates: Sequence[tuple[_Candidate, Path]],
+    runtimes: Sequence[str],
+    known: Sequence[RuntimeInfo],
+    pool: RuntimePool,
+    options: VerifyOptions | None,
+    progress: Progress,
+    tested: PolicyUnderTest,
+) -> ParityReport:
+    def taking_part(numpy_model: LoadedModel, failure: Failure) -> Iterator[Participant]:
+        for candidate, copy in candidates:
+            yield from _participants(candidate, copy, policy, numpy_model, runtimes, pool, failure)
+
+    return verify(tested, runtimes, known, pool, options, progress, participants=taking_part)
 
 
 def _reference(
@@ -299,9 +324,9 @@ def _match(
             text = f"there is no input {aliases[spec.name][0]!r}; there are {_names(own.inputs)}"
             problems.append(_Problem(spec.name, text, blocking=True))
     for spec in signature.inputs:
-        misfit = _misfit(spec, inputs[spec.name]) if spec.name in inputs else ""
-        if misfit:
-            problems.append(_Problem(spec.name, misfit, blocking=True))
+        wrong = misfit(spec, inputs[spec.name]) if spec.name in inputs else ""
+        if wrong:
+            problems.append(_Problem(spec.name, wrong, blocking=True))
     constant, left = _constants(own, policy, {p.name for p in inputs.values()})
     if not own.open:
         for port in left:
@@ -313,28 +338,6 @@ def _match(
 
 def _names(ports: Sequence[Port]) -> str:
     return ", ".join(repr(p.name) for p in ports[:12]) or "none"
-
-
-def _misfit(spec: TensorSpec, port: Port) -> str:
-    """Why an input cannot take what the reference takes; empty where it can, as far as the file tells."""
-    kinds = (np.dtype(spec.dtype).kind, None if port.dtype is None else np.dtype(port.dtype).kind)
-    integers = {"i", "u", "b"}
-    if kinds[1] is not None and spec.dtype != port.dtype and not {*kinds} <= integers:
-        return f"the input {port.name!r} is {port.dtype}, the reference's {spec.dtype}"
-    if port.shape is None:
-        return ""
-    same = len(port.shape) == len(spec.shape) and all(
-        a is None or b is None or a == b for a, b in zip(port.shape[1:], spec.shape[1:], strict=True)
-    )
-    if not same:
-        return f"the input {port.name!r} has the shape {_dims(port.shape)}, the reference's {_dims(spec.shape)}"
-    if port.shape and spec.batched and port.shape[0] is not None:
-        return f"the input {port.name!r} takes {port.shape[0]} rows only, the reference any number"
-    return ""
-
-
-def _dims(shape: Sequence[int | None]) -> str:
-    return "[" + ", ".join("?" if n is None else str(n) for n in shape) + "]"
 
 
 def _constants(own: Ports, policy: Policy, taken: set[str]) -> tuple[dict[str, np.ndarray | None], list[Port]]:

@@ -1,0 +1,74 @@
+"""Candidates whose weights were rounded (``--quantize int8``, ``--dtype float16``): held against the reference with its
+weights rounded alike by numbers, and against the reference itself by what they decide, as export and verify do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from converters.compiler.passes.weights import Storage, rounded
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.frozen_graph.writer import frozen
+from converters.policy.policy import Policy
+from converters.runtimes.pool import RuntimePool
+from exporter.export.options import storage_of
+from exporter.verify.checks.decisions import decisions
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import PolicyUnderTest
+from exporter.verify.report import ParityReport
+from signatures.contract import POLICY
+
+
+def rounded_to(path: Path) -> Storage | None:
+    """Return what the weights of a bundle, or of a file in one, were rounded to, as its policy.json says; else None."""
+    folder = next((f for f in (path, *path.absolute().parents[:2]) if (f / POLICY).is_file()), None)
+    if folder is None:
+        return None
+    weights = Bundle.open(folder).contract.tool.get("weights")
+    return storage_of(str(weights)) if weights else None
+
+
+def compare_rounded(
+    tested: PolicyUnderTest,
+    policy: Policy,
+    storage: Storage,
+    folder: Path,
+    run: Callable[[PolicyUnderTest], ParityReport],
+    runtimes: Sequence[str],
+    pool: RuntimePool,
+    options: VerifyOptions | None,
+) -> ParityReport:
+    """Return the report of ``run`` on the policy with its weights rounded, with what rounding changes of its decisions.
+
+    ``folder`` is where the rounded policy is written to.
+    """
+    graph = rounded(tested.graph, storage)
+    reference = folder / f"reference-{storage}.bytes"
+    small = replace(tested, graph=graph, reference=reference, source=None)
+    frozen(replace(policy, graph=graph)).write(reference)
+    report = run(small)
+    found = decisions(tested, small, storage, runtimes, pool, options or VerifyOptions())
+    note = f"weights in {storage}: numbers were compared with the reference's weights rounded alike, decisions with it"
+    return replace(report.with_findings(found), notes=(*report.notes, note), self_consistent=False)
+
+
+def merge_reports(reports: Iterable[ParityReport]) -> ParityReport:
+    """Return one report of several on one policy: failed where one failed, not verified where one decided nothing."""
+    first, *others = reports
+    if not others:
+        return first
+    every = (first, *others)
+    comparisons = tuple({id(c): c for r in every for c in r.comparisons}.values())
+    passed = [r.passed for r in every]
+    verdict = (
+        False if False in passed else None if any(r.undecided for r in every) else True if True in passed else None
+    )
+    return replace(
+        first,
+        passed=verdict,
+        comparisons=comparisons,
+        sizes={key: size for r in every for key, size in r.sizes.items()},
+        notes=tuple(dict.fromkeys(note for r in every for note in r.notes)),
+    )
