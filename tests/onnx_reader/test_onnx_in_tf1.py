@@ -25,6 +25,8 @@ pytestmark = [pytest.mark.legacy, pytest.mark.slow]
 SOURCES = [*(FOLDER / f"{n}.onnx" for n in POLICIES), *sorted(SHARED.glob("corpus/onnx/*.onnx"))]
 #: Log-probabilities of classes that are next to impossible follow from differences of large logits.
 CLOSE = Tolerance(5e-4, 1e-5)
+#: Verification measures what rounding makes there, this does not: SoccerTwos has logits of 36,000 for whole numbers.
+_ROUNDED = (*FAR_CASES, "whole numbers")
 
 
 @pytest.fixture(scope="module", params=VERSIONS)
@@ -40,7 +42,7 @@ def test_runs_there_and_agrees(source: Path, legacy: RuntimeProcess, tmp_path: P
     model = legacy.load(str(path))
     outputs = [s for s in policy.signature.outputs if s.role is not Role.SAMPLED]
     for case in draw_cases(policy.signature):
-        if case.name in FAR_CASES:  # verification measures what rounding makes there, this does not
+        if case.name in _ROUNDED:
             continue
         names = [s.name for s in outputs]
         got, wanted = model.run(case.feeds, names), run_graph(policy.graph, case.feeds, names)
