@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from converters.files.fetch import address_of, read_bytes, shown
+from converters.formats.bundle.bundle import Bundle
 from exporter import __version__
 from exporter.export.labels import read_labels
 from exporter.export.options import ExportOptions
+from exporter.fleet.marks import is_marked, mark, read_key
 from exporter.remote.fetching import version
 from exporter.remote.filesystem import remote
-from signatures.contract import POLICY
+from signatures.contract import POLICY, safe_name
 from signatures.digest import sha256_hex
-from signatures.errors import BundleError, SourceError
+from signatures.errors import BundleError, ExportModelError, SourceError
 
 _NAME = ".exported.jsonl"
 #: size, time of the last change in ns, sha256
@@ -29,7 +31,8 @@ State = str | list[int] | None
 class Ledger:
     """A line per source in a file of the output folder, appended when its bundles are in their places.
 
-    It is no proof, only a reason not to do work again: a line that is not understood says nothing.
+    It is no proof, only a reason not to do work again: a line that is not understood, or that this user did not write
+    (``marks``), says nothing.
     """
 
     def __init__(self, options: ExportOptions, runtimes: Sequence[str]) -> None:
@@ -38,7 +41,7 @@ class Ledger:
         self._key = _key(options, runtimes)
         self._lines: dict[str, Mapping[str, Any]] = {}
         #: what is at an address is not looked at: all is exported
-        self._keeps = address_of(options.out) is None
+        self._mark = read_key() if address_of(options.out) is None else None
         if os.path.lexists(self._path) and (self._path.is_symlink() or not self._path.is_file()):
             raise BundleError(
                 "already exists and is not a file of ours",
@@ -47,7 +50,7 @@ class Ledger:
                 fix="remove it, or choose another folder with -o",
             )
         try:
-            text = read_bytes(self._path, empty=True).decode() if self._keeps and self._path.exists() else ""
+            text = read_bytes(self._path, empty=True).decode() if self._mark and self._path.exists() else ""
         except (SourceError, ValueError):
             text = ""
         for line in text.splitlines():
@@ -62,17 +65,26 @@ class Ledger:
         entry = self._lines.get(_called(source), {})
         try:
             same = (
-                entry.get("options") == self._key
+                self._mark is not None
+                and is_marked(self._mark, entry)
+                and entry.get("options") == self._key
                 and _is_as_it_was(source, entry["seen"], entry["files"])
-                and all(sha256_hex(read_bytes(self._out / n / POLICY)) == h for n, h in entry["policies"].items())
+                and all(self._is_whole(name, written) for name, written in entry["policies"].items())
             )
             return [str(name) for name in entry["policies"]] if same else None
-        except (OSError, LookupError, TypeError, ValueError, AttributeError, SourceError):
+        except (OSError, LookupError, TypeError, ValueError, AttributeError, ExportModelError):
             return None
+
+    def _is_whole(self, name: str, written: str) -> bool:
+        """Whether a bundle is the one that was written, in each of its files. Raises BundleError, SourceError."""
+        if name != safe_name(name) or sha256_hex(read_bytes(self._out / name / POLICY)) != written:
+            return False
+        Bundle.open(self._out / name).verify_hashes()
+        return True
 
     def record(self, source: Path, seen: State, files: Mapping[str, Stamp], policies: Iterable[str]) -> None:
         """Note that a source was exported, as it was before it was read. Raises BundleError."""
-        if not self._keeps:
+        if self._mark is None:
             return
         try:
             hashes = {n: sha256_hex((self._out / n / POLICY).read_bytes()) for n in policies}
@@ -83,6 +95,7 @@ class Ledger:
                 "files": files,
                 "policies": hashes,
             }
+            entry["mark"] = mark(self._mark, entry)
             with self._path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
         except OSError as error:

@@ -15,6 +15,7 @@ import pytest
 from exporter.cli.fleet import _Tally
 from exporter.export.pipeline import Exporter, ExportOptions
 from exporter.fleet.fleet import export_fleet
+from exporter.fleet.marks import mark, read_key
 from exporter.fleet.worker import Outcome
 from fixtures import path as fixture
 from fixtures.trained import run_folder
@@ -77,6 +78,51 @@ def test_what_is_unchanged_is_left_out(sources: list[Path], tmp_path: Path) -> N
     assert not any(o.unchanged for o in run(sources, out, again=True).values())
     other = export_fleet(sources, ExportOptions(out, verify="none", targets=("onnx",)))
     assert not any(o.unchanged for o in other)
+
+
+def test_a_bundle_that_was_changed_is_exported_again(tmp_path: Path) -> None:
+    """Any file of it, not its contract alone."""
+    out = tmp_path / "out"
+    run([fixture("continuous")], out)
+    whole = contents(out)
+    model = out / "continuous" / "continuous.onnx"
+    model.write_bytes(model.read_bytes()[:-1] + b"x")
+    (second,) = run([fixture("continuous")], out).values()
+    assert not second.unchanged
+    assert contents(out) == whole
+
+
+@pytest.mark.parametrize("change", ["another user", "another name", "no mark", "another line"])
+def test_a_line_that_this_user_did_not_write_says_nothing(
+    change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder came with a repository: its ledger says that all is done, and its bundle may be anybody's."""
+    out = tmp_path / "out"
+    run([fixture("continuous")], out)
+    ledger = out / ".exported.jsonl"
+    (entry,) = lines(ledger)
+    if change == "another user":
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    elif change == "another name":
+        ((name, written),) = entry["policies"].items()
+        entry["policies"] = {f"../out/{name}": written}
+        entry["mark"] = mark(read_key() or b"", entry)
+    elif change == "no mark":
+        del entry["mark"]
+    else:
+        entry["verified"] = True
+    ledger.write_text(json.dumps(entry) + "\n")
+    (second,) = run([fixture("continuous")], out).values()
+    assert not second.unchanged
+
+
+def test_without_a_place_for_a_key_all_is_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    for _ in range(2):
+        (outcome,) = run([fixture("continuous")], tmp_path / "out").values()
+        assert outcome.error is None and not outcome.unchanged
+    assert not (tmp_path / "out" / ".exported.jsonl").exists()
 
 
 @pytest.mark.parametrize("step", ["compiled", "written"])
