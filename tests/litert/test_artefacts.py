@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.compiler.passes.weights import Storage
 from converters.files.children.process import RunFailedError
 from converters.formats.format import WriteOptions
 from converters.formats.litert.artifact import vetted
@@ -69,6 +70,20 @@ def test_files_are_no_larger_than_those_of_tensorflow_s_converter(name: str) -> 
     (policy,) = read_source(path(name)).policies()
     artefact = WRITTEN["litert"].artifact(policy, WriteOptions(json.dumps(policy.signature.to_dict())))
     assert artefact.size <= THEIR_SIZES[name]
+
+
+@pytest.mark.parametrize("storage", ["float16", "int8"])
+@pytest.mark.parametrize("name", ["continuous", "discrete", "recurrent", "visual"])
+def test_weights_in_fewer_bytes_compute_what_the_rounded_policy_does(
+    name: str, storage: Storage, tmp_path: Path, here: RuntimePool
+) -> None:
+    """To the usual tolerance, and every weight to the last bit; XNNPACK widens them when it loads the file."""
+    whole = WRITTEN["litert"].artifact(read_source(path(name)).policies()[0], WriteOptions("{}")).size
+    options = ExportOptions(tmp_path, ("litert",), verify=LITERT, weights=storage)
+    (result,) = export([path(name)], options, pool=here)
+    assert result.report is not None
+    assert result.report.passed is True, "\n".join(failure_lines(result.report))
+    assert (result.folder / f"{name}.tflite").stat().st_size < 0.8 * whole
 
 
 @pytest.mark.corpus

@@ -20,6 +20,7 @@ FORMATS = (
         sniff=lambda file: file.head[4:8] == b"TFL3",
         write=_writer.write,
         main="{name}.tflite",
+        narrow=True,
         held=_artifact.held,
         ports=_artifact.ports,
         vetted=_artifact.vetted,

@@ -110,7 +110,8 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     subgraph = model["subgraphs"][signature.get("subgraph_index", 0)]
     tensors = subgraph["tensors"]
     numbers = {t["name"]: i for i, t in enumerate(tensors) if t.get("name")}
-    made = {int(i) for operator in subgraph["operators"] for i in operator["outputs"]}
+    kept = _kept(model, subgraph)
+    made = {int(i) for operator in subgraph["operators"] for i in operator["outputs"]} - kept.keys()
     fed = {entry["name"]: entry.get("tensor_index", 0) for entry in signature["inputs"]}
 
     names = loads(_note(model, TENSORS_KEY) or "")
@@ -123,7 +124,8 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         given = {name: array for name, array in feeds.items() if name in fed}
         wanted = [name for name in fetch if numbers[name] in made]
         values = {n: given[n] for n in fetch if n in given}
-        values |= {n: _constant(model, tensors[numbers[n]]) for n in fetch if n not in values and n not in wanted}
+        others = [n for n in fetch if n not in values and n not in wanted]
+        values |= {n: _constant(model, tensors[kept.get(numbers[n], numbers[n])]) for n in others}
         if wanted:
             more = [{"name": name, "tensor_index": numbers[name]} for name in wanted]
             opened = {**signature, "outputs": more}
@@ -143,6 +145,25 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         yield InnerTensors(view, run)
 
 
+def _kept(model: Table, subgraph: Table) -> dict[int, int]:
+    """Weights that the file keeps in fewer bytes: the tensor that is widened → the one that is kept.
+
+    XNNPACK does so before it runs anything, and does not say what came of it.
+    """
+    code = next((i for i, c in enumerate(model["operator_codes"]) if operator_of(c) == "DEQUANTIZE"), None)
+    return {
+        int(operator["outputs"][0]): int(operator["inputs"][0])
+        for operator in subgraph["operators"]
+        if operator.get("opcode_index", 0) == code
+    }
+
+
 def _constant(model: Table, tensor: Table) -> np.ndarray:
+    """The numbers of a constant, widened where they are kept in fewer bytes."""
     shape = [int(n) for n in tensor.get("shape", ())]
-    return np.frombuffer(_buffer(model, tensor.get("buffer", 0)), _DTYPES[tensor.get("type", 0)]).reshape(shape)
+    array = np.frombuffer(_buffer(model, tensor.get("buffer", 0)), _DTYPES[tensor.get("type", 0)]).reshape(shape)
+    kept = tensor.get("quantization")
+    if kept is not None:
+        sizes = [-1 if axis == kept.get("quantized_dimension", 0) else 1 for axis in range(array.ndim)]
+        return np.asarray(array * np.asarray(kept["scale"], np.float32).reshape(sizes))
+    return array.astype(np.float32) if array.dtype == np.float16 else array

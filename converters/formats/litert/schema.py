@@ -132,6 +132,7 @@ CONCATENATION 2 ConcatenationOptions filub
 CONV_2D 3 Conv2DOptions f
 COS 108 - f
 DEPTHWISE_CONV_2D 4 DepthwiseConv2DOptions f
+DEQUANTIZE 6 - hc h=3 c=5
 DIV 42 DivOptions fi >4=2
 ELU 111 - f
 EQUAL 71 - filb >4=0

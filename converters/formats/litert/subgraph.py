@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.compiler.passes.weights import Storage, compact
 from converters.files.chunks import equal
 from converters.files.external_data import LARGE
 from converters.formats.intermediate_tensors import View
@@ -61,8 +62,8 @@ class Shared:
 class Subgraph:
     """One function of a model (implements converters.graph.ops.litert.base.LitertBuilder)."""
 
-    def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared) -> None:
-        self.graph, self.shared = graph, shared
+    def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared, storage: Storage = "float32") -> None:
+        self.graph, self.shared, self.storage = graph, shared, storage
         self.types = infer_types(graph)
         self.tensors: list[Table] = []
         self.operators: list[Table] = []
@@ -125,16 +126,33 @@ class Subgraph:
 
     def const(self, array: np.ndarray, holds: str = "", axes: Sequence[int] = ()) -> Value:
         """A constant; equal ones are one tensor."""
-        buffer = self.shared.buffer(array)
-        key = (buffer, array.dtype.str, array.shape)
-        if key not in self._constants:
-            self._constants[key] = self._tensor(of_array(array), buffer)
-        value = self._constants[key]
+        found = None if self.storage == "float32" else compact(array, self.storage)
+        value = self._stored(array) if found is None else self._widened(array, *found)
         if holds:
             if "name" not in self.tensors[value]:
                 self.tensors[value]["name"] = self._names.fresh(holds)
             self.turned[holds] = View(self.tensors[value]["name"], tuple(axes))
         return value
+
+    def _stored(self, array: np.ndarray) -> Value:
+        buffer = self.shared.buffer(array)
+        key = (buffer, array.dtype.str, array.shape)
+        if key not in self._constants:
+            self._constants[key] = self._tensor(of_array(array), buffer)
+        return self._constants[key]
+
+    def _widened(self, array: np.ndarray, narrow: np.ndarray, step: np.ndarray | None) -> Value:
+        """A constant that is kept in fewer bytes: float16, or int8 with the length of a step for each channel."""
+        key = (self.shared.buffer(narrow), "" if step is None else str(step.tobytes()), array.shape)
+        if key not in self._constants:
+            small = self._tensor(of_array(narrow), key[0])
+            if step is not None:
+                axis = max(range(step.ndim), key=step.shape.__getitem__)
+                zeros = np.zeros(step.size, np.int64)
+                scales = {"scale": step.reshape(-1), "zero_point": zeros, "quantized_dimension": axis}
+                self.tensors[small]["quantization"] = scales
+            self._constants[key] = self.emit("DEQUANTIZE", [small], TensorType(array.dtype, array.shape))
+        return self._constants[key]
 
     def _tensor(self, kind: TensorType, buffer: int = 0) -> Value:
         if kind.dtype not in TYPES:
