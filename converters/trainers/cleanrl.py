@@ -2,7 +2,7 @@
 
 Source: cleanrl/{ppo,ppo_continuous_action,ppo_atari,ppo_atari_lstm,dqn,dqn_atari,c51,pqn,sac_continuous_action,
 td3_continuous_action,ddpg_continuous_action}.py. What is no weight in them (activations, strides, tanh) follows from
-those scripts; the activation, which people change, must be said.
+those scripts, the activation too, which is said in a note: people change it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
 from signatures.roles import Role
 
-USUAL = "CleanRL's scripts have tanh in PPO, relu in DQN, C51, PQN, SAC, TD3, DDPG and before images"
+USUAL = "CleanRL's scripts have tanh in PPO, relu elsewhere and before images"
 EXPORT_ONNX = "export the policy to ONNX in its own project (torch.onnx.export), and give that"
 #: The logarithm of SAC's deviation lies between these.
 _LOWEST, _HIGHEST = -5.0, 2.0
@@ -35,11 +35,23 @@ _Outputs = dict[str, Role | None]
 
 @dataclass(frozen=True, slots=True)
 class _Script:
-    """A kind of script: the names that tell it, what it is called, and what builds it."""
+    """A kind of script: the names that tell it, what it is called, what builds it, and the activation that the scripts
+    in ``evidence`` have between their layers; empty: no script has these names.
+    """
 
     names: tuple[str, ...]
     algorithm: str
     build: Callable[[_Making], str]
+    activation: str = ""
+    evidence: str = ""
+
+    @property
+    def default(self) -> tuple[str, str] | None:
+        """The activation where neither the user nor a file says it, and the note on it."""
+        if not self.activation:
+            return None
+        said = f"its activation is taken to be {self.activation}, as in CleanRL's {self.evidence}; if it was changed"
+        return self.activation, f"{said} there, say which: --activation NAME"
 
 
 @dataclass
@@ -277,12 +289,33 @@ def _td3(making: _Making) -> str:
     return "the action is squashed by tanh and scaled"
 
 
+#: Scripts of cleanrl/cleanrl, release 1.0 and its main branch; what stands first is looked for first.
 _SCRIPTS = (
-    _Script(("actor_mean.0.", "actor_logstd"), "PPO", _ppo_continuous),
-    _Script(("fc1.", "fc_mean.", "fc_logstd.", "action_scale", "action_bias"), "SAC", _sac),
-    _Script(("fc1.", "fc_mu.", "action_scale", "action_bias"), "TD3 or DDPG", _td3),
-    _Script(("actor.0.", "critic."), "PPO", _ppo_discrete),
+    _Script(("actor_mean.0.", "actor_logstd"), "PPO", _ppo_continuous, "tanh", "ppo_continuous_action.py"),
+    _Script(
+        ("fc1.", "fc_mean.", "fc_logstd.", "action_scale", "action_bias"),
+        "SAC",
+        _sac,
+        "relu",
+        "sac_continuous_action.py",
+    ),
+    _Script(
+        ("fc1.", "fc_mu.", "action_scale", "action_bias"),
+        "TD3 or DDPG",
+        _td3,
+        "relu",
+        "td3_continuous_action.py and ddpg_continuous_action.py",
+    ),
+    _Script(("actor.0.", "critic."), "PPO", _ppo_discrete, "tanh", "ppo.py"),
+    # Three convolutions, Flatten and a layer; a trunk of other layers before one actor is in no script.
+    _Script(
+        ("network.0.", "network.2.", "network.4.", "network.7.", "actor.weight", "critic."),
+        "PPO",
+        _ppo_discrete,
+        "relu",
+        "ppo_atari.py and ppo_atari_lstm.py",
+    ),
     _Script(("actor.weight", "critic."), "PPO", _ppo_discrete),
-    _Script(("network.0.", "atoms"), "C51", _values),
-    _Script(("network.0.",), "DQN or PQN", _values),
+    _Script(("network.0.", "atoms"), "C51", _values, "relu", "c51.py and c51_atari.py"),
+    _Script(("network.0.",), "DQN or PQN", _values, "relu", "dqn.py, dqn_atari.py and pqn.py"),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +75,19 @@ def test_gives_what_the_modules_give(name: str, tmp_path: Path) -> None:
     assert unchecked <= {"deterministic_action"}
 
 
-@pytest.mark.parametrize("name", ["rsl_5_5", "clean_ppo"])
-def test_the_activation_is_asked_for_and_never_guessed(name: str, tmp_path: Path) -> None:
-    path = saved(tmp_path, name)
+def trunk_of_ones_own(folder: Path) -> Path:
+    """Linear layers that an actor and a critic share, which no script of CleanRL has."""
+    layers = {"network.0": (6, 4), "network.2": (6, 6), "actor": (2, 6), "critic": (1, 6)}
+    state = {f"{n}.weight": waves(n, shape) for n, shape in layers.items()}
+    writer = Writer()
+    path = folder / "own.pt"
+    path.write_bytes(writer.zip(writer.state(state | {f"{n}.bias": waves(n, s[:1]) for n, s in layers.items()})))
+    return path
+
+
+@pytest.mark.parametrize("name", ["rsl_5_5", "own"])
+def test_the_activation_is_asked_for_where_no_script_tells_it(name: str, tmp_path: Path) -> None:
+    path = trunk_of_ones_own(tmp_path) if name == "own" else saved(tmp_path, name)
     with pytest.raises(SourceError, match="what stands between the layers") as caught:
         read_source(path)
     assert f"--activation NAME ({'rsl_rl' if name == 'rsl_5_5' else 'CleanRL'}" in str(caught.value)
@@ -86,6 +97,18 @@ def test_the_activation_is_asked_for_and_never_guessed(name: str, tmp_path: Path
         "verify", tmp_path / "out" / name, "--source", path, "--runtimes", "numpy", "--allow-unverified"
     )
     assert again.status == 0, again.err
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in FOLDER.glob("clean_*.npz")))
+def test_the_activation_of_cleanrls_script_is_the_default_and_said(name: str, tmp_path: Path) -> None:
+    """The weights and answers of the fixtures are of the scripts' own classes."""
+    path, told = saved(tmp_path, name), options(name)
+    (given,) = read_source(path, told).policies()
+    (taken,) = read_source(path, replace(told, activation=None)).policies()
+    assert [(n.op, n.inputs) for n in taken.graph.nodes] == [(n.op, n.inputs) for n in given.graph.nodes]
+    (note,) = set(taken.signature.notes) - set(given.signature.notes)
+    assert f"taken to be {told.activation}, as in CleanRL's" in note
+    assert "--activation NAME" in note
 
 
 def test_the_activation_that_isaac_lab_wrote_is_taken(tmp_path: Path) -> None:

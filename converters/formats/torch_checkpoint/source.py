@@ -26,7 +26,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         activation, files, notes = activation_of(given, options.activation, rsl_rl.USUAL)
         graph, facts = rsl_rl.to_graph(archive, layout, activation)
     elif (found := cleanrl.state_of(archive.value)) is not None:
-        activation, files, notes = activation_of(given, options.activation, cleanrl.USUAL)
+        activation, files, notes = activation_of(given, options.activation, cleanrl.USUAL, found[1].default)
         graph, facts = cleanrl.to_graph(archive, *found, activation, options.sensors)
     else:
         state = State(archive)

@@ -2,8 +2,9 @@
 
 Formulas and defaults: torch/nn/modules/activation.py. ``elu`` and ``ELU`` are one. ``lrelu`` and ``crelu`` (CELU) are
 rsl_rl's (rsl_rl/utils/utils.py). No state dictionary has the activation: it is the user's word, or what the trainer
-wrote beside the checkpoint. Isaac Lab writes ``params/agent.yaml`` into a run's folder, where rsl_rl's ``model_<n>.pt``
-lie. Of that file the lines ``key: value`` are read by their indentation; nothing of YAML is needed beyond that.
+wrote beside the checkpoint, or what the one script of a trainer has. Isaac Lab writes ``params/agent.yaml`` into a
+run's folder, where rsl_rl's ``model_<n>.pt`` lie. Of that file the lines ``key: value`` are read by their indentation;
+nothing of YAML is needed beyond that.
 """
 
 from __future__ import annotations
@@ -65,9 +66,10 @@ _OF_POLICY = frozenset(("policy", "actor", "student", "model"))
 
 
 def activation_of(
-    given: Fetched, wanted: str | None, usual: str
+    given: Fetched, wanted: str | None, usual: str, default: tuple[str, str] | None = None
 ) -> tuple[Activation, tuple[Path, ...], tuple[str, ...]]:
-    """(the activation, files that said it, notes). ``wanted`` is what the user names, ``usual`` what trainers have.
+    """(the activation, files that said it, notes). ``wanted`` is what the user names, ``usual`` what trainers have,
+    ``default`` what is taken where nobody says it, with the note on that.
 
     Raises SourceError where nobody says it, UsageError where the user contradicts the file, or names none.
     """
@@ -85,6 +87,9 @@ def activation_of(
         return known[0], (file,), (f"its activation is {word}, as {name} says",)
     if wanted is not None:
         return told(wanted), (), ()
+    if default is not None:
+        name, note = default
+        return told(name), (), (note,)
     raise SourceError(
         "the checkpoint does not tell what stands between the layers of its network",
         why="a state dictionary has weights, and an activation has none",
