@@ -49,6 +49,7 @@ _RANKS = {
     Role.MASKS: (2,),
     Role.PREV_ACTION: (1, 2),
     **dict.fromkeys((Role.VECTOR, Role.ENTITIES, Role.CONTINUOUS, Role.LOG_PROBS, Role.PROBS), tuple(range(1, 33))),
+    Role.Q_VALUES: (2, 3),
 }
 
 

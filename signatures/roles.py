@@ -37,6 +37,8 @@ class Role(StrEnum):
     ACTION = "action"
     ACTION_PROBS = "action_probs"
     VALUE = "value_estimate"
+    #: a value of each action of a discrete policy, [B, actions]: the action is the largest
+    Q_VALUES = "q_values"
     MEMORY_OUT = "memory_out"
     #: the spread of a Gaussian policy whose action is the mean, [B, size]; and its logarithm
     STD = "std"
@@ -61,8 +63,10 @@ INPUT_ROLES = (
 )
 OUTPUT_ROLES = (
     *(Role.ACTION, Role.ACTION_PROBS, Role.VALUE, Role.MEMORY_OUT),
-    *(Role.STD, Role.LOG_STD, Role.LOG_PROB, Role.OTHER),
+    *(Role.Q_VALUES, Role.STD, Role.LOG_STD, Role.LOG_PROB, Role.OTHER),
 )
+#: Roles of outputs that say what is done.
+ACTING = (Role.ACTION, Role.Q_VALUES)
 
 #: Canonical names that are accepted in place of a role on the command line.
 ALIASES = {
@@ -103,6 +107,8 @@ OUTPUT_NAMES = {
     "action_probs": Role.ACTION_PROBS,
     "value_estimate": Role.VALUE,
     "recurrent_out": Role.MEMORY_OUT,
+    # Stable-Baselines3, CleanRL, and what this tool writes of any network that values actions
+    "q_values": Role.Q_VALUES,
     # what this tool writes beside them, so that our own graphs are read back as what they were
     "action_log_probs": Role.LOG_PROBS,
     "deterministic_action": Role.DETERMINISTIC,
@@ -112,6 +118,16 @@ OUTPUT_NAMES = {
     "action_log_std": Role.LOG_STD,
     "action_log_prob": Role.LOG_PROB,
 }
+
+#: What trainers and tutorials call the values of actions (CleanRL, Stable-Baselines3, Keras and TensorFlow.js games) …
+Q_NAMES = re.compile(
+    r"q|qs|q_?val(ue)?s?|q_?outs?|q_?outputs?|outputs?_q|q_?net(work)?|q_?func(tion)?|q_?head|d+qn(_outputs?|_head)?"
+    r"|(state_)?action_?values?|(main|target|online|local|policy|eval)_q|q_(main|target|online|local|policy|eval)"
+)
+#: … and the value of a state, one number a row (CleanRL, rsl_rl, Stable-Baselines3, RLlib).
+STATE_VALUE_NAMES = re.compile(
+    r"v|vf|values?|value_estimate|v_?values?|state_?values?|critic|baseline|value_?(net(work)?|head|func(tion)?|outputs?)"
+)
 
 #: What the action is called: alone, or (hybrid policies, torch exports) by its kind.
 ACTION_NAMES = tuple(name for name, role in OUTPUT_NAMES.items() if role is Role.ACTION)
@@ -144,10 +160,17 @@ CANONICAL = {
     Role.MEMORY_OUT: "recurrent_out",
     Role.ACTION_PROBS: "action_probs",
     Role.VALUE: "value_estimate",
+    Role.Q_VALUES: "q_values",
     Role.STD: "action_std",
     Role.LOG_STD: "action_log_std",
     Role.LOG_PROB: "action_log_prob",
 }
+
+
+def plain_name(name: str) -> str:
+    """A tensor's name without scope, index and number, in small letters: ``net/QValues_1:0`` as q_values."""
+    base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=Q)(?=[A-Z][a-z])", "_", name.rpartition("/")[2].partition(":")[0])
+    return re.sub(r"_\d+$", "", base.lower())
 
 
 def canonical_name(role: Role, number: int, own: str) -> str:

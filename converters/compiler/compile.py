@@ -12,6 +12,7 @@ from converters.compiler.compilation import Compilation, Pass, on_graph, on_inpu
 from converters.compiler.options import MAX_PORTS, CompileOptions
 from converters.compiler.passes import conditions as has
 from converters.compiler.passes.batch_axis import for_any_number, without_agents
+from converters.compiler.passes.best_action import rank_actions
 from converters.compiler.passes.fold import fold
 from converters.compiler.passes.inputs import complete_shapes, set_values, settle_inputs
 from converters.compiler.passes.memories import join_memories
@@ -48,6 +49,7 @@ PASSES = (
     DROP,
     Pass("collapse views", on_tensors(collapse_views), (has.no_identities,), (has.no_identities, has.no_dead_nodes)),
     Pass("cancel transposes", on_tensors(cancel_transposes), (has.constants_folded,), (has.no_dead_nodes,)),
+    Pass("rank actions", rank_actions, (has.no_identities,), (has.no_identities,)),
     Pass("settle mixtures", settle_mixtures, (has.no_identities,), (has.no_identities,)),
     Pass("understand actions", understand_actions, (has.no_identities,), (has.meanings,)),
     Pass("leave out", leave_out_without_rows, (has.meanings,), (has.meanings,)),

@@ -7,7 +7,7 @@ candidates.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import field, replace
 
 import numpy as np
@@ -18,14 +18,17 @@ from converters.policy.memories import looks_like_state
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.records import dataclass
 from signatures.roles import (
+    ACTING,
     ACTION_NAMES,
     CANONICAL,
     CONSTANT_NAMES,
     LISTED_CONSTANTS,
     OUTPUT_NAMES,
     OUTPUT_ROLES,
+    Q_NAMES,
     Constant,
     Role,
+    plain_name,
 )
 
 #: Names that inputs get; an output is called otherwise, since both may be nodes of one graph.
@@ -72,7 +75,8 @@ class Brain:
             return (Head("action", "action"),)
         if {"continuous_actions", "discrete_actions"} <= set(bases):
             return (Head("continuous_actions", "continuous_actions"), Head("discrete_actions", "discrete_actions"))
-        return (Head(bases[0], "action"),)
+        # where there is none, the best of the values of actions becomes it
+        return (Head(bases[0] if bases else "action", "action"),)
 
     @property
     def canonical(self) -> dict[str, str]:
@@ -107,9 +111,14 @@ def find_brains(
         return _chosen(graph, wanted, declared)
     fed = depends_on_input(graph)
     given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
-    if Role.ACTION in given.values():
+    if Role.ACTION not in given.values() and Role.Q_VALUES in given.values():  # an argmax beside the values
+        choices = [n for n in declared or () if n in fed and n not in given and _is_choice(graph, graph[n])]
+        given |= {n: Role.ACTION for n in choices if len(choices) == 1}
+    values = [n for n, role in given.items() if role is Role.Q_VALUES]
+    given |= dict.fromkeys(values[1:], Role.OTHER)
+    if not {*given.values()}.isdisjoint(ACTING):
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
-        scope = _scope_of(graph, [n for n, role in given.items() if role is Role.ACTION])
+        scope = _scope_of(graph, [n for n, role in given.items() if role in ACTING])
         rest = [n for n in declared or () if n in fed and n not in given]
         return (Brain(scope, (*outputs, *_others(outputs, rest)), _constants(graph, scope)),)
     if declared:
@@ -173,6 +182,14 @@ def fed_through(graph: Graph, reference: str) -> str | None:
     return node.name if is_fed(node) else None
 
 
+def _shows_one_of(graph: Graph, name: str, nodes: Collection[str]) -> bool:
+    """Whether a node is one of ``nodes``, or passes one of them on."""
+    node = graph[name]
+    while node.name not in nodes and passes_on(node) and node.inputs:
+        node = graph.producer(node.inputs[0])
+    return node.name in nodes
+
+
 def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None) -> tuple[Brain, ...]:
     outputs: list[tuple[str, Role, str]] = []
     for name, role in wanted.items():
@@ -187,7 +204,20 @@ def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Rol
             roles = ", ".join(OUTPUT_ROLES)
             raise UsageError(f"--output {name}={role}: that is not an output's role", fix=f"one of: {roles}")
         outputs.append((node_name.rsplit("/", 1)[-1], role, normal_ref(name)))
-    if any(role is Role.ACTION for _, role, _ in outputs):
+    values = [reference for _, role, reference in outputs if role is Role.Q_VALUES]
+    if len(values) > 1:
+        raise UsageError(
+            f"--output says that {len(values)} outputs are values of actions: {', '.join(values)}",
+            why="the action is the best of one of them",
+            fix="give the role q_values to that one, and other to the rest",
+        )
+    nodes = {node_of(reference) for _, _, reference in outputs}
+    acted = {n for n, role in (declared or {}).items() if role is Role.ACTION} | {
+        n.name for n in graph.nodes if n.name.rpartition("/")[2] in ACTION_NAMES and not declared
+    }
+    given = {role for _, role, _ in outputs}
+    acted = {n for n in acted if not _shows_one_of(graph, n, nodes)}
+    if Role.ACTION in given or (Role.Q_VALUES in given and not acted):
         scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
         return (Brain(scope, tuple(outputs), _constants(graph, scope)),)
     # Naming one output is enough to say that the rest is where it always is.
@@ -239,6 +269,7 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
             fix="give the frozen graph of the policy, or name its output with --output NAME=action",
         )
     likely = [n for n in sinks if re.search(r"action|policy|^pi$|/pi$", n.name.lower())]
+    likely = likely or [n for n in sinks if Q_NAMES.fullmatch(plain_name(n.name))]
     chosen = sinks if len(sinks) == 1 else likely
     if declared and not chosen:  # where no name says anything: the one output that is a choice
         chosen = [n for n in sinks if _is_choice(graph, n)]

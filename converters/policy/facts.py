@@ -27,6 +27,7 @@ class SourceFacts:
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``notes``: what the user should know of this source.
     - ``labels``: names of observations (by placeholder) and actions, where the source carries them.
+    - ``model_name``, ``loss``: what the model is called, and what it was trained with, where the format says it.
     - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined; None:
       names and shapes tell.
     """
@@ -42,4 +43,6 @@ class SourceFacts:
     rows: int | None = None
     notes: tuple[str, ...] = ()
     labels: Mapping[str, Any] = field(default_factory=dict)
+    model_name: str = ""
+    loss: str = ""
     memories: tuple[SeparateMemory, ...] | None = None

@@ -265,7 +265,7 @@ def _values(making: _Making) -> str:
         rows = net.reshape(net.add("Softmax", [net.reshape(x, (-1, len(atoms)))]), (-1, actions, len(atoms)))
         x = net.reduce("Sum", net.add("Mul", [rows, net.const(atoms, "atoms")]), [2], keep=False)
     net.highest(x)
-    making.outputs.update(action=Role.ACTION, q_values=Role.OTHER)
+    making.outputs.update(action=Role.ACTION, q_values=Role.Q_VALUES)
     return f"the action of the highest of {net.width(x)} values"
 
 

@@ -45,6 +45,7 @@ _MEANING = {
     Role.DETERMINISTIC: "deterministic action",
     Role.ACTION_PROBS: "the trainer's action_probs (its meaning changed from version to version)",
     Role.VALUE: "the critic's value",
+    Role.Q_VALUES: "a value of each action (the action is the largest)",
     Role.MEMORY_OUT: "memory for the next step",
     Role.OTHER: "another output",
 }

@@ -38,12 +38,16 @@ class Original:
             )
         #: draws that the policy makes itself, and the source is given
         self.draws = np.random.default_rng(0)
+        #: the values of actions, as far as the source gives them
+        self.values = next(
+            (s.name for s in signature.outputs if s.role is Role.Q_VALUES and s.name in source.fetches), None
+        )
         #: an action without chance → the action it belongs to
         self.plain = {head.plain.name: head.spec for head in signature.heads if head.plain is not None}
 
     def _derivable(self, spec: TensorSpec) -> bool:
         if spec.name in {h.name for h in self.signature.heads}:
-            return False
+            return self._is_best(spec)
         if spec.role is Role.LOG_PROBS:
             return self._has_logits()
         head = self.plain.get(spec.name)
@@ -53,7 +57,12 @@ class Original:
             return bool(self.signature.branches) and head.name in self.source.fetches
         if head.role is Role.SAMPLED:
             return self._has_logits()
-        return head.name in self.source.fetches
+        return head.name in self.source.fetches or self._is_best(head)
+
+    def _is_best(self, head: TensorSpec) -> bool:
+        """Whether an action that the source lacks is the best of the values that it has."""
+        chosen = head.role is Role.DETERMINISTIC and not head.is_continuous and head.source is None
+        return chosen and self.values is not None
 
     def _has_logits(self) -> bool:
         return bool(self.source.branches) and all(b is not None for b in self.source.branches)
@@ -122,6 +131,8 @@ class Original:
                 continue
             if spec.role is Role.LOG_PROBS:
                 results[spec.name] = np.concatenate([_log_softmax(p) for p in scores], axis=1)
+            elif spec.name not in self.plain and self.values is not None:
+                results[spec.name] = np.argmax(results[self.values], axis=-1).reshape(-1, 1).astype(np.int64)
             else:
                 results[spec.name] = self._deterministic(self.plain[spec.name], feeds, results, scores)
         return results

@@ -30,6 +30,8 @@ from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unkno
 Arrays = dict[str, np.ndarray]
 #: A difference so many times what rounding explained is not explained by looking longer.
 _HOPELESS = 8
+#: Outputs that an argmax is taken of.
+_SCORES = (Role.LOG_PROBS, Role.PROBS, Role.Q_VALUES)
 
 
 class Trial:
@@ -286,7 +288,7 @@ class Trial:
             return np.isnan(expected[name])
         if not self.signature.branches or expected[name].dtype.kind == "f":
             return None
-        scores = next((s.name for s in self.signature.outputs if s.role in (Role.LOG_PROBS, Role.PROBS)), None)
+        scores = next((s.name for s in self.signature.outputs if s.role in _SCORES), None)
         if scores is None or scores not in expected or expected[scores].shape[-1] != sum(self.signature.branches):
             return None
         found = ties(

@@ -262,7 +262,8 @@ def test_a_file_that_nothing_marks_as_a_policy_says_so(tmp_path: Path) -> None:
         {"w": floats(3, 4)},
     )
     assert any("nothing marks this file as a policy" in note for note in compiled(message, tmp_path).signature.notes)
-    marked = model([node("MatMul", ["obs", "w"], "y")], {"obs": (np.float32, ["b", 3])}, ["y"], {"w": floats(3, 4)})
+    nodes = [node("MatMul", ["obs", "w"], "mu")]
+    marked = model(nodes, {"obs": (np.float32, ["b", 3])}, ["mu"], {"w": floats(3, 4)})
     assert compiled(marked, tmp_path).signature.notes == ()
 
 

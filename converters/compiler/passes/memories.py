@@ -17,7 +17,7 @@ from converters.policy.memories import paired_memories
 from signatures.errors import SignatureError
 from signatures.memories import SeparateMemory, SourcePart
 from signatures.records import dataclass
-from signatures.roles import CANONICAL, Role
+from signatures.roles import ACTING, CANONICAL, Role
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,9 @@ def join_memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> 
     joined, taken, given = _rewritten(graph, memories, origins)
     inputs, outputs = {m.input for m in memories}, {m.output for m in memories}
     wanted = {n: r for n, r in options.outputs.items() if normal_ref(n) not in outputs}
-    if Role.ACTION in wanted.values():  # naming the action says that the rest is left out; a memory belongs to it
+    if not {*wanted.values()}.isdisjoint(
+        ACTING
+    ):  # naming the action says that the rest is left out; a memory belongs to it
         wanted[given] = Role.MEMORY_OUT
     declared = {n: r for n, r in facts.outputs.items() if n not in outputs}
     return Joined(

@@ -32,6 +32,7 @@ _OUTPUT_ORDER = (
     LOG_PROBS,
     "action_probs",
     "value_estimate",
+    "q_values",
     "recurrent_out",
 )
 
@@ -98,13 +99,14 @@ def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, s
     brain, facts = compiled.brain, compiled.facts
     bare = [n.removeprefix(brain.scope) for n in compiled.roles]
     constants = {**facts.constants, **brain.constants}
+    family = facts.family or generation(numbers(constants), bare, {n.op for n in compiled.source.nodes})
     signature = PolicySignature(
         inputs=tuple(inputs),
         outputs=tuple(outputs),
-        family=facts.family or generation(numbers(constants), bare, {n.op for n in compiled.source.nodes}),
+        family=family,
         action_space="hybrid" if len(kinds) > 1 else "continuous" if True in kinds else "discrete",
         branches=compiled.branches,
-        algorithm=_algorithm(compiled) if facts.algorithm is None else facts.algorithm or None,
+        algorithm=_algorithm(compiled, family) if facts.algorithm is None else facts.algorithm or None,
         memory=_memory(compiled, inputs, outputs, feeds, notes),
         preprocess={
             s.name: _preprocessing(facts.image_layout, highest_colour(compiled.graph, feeds[s.name]))
@@ -310,13 +312,13 @@ def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[st
 # ------------------------------------------------------------------ facts
 
 
-def _algorithm(compiled: Compilation) -> str | None:
-    """The trainer that writes such a graph, where only one does.
+def _algorithm(compiled: Compilation, family: str) -> str | None:
+    """The trainer of ML-Agents that writes such a graph, where only one does; of others none is guessed.
 
     SAC squashes its sample with tanh and has no critic in the export; PPO clips it (0.4 on) or not (0.1-0.3); cloned
     behaviour has no noise. Discrete graphs of PPO and SAC do not differ.
     """
-    if compiled.facts.family is not None and not compiled.facts.family.startswith("ML-Agents"):
+    if not family.startswith("ML-Agents"):
         return None
     head: Head = compiled.brain.heads[0]
     meaning = compiled.meanings[head.name]

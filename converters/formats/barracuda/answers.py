@@ -46,7 +46,7 @@ def answered(signature: PolicySignature) -> list[str]:
     A drawn class has no place in one of API version 2: ML-Agents draws it from the log-probabilities.
     """
     scored = any(s.role is Role.LOG_PROBS for s in signature.outputs)
-    unanswered = {Role.OTHER, Role.SAMPLED} if scored else {Role.OTHER}
+    unanswered = {Role.OTHER, Role.Q_VALUES} | ({Role.SAMPLED} if scored else set())
     return [s.name for s in signature.outputs if s.role not in unanswered]
 
 

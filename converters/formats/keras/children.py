@@ -27,6 +27,8 @@ class Stored:
     arrays: dict[tuple[str, str], np.ndarray]
     config: str | None = None
     version: str | None = None
+    #: how the model was compiled, as JSON
+    training: str | None = None
 
 
 def stored_in(path: Path) -> Stored:
@@ -48,7 +50,7 @@ def stored_in(path: Path) -> Stored:
         ) from error
     index = json.loads(answer["index"].tobytes())
     arrays = {(layer, name): answer[str(i)] for i, (layer, name) in enumerate(index["arrays"])}
-    return Stored(arrays, index["config"], index["version"])
+    return Stored(arrays, index["config"], index["version"], index["training"])
 
 
 def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:

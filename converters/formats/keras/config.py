@@ -158,3 +158,23 @@ def _code(name: str) -> NotAPolicyError:
         why="Keras would run it when the model is loaded or called, and a model file is untrusted input",
         fix="replace it by layers of Keras; or in the process that trains it: export_model(keras_model=model)",
     )
+
+
+def loss_of(training: Any) -> str:
+    """What the loss of a ``training_config`` or ``compile_config`` is called; "" where there is none, or several.
+
+    ``"mse"``, ``["mse"]``, ``{"q": "mse"}``; Keras 3: ``{"class_name": "Huber", "config": {…}}``, of a function
+    ``{"class_name": "function", "config": "huber"}``.
+    """
+    loss = training.get("loss") if isinstance(training, dict) else None
+    for _ in range(_MAX_DEPTH):
+        if isinstance(loss, str):
+            return loss[:200]
+        if isinstance(loss, dict) and "class_name" in loss:
+            plain = loss["class_name"] == "function" and isinstance(loss.get("config"), str)
+            loss = loss["config"] if plain else loss["class_name"]
+        elif isinstance(loss, dict | list) and len(loss) == 1:
+            (loss,) = loss.values() if isinstance(loss, dict) else loss
+        else:
+            break
+    return ""

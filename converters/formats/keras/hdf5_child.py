@@ -1,8 +1,8 @@
 """The arrays and the configuration of an HDF5 file, read by h5py in a confined process.
 
 ``python -m converters.formats.keras.hdf5_child``. Loads by ``path`` an ``.h5``, or a ``.keras``'s
-``model.weights.h5``; run, it gives JSON as ``index`` ({"config", "version", "arrays": [[layer, name], …]}), and the
-arrays as ``0``, ``1``, ….
+``model.weights.h5``; run, it gives JSON as ``index`` ({"config", "version", "training", "arrays": [[layer, name], …]}),
+and the arrays as ``0``, ``1``, ….
 The HDF5 library has met hostile files before: it has no network here, writes nothing, and can end without harm. What
 lies elsewhere, refers to something, or is larger than the file is refused before it is read.
 """
@@ -49,10 +49,11 @@ class _Weights:
         stream, self.left = _opened(path)
         self.entries = _MAX_ENTRIES
         with h5py.File(stream, "r") as file:
-            config, version = (self._text(file.attrs, key) for key in ("model_config", "keras_version"))
+            said = ("model_config", "keras_version", "training_config")
+            config, version, training = (self._text(file.attrs, key) for key in said)
             root = self._group(file, "model_weights") or file
             arrays = [*(self._listed(root) if "layer_names" in root.attrs else self._found(root, "", 0))]
-        index = {"config": config, "version": version, "arrays": [name for name, _ in arrays]}
+        index = {"config": config, "version": version, "training": training, "arrays": [name for name, _ in arrays]}
         self.tensors = {str(i): array for i, (_, array) in enumerate(arrays)}
         self.tensors["index"] = np.frombuffer(json.dumps(index).encode(), np.uint8)
 

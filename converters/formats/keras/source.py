@@ -16,7 +16,7 @@ from converters.files.fetch import Fetched
 from converters.files.file_probe import json_in
 from converters.formats.frozen_graph.reader import from_graph_def
 from converters.formats.keras.children import frozen_by_tensorflow, stored_in
-from converters.formats.keras.config import config_of, no_configuration, refuse_code, stateful_layer
+from converters.formats.keras.config import config_of, loss_of, no_configuration, refuse_code, stateful_layer
 from converters.formats.keras.model import model_of
 from converters.formats.keras.network import Network, UnknownLayerError
 from converters.formats.keras.weights import Groups, Listed, Weights
@@ -38,14 +38,14 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     RuntimeUnavailableError without h5py; SourceError and its kinds.
     """
     try:
-        config, weights, version = _stored(given)
+        config, weights, version, loss = _stored(given)
     except RuntimeUnavailableError:
         if options.trust_source:
             return [_through_keras(given.path)]
         raise
     stateful = stateful_layer(config)
     try:
-        model = layered((given.path,), config, weights, version)
+        model = layered((given.path,), config, weights, version, loss)
     except UnknownLayerError as error:
         if not options.trust_source:
             fix = "--trust-source (trust_source=True) has Keras itself load it, if you know where it comes from"
@@ -66,8 +66,11 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return [replace(model, facts=replace(model.facts, notes=(*model.facts.notes, note)))]
 
 
-def _stored(given: Fetched) -> tuple[Any, Weights, str]:
-    """(the configuration, the weights, Keras' version) of a file. Raises NotAPolicyError where it names code."""
+def _stored(given: Fetched) -> tuple[Any, Weights, str, str]:
+    """Return the configuration, the weights, Keras' version and the loss of a file.
+
+    Raises NotAPolicyError where it names code.
+    """
     path = given.path
     if given.data.startswith(b"PK"):
         config = config_of(path)
@@ -75,21 +78,27 @@ def _stored(given: Fetched) -> tuple[Any, Weights, str]:
         stored = stored_in(path)
         metadata = config_of(path, "metadata.json")
         version = str(metadata.get("keras_version", "")) if isinstance(metadata, dict) else ""
-        return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version
+        compiled = config.get("compile_config") if isinstance(config, dict) else None
+        return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version, loss_of(compiled)
     stored = stored_in(path)
     if stored.config is None:
         raise no_configuration()
     config = _configuration(stored.config)
     refuse_code(config)
     entries = [(name, array) for (_, name), array in stored.arrays.items()]
-    return config, Listed(entries, [layer for layer, _ in stored.arrays]), stored.version or ""
+    weights = Listed(entries, [layer for layer, _ in stored.arrays])
+    return config, weights, stored.version or "", loss_of(_configuration(stored.training or "null"))
 
 
-def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str) -> SourceModel:
-    """The model of a configuration with its weights. Raises UnknownLayerError, SourceError and its kinds."""
+def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str, loss: str = "") -> SourceModel:
+    """The model of a configuration with its weights; ``loss`` is what it was compiled with.
+
+    Raises UnknownLayerError, SourceError and its kinds.
+    """
     try:
         net = Network(version)
-        signature = net.whole(model_of(config), weights)
+        model = model_of(config)
+        signature = net.whole(model, weights)
         graph, roles = expose(net.graph(), signature)
     except UnknownLayerError as error:
         error.fix = error.fix or "save the model without that layer, or give a SavedModel or an ONNX of it"
@@ -104,15 +113,23 @@ def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str
         outputs=declared(signature),
         memories=net.memories(names) or None,
         notes=tuple(net.notes),
+        model_name=model.name,
+        loss=loss if len(signature.outputs) == 1 else "",
     )
     return SourceModel(graph, files, facts)
 
 
-def of_web_model(files: tuple[Path, ...], topology: Mapping[str, Any], weights: Weights) -> SourceModel:
-    """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``. Raises what ``layered`` raises."""
+def of_web_model(
+    files: tuple[Path, ...], topology: Mapping[str, Any], weights: Weights, training: Any = None
+) -> SourceModel:
+    """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``, ``training`` its ``trainingConfig``.
+
+    Raises what ``layered`` raises.
+    """
     config = topology.get("model_config") or topology
+    loss = loss_of(training) or loss_of(topology.get("training_config"))
     version = str(topology.get("keras_version") or "tfjs-layers")
-    return layered(files, _configuration(config) if isinstance(config, str) else config, weights, version)
+    return layered(files, _configuration(config) if isinstance(config, str) else config, weights, version, loss)
 
 
 def _configuration(text: str) -> Any:

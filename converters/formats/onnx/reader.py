@@ -68,6 +68,8 @@ class OnnxModel:
     alone: bool = False
     #: it is in half precision, and was read as float32
     halves: bool = False
+    #: what the graph is called
+    name: str = ""
 
 
 def read_onnx(given: Fetched) -> OnnxModel:
@@ -106,6 +108,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
         _joint(reading, memories, outputs),
         reading.alone,
         halves,
+        graph.name,
     )
 
 

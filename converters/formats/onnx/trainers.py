@@ -17,15 +17,15 @@ from converters.formats.bundle.embed import facts_of as facts_of_contract
 from converters.formats.onnx.reader import OnnxModel
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
+from converters.policy.action_values import is_q_name
 from converters.policy.brains import depends_on_input
 from converters.policy.facts import SourceFacts
 from converters.policy.generations import SAC_MEAN, torch_generation
 from signatures.contract import EMBEDDED
-from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, Role
+from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, STATE_VALUE_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
 _ACTION = re.compile(r"actions?|act|action_mean|mean_actions?|action_logits|logits|outputs?|mean|mu|pi|policy")
-_VALUE = re.compile(r"values?|value_estimate|critic|vf")
 _SCORES = re.compile(r"(action_)?logits")
 #: What only policies (and critics) call their inputs and outputs.
 _OF_A_POLICY = re.compile(
@@ -54,6 +54,7 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
         rows=rows,
         outputs=dict.fromkeys(model.outputs.values()),
         memories=model.memories or None,
+        model_name=model.name,
     )
     if model.producer.startswith("tf2onnx"):
         facts = _of_tensorflow(model, facts, number)
@@ -166,8 +167,14 @@ def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
         base = _base(node)
         known = OUTPUT_NAMES.get(base)
         roles[node] = known or (Role.ACTION if _ACTION.fullmatch(base) else None)
-        if known is None and _VALUE.fullmatch(base) and _columns(model, name) == 1:
+        if known is None and STATE_VALUE_NAMES.fullmatch(base) and _columns(model, name) == 1:
             roles[node] = Role.VALUE
+        shape = model.shapes.get(node) or ()
+        if roles[node] in (None, Role.Q_VALUES) and is_q_name(node):
+            roles[node] = Role.Q_VALUES if len(shape) == 2 and shape[1] != 1 else None
+    values = [n for n, role in roles.items() if role is Role.Q_VALUES]
+    if len(values) > 1:
+        roles |= dict.fromkeys(values)
     actions = [n for n, role in roles.items() if role is Role.ACTION]
     if len(actions) > 1:  # beside one that is called so, a mean or logits are what it was made of
         called = [[n for n in actions if _base(n) == name] for name in ("action", "actions")]
@@ -175,6 +182,8 @@ def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
         if plain is not None:
             roles |= {n: None for n in actions if n not in plain}
             actions = plain
+    if not actions and len(values) == 1:
+        return roles
     if len(actions) != 1:  # none, or more than one: names and structure decide, or ask
         return dict.fromkeys(roles)
     width = (model.shapes.get(actions[0]) or ())[1:]
@@ -207,7 +216,9 @@ def _positional(model: OnnxModel) -> bool:
     Unnamed outputs are numbers, or what PyTorch calls its inner tensors.
     """
     names = list(model.outputs)
-    said = [n for n in names if _ACTION.fullmatch(n.lower()) or n in OUTPUT_NAMES or _VALUE.fullmatch(n.lower())]
+    said = [
+        n for n in names if _ACTION.fullmatch(n.lower()) or n in OUTPUT_NAMES or STATE_VALUE_NAMES.fullmatch(n.lower())
+    ]
     if said or len(names) not in (2, 3):
         return False
     ranks = [len(model.shapes.get(n) or ()) for n in model.outputs.values()]

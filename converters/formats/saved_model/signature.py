@@ -31,6 +31,7 @@ from converters.graph.nodes import (
 )
 from converters.graph.ops.table import is_fed
 from converters.graph.types import Symbols, TensorType
+from converters.policy.action_values import is_q_name
 from converters.policy.facts import SourceFacts
 from converters.policy.inputs import role_by_name
 from converters.policy.memories import float_rows, paired_memories
@@ -39,8 +40,9 @@ from signatures.dtypes import DATA_TYPES
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.memories import SeparateMemory
 from signatures.records import dataclass
-from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, OUTPUT_NAMES, Role
+from signatures.roles import ACTION_NAMES, CANONICAL, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
+_Q_VALUES = CANONICAL[Role.Q_VALUES]
 #: TensorFlow's names of dtypes that numpy knows by the same.
 _NUMBERS = frozenset(t.dtype.name for t in DATA_TYPES)
 
@@ -260,6 +262,12 @@ def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:
     return role_by_name(key, node)
 
 
+def _has_several_columns(tensor: Tensor) -> bool:
+    """Whether a tensor is floats [B, n], n above 1, as far as the signature says."""
+    dims, dtype = tensor.shape.dims, tensor.dtype
+    return (dtype is None or dtype.kind == "f") and (dims is None or (len(dims) == 2 and dims[1] != 1))
+
+
 def output_names(signature: ModelSignature) -> dict[str, str]:
     """Output's key → the node that stands for it, once it is exposed."""
     names = {keys[0]: action for action, keys in _actions(signature).items() if len(keys) == 1}
@@ -272,9 +280,12 @@ def output_names(signature: ModelSignature) -> dict[str, str]:
             names[key] = key
         elif index == 0 and node.rpartition("/")[2] in OUTPUT_NAMES and node not in names.values():
             names[key] = node
+        elif is_q_name(key) and _has_several_columns(tensor) and _Q_VALUES not in {*names.values(), *signature.outputs}:
+            names[key] = _Q_VALUES
         else:
             left.append(key)
-    if len(left) == 1 and not any(n.rpartition("/")[2] in ACTION_NAMES for n in names.values()):
+    acting = {n.rpartition("/")[2] for n in names.values()} & {*ACTION_NAMES, _Q_VALUES}
+    if len(left) == 1 and not acting:
         names[left[0]] = "action"
     else:
         scope = NameScope(names.values())

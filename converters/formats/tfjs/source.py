@@ -40,7 +40,8 @@ def _layered(content: Mapping[str, Any], given: Fetched) -> SourceModel:
     from converters.formats.keras.weights import Listed
 
     weights, shards = weights_of(content, given)
-    return of_web_model((model_file(given.path), *shards), content["modelTopology"], Listed([*weights.items()]))
+    files, topology = (model_file(given.path), *shards), content["modelTopology"]
+    return of_web_model(files, topology, Listed([*weights.items()]), content.get("trainingConfig"))
 
 
 #: The dtypes that TensorFlow.js has.

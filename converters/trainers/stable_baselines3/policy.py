@@ -420,7 +420,7 @@ def _highest(made: _Built, values: str) -> None:
     if made.actions.kind != "Discrete" or net.width(values) != made.actions.size:
         raise _mixed(f"its network values {net.width(values)} actions, and its space has {made.actions.size}")
     net.highest(values)
-    made.outputs |= {"action": Role.ACTION, "q_values": Role.OTHER}
+    made.outputs |= {"action": Role.ACTION, "q_values": Role.Q_VALUES}
 
 
 #: By the module of the policy's class.

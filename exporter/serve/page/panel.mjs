@@ -134,7 +134,7 @@ export class Panel {
       this.#answers.memory = new Strip("The memory that comes out");
       made.push(h("figure", {}, h("figcaption", {}, "Memory afterwards"), this.#answers.memory.element));
     }
-    this.#answers.others = contract.outputs.slice(1).filter(({ role }) => ["value_estimate", "other"].includes(role));
+    this.#answers.others = contract.outputs.slice(1).filter(({ role }) => ["value_estimate", "q_values", "other"].includes(role));
     this.#answers.list = h("dl", { class: "others" });
     made.push(this.#answers.list);
     return made;
