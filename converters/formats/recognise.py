@@ -83,7 +83,12 @@ REFUSED = (
         advice="Unity's runtime format cannot be read back; give the .onnx it was imported from",
         sniff=lambda file: file.text is None and file.name.lower().endswith(".sentis"),
     ),
-    Format(key="text", label="a text file", advice="give a model file", sniff=lambda file: file.text is not None),
+    Format(
+        key="text",
+        label="a text file",
+        advice="give a model file, or a .txt with the path of one on each line",
+        sniff=lambda file: file.text is not None,
+    ),
 )
 UNKNOWN = Format(
     key="unknown",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 from converters.files.fetch import Fetched, shown, unreadable
@@ -17,6 +19,10 @@ from signatures.errors import SourceError, UsageError
 #: Bytes of a list of paths.
 MAX_LIST = 16 << 20
 _MAGIC = frozenset("*?[")
+#: The format of text that is none of the others, and how much of a file of it is looked at.
+_TEXT, _LINES_LOOKED_AT = "text", 1000
+#: A suffix that begins with a letter, as ``numpy==2.1`` has not.
+_FILE_NAME = re.compile(r"\w\.[A-Za-z]\w{1,15}$")
 #: What a folder holds besides models is passed over, but for what stands there in a model's place.
 _TELLING = ("lfs_pointer",)
 
@@ -28,7 +34,7 @@ def is_many(given: Sequence[Path]) -> bool:
             remote(path) is not None
             or (path.is_dir() and not _is_source(path))
             or (not path.exists() and not _MAGIC.isdisjoint(str(path)))
-            or (path.suffix == ".txt" and path.is_file())
+            or _is_list(path)
             for path in given
         )
     except (OSError, ValueError):  # what cannot be a path: its reader says why
@@ -38,9 +44,9 @@ def is_many(given: Sequence[Path]) -> bool:
 def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
     """The sources that the paths stand for, each once, in their order; those of a pattern or folder by name.
 
-    ``**`` goes through all folders. A ``.txt`` has a path a line, from where the command is called; ``#`` begins a
-    comment. What is at an address is fetched later, one by one. What lies in ``out`` is no source. Raises UsageError
-    where there is none, or a path stands for none.
+    ``**`` goes through all folders. A ``.txt`` whose lines are paths stands for them, from where the command is called;
+    ``#`` begins a comment. What is at an address is fetched later, one by one. What lies in ``out`` is no source.
+    Raises UsageError where there is none, or a path stands for none.
     """
     if not given:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
@@ -65,10 +71,10 @@ def _expanded(path: Path, out: Path) -> Iterator[Path]:
         yield from matching(address) if is_pattern(address) else [path]
     elif path.is_dir():
         yield from _walked(path, out)
-    elif path.suffix == ".txt" and path.is_file():
+    elif _is_list(path):
         for line in _lines(path):
             listed = Path(line)
-            if listed.suffix == ".txt" and listed.is_file():  # one that names itself has no end
+            if _is_list(listed):  # one that names itself has no end
                 raise UsageError(f"{path} names another list", where=line, fix="put its lines in its place")
             yield from _expanded(listed, out)
     elif not path.exists() and not _MAGIC.isdisjoint(str(path)):
@@ -110,6 +116,32 @@ def _found(pattern: Path) -> Iterator[Path]:
                 yield from (Path(folder, *f) for f in ((), *((n,) for n in files if not n.startswith("."))))
     if at == len(parts):
         yield from map(Path, tops)
+
+
+def _is_list(path: Path) -> bool:
+    """Whether a file is a list of sources: text whose lines could be paths, one of which at least is there or ends as a
+    file's name does. Any other ``.txt`` is read by its content, as every file is.
+    """
+    if path.suffix != ".txt" or not path.is_file():
+        return False
+    try:
+        if recognised(Fetched(path)).key != _TEXT:
+            return False
+    except SourceError:  # it cannot be read: its reader says why
+        return False
+    lines = list(islice(_lines(path), _LINES_LOOKED_AT))
+    return not lines or any(map(_stands_for_something, lines)) or all(map(_looks_like_path, lines))
+
+
+def _stands_for_something(line: str) -> bool:
+    try:
+        return remote(Path(line)) is not None or Path(line).exists() or next(_found(Path(line)), None) is not None
+    except (OSError, ValueError):  # what cannot be a path
+        return False
+
+
+def _looks_like_path(line: str) -> bool:
+    return _FILE_NAME.search(line) is not None or bool(re.fullmatch(r"\S*[/\\]\S*", line))
 
 
 def _lines(path: Path) -> Iterator[str]:

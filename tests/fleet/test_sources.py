@@ -72,3 +72,33 @@ def test_what_stands_for_nothing_is_refused(given: str, words: str, place: Path)
     (place / "empty").mkdir()
     with pytest.raises(ExportModelError, match=words):
         sources_in([Path(given)], Path("out"))
+
+
+def test_a_txt_is_a_list_by_its_content(place: Path) -> None:
+    """A model under that name is a model, and prose, requirements or names of classes are no list."""
+    shutil.copy(fixture("continuous"), place / "model.txt")
+    (place / "notes.txt").write_text("We trained it twice.\nThe second run was better, see below.\n")
+    (place / "requirements.txt").write_text("numpy==2.1\ntorch>=2.0\n")
+    (place / "classes.txt").write_text("left\nright\n")
+    (place / "graph.txt").write_text('node {\n  name: "state"\n  op: "Placeholder"\n}\n')
+    for name in ("model.txt", "notes.txt", "requirements.txt", "classes.txt", "graph.txt"):
+        assert not is_many([Path(name)])
+        assert sources_in([Path(name)], Path("out")) == [Path(name)]  # which its reader takes or refuses
+    for text in (
+        f"{FLAT[0]}\nsome words\n",
+        "runs/*\n",
+        "gone.onnx\nruns/gone\n",
+        "https://x.invalid/a.onnx\n",
+        "# none\n",
+    ):
+        (place / "more.txt").write_text(text)
+        assert is_many([Path("more.txt")]), text
+
+
+def test_a_list_may_name_a_model_that_is_called_txt(place: Path) -> None:
+    shutil.copy(fixture("continuous"), place / "model.txt")
+    (place / "more.txt").write_text("model.txt\n")
+    assert sources_in([Path("more.txt")], Path("out")) == [Path("model.txt")]
+    (place / "more.txt").write_text("more.txt\n")
+    with pytest.raises(ExportModelError, match="names another list"):
+        sources_in([Path("more.txt")], Path("out"))
