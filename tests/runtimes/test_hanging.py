@@ -11,7 +11,9 @@ import pytest
 from converters.files.children import process
 from converters.files.children import time_limits as patience
 from converters.files.children.process import RunFailedError, RuntimeProcess
+from converters.formats.keras import children
 from converters.runtimes.pool import RuntimePool
+from signatures.errors import DamagedFileError
 
 _PROGRAM = """
 import sys, time
@@ -64,3 +66,19 @@ def test_a_model_that_answered_before_may_take_its_time(tmp_path: Path, monkeypa
     model.touch()
     with RuntimePool({"slow": lambda: [sys.executable, "-c", _PROGRAM, "run", "1"]}) as pool:
         assert pool.process("slow").load(str(model), answered=True).run({}, []) == {}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system says how long a child has computed")
+@pytest.mark.parametrize("command", ["load", "run"])
+def test_an_h5_that_keeps_its_library_busy_is_refused(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("h5py")
+    monkeypatch.setattr(process, "_LOOK", 0.05)
+    monkeypatch.setattr(patience, "FIRST", 0.2)
+    program = [sys.executable, "-c", _PROGRAM, command, "inf"]
+    monkeypatch.setattr(children, "child_command", lambda module: program)
+    (tmp_path / "policy.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(DamagedFileError) as refused:
+        children.stored_in(tmp_path / "policy.h5")
+    assert "of computing are enough" in (refused.value.why or "")
