@@ -13,6 +13,7 @@ from converters.compiler.options import MAX_PORTS, CompileOptions
 from converters.compiler.passes import conditions as has
 from converters.compiler.passes.batch_axis import for_any_number, without_agents
 from converters.compiler.passes.best_action import rank_actions
+from converters.compiler.passes.doubles import narrow_doubles
 from converters.compiler.passes.fold import fold
 from converters.compiler.passes.inputs import complete_shapes, set_values, settle_inputs
 from converters.compiler.passes.memories import join_memories
@@ -89,6 +90,7 @@ def compile_graph(
 
 def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> list[tuple[str, Compilation]]:
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
+    graph, facts = narrow_doubles(graph, facts)
     options = _by_nodes(graph, options)
     facts = drop_passed_through(graph, options, facts)
     graph, facts = _for_any_number(graph, options, facts)

@@ -56,7 +56,7 @@ class OriginalRun:
             file = folder / "source.pb"
             part = self.definition if self.asked is None else subgraph(self.definition, *self.asked)
             schema.pieces(part, self.detached).write(file)
-            yield str(file), {"kind": "graph"}
+            yield str(file), {"kind": "graph", "source": True}
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,9 @@ from signatures.memories import SeparateMemory
 from signatures.records import dataclass
 from signatures.roles import Constant, Role
 
+#: The note of a source that has float64 numbers.
+DOUBLES_NARROWED = "float64 numbers of the source are computed as float32"
+
 
 @dataclass(frozen=True)
 class SourceFacts:

@@ -252,6 +252,19 @@ def history(folder: Path) -> None:
     )
 
 
+def doubles(folder: Path) -> None:
+    """Observations in float64, as Gym gives them: cast before the first layer, or with weights in float64."""
+    for name, width in (("doubles-cast", tf.float32), ("doubles", tf.float64)):
+        policy = tf.Module()
+        policy.kernel = tf.Variable(tf.cast(draw(4, 2), width))
+        call = tf.function(lambda observation, p=policy, w=width: {"action": tf.cast(observation, w) @ p.kernel})
+        signature = call.get_concrete_function(observation=tf.TensorSpec([None, 4], tf.float64))
+        tf.saved_model.save(policy, folder / name, signatures=signature)
+        observation = draw(3, 4)
+        action = call(tf.constant(observation, tf.float64))["action"]
+        keep(folder, name, {"state": observation}, {"action": tf.cast(action, tf.float32)})
+
+
 class Boxed(CompositeTensor):
     """A tensor whose type TensorFlow cannot load where this class is not."""
 
@@ -326,6 +339,7 @@ def saver(folder: Path) -> None:
 
 def main(folder: Path) -> None:
     history(folder)
+    doubles(folder)
     saver(folder)
     tf2(folder)
     winding(folder)

@@ -11,6 +11,7 @@ import pytest
 
 from converters.formats.checkpoint.tensor_bundle import Checkpoint
 from converters.formats.source import ReadOptions
+from converters.policy.facts import DOUBLES_NARROWED
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
@@ -27,6 +28,8 @@ OF_FUNCTIONS = {
     "exported": "keras",
     "history": "history",
     "saver": "saver",
+    "doubles": "doubles",
+    "doubles-cast": "doubles-cast",
 }
 TRUSTED = ReadOptions(trust_source=True)
 #: Read as data, Keras' own run beside it; and one whose activation Keras alone knows.
@@ -71,6 +74,15 @@ def test_keys_of_ml_agents_on_other_names(models: Path) -> None:
     }
     assert sources(policy)["state"] == "Placeholder"
     assert policy.signature.branches == (3,)
+
+
+@pytest.mark.parametrize("name", ["doubles", "doubles-cast"])
+def test_doubles_are_narrowed_and_said(models: Path, name: str) -> None:
+    """In no tensor that TensorFlow.js would be given, and in the words of the ONNX reader."""
+    (policy,) = read_source(models / name).policies()
+    assert {s.dtype for s in (*policy.signature.inputs, *policy.signature.outputs)} == {"float32"}
+    assert not any(n.value is not None and n.value.dtype == np.float64 for n in policy.graph.nodes)
+    assert [n for n in policy.signature.notes if "float64" in n] == [DOUBLES_NARROWED]
 
 
 def test_a_partitioned_variable_is_joined(models: Path) -> None:

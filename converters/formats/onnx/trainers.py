@@ -19,7 +19,7 @@ from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
 from converters.policy.action_values import is_q_name
 from converters.policy.brains import depends_on_input
-from converters.policy.facts import SourceFacts
+from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from converters.policy.generations import SAC_MEAN, torch_generation
 from signatures.contract import EMBEDDED
 from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, STATE_VALUE_NAMES, Role
@@ -295,5 +295,5 @@ def _common_notes(model: OnnxModel) -> list[str]:
     if model.halves:
         notes.append("the source is in half precision (16 bits); it is read, run and compared as float32")
     if model.doubles:
-        notes.append("float64 numbers of the source are computed as float32")
+        notes.append(DOUBLES_NARROWED)
     return notes

@@ -37,15 +37,20 @@ def main() -> None:
     tf.config.threading.set_inter_op_parallelism_threads(1)
 
     class InSession:
-        """A graph in a Session; feeds and fetches are tensor names, inner ones too."""
+        """A graph in a Session; feeds and fetches are tensor names, inner ones too. The doubles of a ``source`` are
+        given as float32, as which they are exported.
+        """
 
-        def __init__(self, graph: Any) -> None:
+        def __init__(self, graph: Any, *, source: bool = False) -> None:
+            self.source = source
             settings = tf.compat.v1.ConfigProto(allow_soft_placement=True)
             self.session = tf.compat.v1.Session(graph=graph, config=settings)
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
             given = {_tensor(name): self._fitting(_tensor(name), array) for name, array in feeds.items()}
             values = self.session.run([_tensor(n) for n in fetch], given)
+            if self.source:
+                values = [v.astype(np.float32) if v.dtype == np.float64 else v for v in values]
             return dict(zip(fetch, values, strict=True))
 
         def _fitting(self, name: str, array: Any) -> Any:
@@ -62,12 +67,12 @@ def main() -> None:
             tf.import_graph_def(definition, name="")
         return graph
 
-    def frozen(path: str) -> InSession:
-        return InSession(imported(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())))
+    def frozen(path: str, *, source: bool) -> InSession:
+        return InSession(imported(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())), source=source)
 
     def given(path: str, archive: str, names: Sequence[str]) -> InSession:
         """A training graph with values that were read from a session; variables are told by their nodes' names."""
-        model = frozen(path)
+        model = frozen(path, source=True)
         with np.load(archive, allow_pickle=False) as kept:
             values = {name: kept[f"arr_{i}"] for i, name in enumerate(names)}
         graph = model.session.graph
@@ -103,8 +108,9 @@ def main() -> None:
             refuse_code(config_inside(path), built=True)
             return _Frozen(frozen_function(path, "keras"))
         if kind == "function":
-            return InSession(imported(frozen_function(path, header["form"], header.get("signature")).graph_def))
-        return frozen(path)
+            definition = frozen_function(path, header["form"], header.get("signature")).graph_def
+            return InSession(imported(definition), source=True)
+        return frozen(path, source=header.get("source", False))
 
     faults = (tf.errors.OpError, AttributeError, RuntimeError, ImportError, ExportModelError)
     serve("tensorflow", tf.__version__, load, faults, out)
