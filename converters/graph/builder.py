@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, ref, topological
-from converters.graph.ops.base import REQUIRED
+from converters.graph.ops.base import REQUIRED, axis_within
 from converters.graph.ops.table import TABLE, op_of
 from converters.graph.shapes import Types, add_types, outputs_of
 from converters.graph.size_limits import MAX_MADE, Allowance
@@ -214,10 +214,14 @@ class Builder:
 
     def axis(self, reference: str, axis: int) -> int:
         """A possibly negative axis as a positive one; raises UnsupportedOpError."""
-        rank = self.rank(reference)
-        if not -rank <= axis < max(rank, 1):
-            raise UnsupportedOpError(f"axis {axis} is out of range for {rank} axes", why=_DAMAGED)
-        return axis % max(rank, 1)
+        return self.axis_of(axis, max(self.rank(reference), 1))
+
+    def axis_of(self, axis: int, rank: int) -> int:
+        """A possibly negative axis of ``rank`` as a positive one; raises UnsupportedOpError."""
+        try:
+            return axis_within(axis, rank)
+        except IndexError as error:
+            raise UnsupportedOpError(str(error), why=_DAMAGED) from error
 
     def joined(self, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
         """The shape that several broadcast to; raises UnsupportedOpError where they do not."""

@@ -326,5 +326,5 @@ def test_parts_join_to_the_whole(x: Array, data: st.DataObject) -> None:
     parts = function(Node("op", "SplitV"), x, sizes, where)
     assert [p.shape[axis] for p in parts] == sizes.tolist()
     np.testing.assert_array_equal(kernel("ConcatV2", *parts, where), x, strict=True)
-    pieces = TABLE["Unpack"].kernel(Node("op", "Unpack", attrs={"axis": axis}), x)
+    pieces = TABLE["Unpack"].kernel(Node("op", "Unpack", attrs={"axis": axis, "num": x.shape[axis]}), x)
     np.testing.assert_array_equal(kernel("Pack", *pieces, axis=axis), x, strict=True)

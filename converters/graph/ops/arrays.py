@@ -15,6 +15,7 @@ from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
+    axes_within,
     by_shape,
     constant_input,
     direct,
@@ -153,7 +154,7 @@ def _open_length(
 def _squeeze_axes(node: Node, shape: Sequence[Dim]) -> tuple[int, ...]:
     wanted = node.attrs["squeeze_dims"]
     if wanted:
-        return tuple(sorted({int(a) % len(shape) for a in wanted}))
+        return axes_within(wanted, len(shape))
     return tuple(i for i, d in enumerate(shape) if d == 1)
 
 

@@ -7,7 +7,7 @@ GraphDef, how other versions of TensorFlow spell it, and the *traits* that passe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY
 from typing import Any, Literal, Protocol
 
@@ -410,9 +410,24 @@ def _with_axes(builder: OnnxBuilder, onnx_op: str, value: str, axes: Sequence[in
     return builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")])
 
 
+def axis_within(axis: int, rank: int) -> int:
+    """An axis counted from the front. Raises IndexError, one of ``MISFIT``, where ``rank`` axes do not have it.
+
+    Whatever a file says is held to the rank here, before a shape or a list is made of it.
+    """
+    if not -rank <= axis < rank:
+        raise IndexError(f"axis {axis} must be one of {rank} axes, {-rank} to {rank - 1}")
+    return axis % rank
+
+
+def axes_within(axes: Iterable[int], rank: int) -> tuple[int, ...]:
+    """Axes counted from the front, sorted, each once. Raises IndexError, one of ``MISFIT``."""
+    return tuple(sorted({axis_within(int(axis), rank) for axis in axes}))
+
+
 def inserted(shape: Shape, axis: int, length: Dim = 1) -> tuple[Dim, ...] | None:
-    """A shape with one axis more at ``axis``, which may be counted from the end of the result."""
+    """A shape with one axis more at ``axis``, which may be counted from the end of the result. Raises IndexError."""
     if shape is None:
         return None
-    at = axis + len(shape) + 1 if axis < 0 else axis
+    at = axis_within(axis, len(shape) + 1)
     return (*shape[:at], length, *shape[at:])

@@ -21,6 +21,7 @@ from converters.graph.ops.base import (
     inserted,
     not_constant,
     require_constant,
+    shape_error,
     type_attr,
     unsqueezed,
 )
@@ -82,7 +83,9 @@ def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
     if shape is None:
         return [TensorType(args[2].dtype, None)]
     depth, axis = int(require_constant(node, args, 1, "a depth")), int(node.attrs["axis"])
-    return [TensorType(args[2].dtype, inserted(shape, max(axis, -1), depth))]
+    if axis < -1:  # TensorFlow counts none from the end but the last
+        raise shape_error(node, args, f"its axis must be from -1 to {len(shape)}, and is {axis}")
+    return [TensorType(args[2].dtype, inserted(shape, axis, depth))]
 
 
 def _depth(node: Node, args: Sequence[TensorType]) -> int | None:

@@ -16,6 +16,7 @@ from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
+    axis_within,
     constant_input,
     inserted,
     not_constant,
@@ -44,12 +45,12 @@ def _infer_concat(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
         if not known:
             return [TensorType(parts[0].dtype, None)]
         # A part of unknown rank: the others tell all but the joined axis.
-        axis %= len(known[0])
+        axis = axis_within(axis, len(known[0]))
         return [TensorType(parts[0].dtype, (*known[0][:axis], symbols.fresh(), *known[0][axis + 1 :]))]
     rank = len(known[0])
-    if not -rank <= axis < rank or any(len(s) != rank for s in known):
-        raise shape_error(node, args, f"parts of different rank, or axis {axis} out of range")
-    axis %= rank
+    if any(len(s) != rank for s in known):
+        raise shape_error(node, args, "its parts are of different rank")
+    axis = axis_within(axis, rank)
     dims = list(known[0])
     for shape in known[1:]:
         for i, (a, b) in enumerate(zip(dims, shape, strict=True)):
@@ -88,8 +89,10 @@ def _lower_pack(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _unpack(node: Node, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    axis = node.attrs["axis"]
-    return tuple(np.take(x, i, axis=axis) for i in range(x.shape[axis]))
+    axis, count = node.attrs["axis"], node.attrs["num"]
+    if x.shape[axis] != count:
+        raise ValueError(f"axis {axis} has the length {x.shape[axis]}, and {count} pieces are made of it")
+    return tuple(np.take(x, i, axis=axis) for i in range(count))
 
 
 def _pieces(node: Node, args: Sequence[TensorType], attribute: str) -> int:
@@ -104,7 +107,9 @@ def _infer_unpack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> l
     shape, axis, count = args[0].shape, node.attrs["axis"], _pieces(node, args, "num")
     if shape is None:
         return [TensorType(args[0].dtype, None)] * count
-    axis %= len(shape)
+    axis = axis_within(axis, len(shape))
+    if isinstance(shape[axis], int) and shape[axis] != count:
+        raise shape_error(node, args, f"a length of {shape[axis]} does not come apart into {count}")
     return [TensorType(args[0].dtype, shape[:axis] + shape[axis + 1 :])] * count
 
 
@@ -144,7 +149,7 @@ def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
     data, axis_at = (args[1], 0) if node.op == "Split" else (args[0], 2)
     if data.shape is None:
         return [TensorType(data.dtype, None)] * _pieces(node, args, "num_split")
-    axis = int(require_constant(node, args, axis_at, "an axis")) % len(data.shape)
+    axis = axis_within(int(require_constant(node, args, axis_at, "an axis")), len(data.shape))
     sizes = _split_sizes(node, data.shape[axis], args)
     return [TensorType(data.dtype, (*data.shape[:axis], size, *data.shape[axis + 1 :])) for size in sizes]
 
@@ -156,7 +161,7 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
     kind = builder.type_of(node.inputs[data_at])
     assert kind.shape is not None
-    axis = int(constant_input(node, builder, axis_at, "an axis")) % len(kind.shape)
+    axis = axis_within(int(constant_input(node, builder, axis_at, "an axis")), len(kind.shape))
     sizes = _split_sizes(node, kind.shape[axis], [builder.type_of(r) for r in node.inputs])
     if any(not isinstance(s, int) for s in sizes):
         raise not_constant(node, "a length to split")

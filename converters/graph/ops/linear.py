@@ -17,6 +17,8 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     Precision,
+    axes_within,
+    axis_within,
     by_shape,
     constant_input,
     direct,
@@ -167,9 +169,8 @@ def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
 # ------------------------------------------------------------------ reductions
 
 
-def _axes(node: Node, axes: np.ndarray, rank: int) -> tuple[int, ...]:
-    wanted = [int(a) for a in np.atleast_1d(axes)]
-    return tuple(sorted({a + rank if a < 0 else a for a in wanted}))
+def _axes(axes: np.ndarray, rank: int) -> tuple[int, ...]:
+    return axes_within(np.atleast_1d(axes), rank)
 
 
 def _mean(x: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
@@ -182,7 +183,7 @@ def _mean(x: np.ndarray, axis: tuple[int, ...], keepdims: bool) -> np.ndarray:
 def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[..., np.ndarray]:
     def kernel(node: Node, x: np.ndarray, axes: np.ndarray) -> np.ndarray:
         work = x.astype(np.float64) if wide and x.dtype.kind == "f" else x
-        chosen = _axes(node, axes, x.ndim)
+        chosen = _axes(axes, x.ndim)
         with np.errstate(all="ignore"):
             result = function(work, axis=chosen, keepdims=bool(node.attrs["keep_dims"])) if chosen else work
         return np.asarray(result).astype(x.dtype)
@@ -193,9 +194,7 @@ def _reduction(function: Callable[..., np.ndarray], *, wide: bool) -> Callable[.
 @by_shape
 def _infer_reduction(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     keep = bool(node.attrs["keep_dims"])
-    axes = _axes(node, require_constant(node, args, 1, "the axes to reduce over"), len(shape))
-    if any(a >= len(shape) or a < 0 for a in axes):
-        raise shape_error(node, args, f"axes {axes} are outside the tensor's rank")
+    axes = _axes(require_constant(node, args, 1, "the axes to reduce over"), len(shape))
     return [1 if i in axes else d for i, d in enumerate(shape) if keep or i not in axes]
 
 
@@ -203,7 +202,7 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
     def lower(node: Node, builder: OnnxBuilder) -> Any:
         kind = builder.type_of(node.inputs[0])
         assert kind.shape is not None
-        axes = _axes(node, constant_input(node, builder, 1, "the axes to reduce over"), len(kind.shape))
+        axes = _axes(constant_input(node, builder, 1, "the axes to reduce over"), len(kind.shape))
         value = builder.value(node.inputs[0])
         keep = bool(node.attrs["keep_dims"])
         if kind.dtype == BOOL:  # ONNX does not reduce booleans
@@ -250,9 +249,7 @@ def _infer_arg(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list
     if shape is None:
         return [TensorType(node.attrs["output_type"], None)]
     axis = int(require_constant(node, args, 1, "an axis"))
-    if not -len(shape) <= axis < len(shape):
-        raise shape_error(node, args, f"axis {axis} is outside the tensor's rank")
-    axis %= len(shape)
+    axis = axis_within(axis, len(shape))
     return [TensorType(node.attrs["output_type"], shape[:axis] + shape[axis + 1 :])]
 
 

@@ -13,6 +13,7 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
+    axis_within,
     by_shape,
     constant_input,
     inserted,
@@ -277,7 +278,7 @@ def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | N
 def _infer_gather(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     if args[0].shape is None or args[1].shape is None:
         return [TensorType(args[0].dtype, None)]
-    axis = 0 if len(args) < 3 else int(require_constant(node, args, 2, "an axis")) % len(args[0].shape)
+    axis = 0 if len(args) < 3 else axis_within(int(require_constant(node, args, 2, "an axis")), len(args[0].shape))
     return [TensorType(args[0].dtype, args[0].shape[:axis] + args[1].shape + args[0].shape[axis + 1 :])]
 
 

@@ -110,7 +110,7 @@ def _flatten(op: Op, net: Importer) -> str:
     x = op.need(0)
     dims = net.shape(x)
     axis = op.integer("axis", 1)
-    axis = axis + len(dims) if axis < 0 else axis
+    axis = net.axis_of(axis, len(dims)) if axis < len(dims) else net.axis_of(axis, len(dims) + 1)
     sizes = [product(dims[:axis], net.symbols), product(dims[axis:], net.symbols)]
     if isinstance(sizes[1], int):
         return net.reshape(x, (sizes[0] if axis == 1 else -1, sizes[1]))
@@ -140,7 +140,10 @@ def _unsqueeze(op: Op, net: Importer) -> str:
     if axes is None:
         raise op.refused("it has no axes", "the model is damaged")
     rank = net.rank(x) + len(axes)
-    for axis in sorted({a % rank for a in axes}):
+    places = {net.axis_of(a, rank) for a in axes}
+    if len(places) < len(axes):
+        raise op.refused(f"its axes are {list(axes)}", "each must be another one")
+    for axis in sorted(places):
         x = net.expand_dims(x, axis)
     return x
 

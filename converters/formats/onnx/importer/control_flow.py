@@ -49,8 +49,7 @@ def _scan(op: Op, net: Importer) -> list[str | None]:
     results = net.inline(op, body, bindings)
     ends: list[str | None] = [*results[:states]]
     for value, axis in zip(results[states:], stacked, strict=True):
-        rank = net.rank(value) + 1
-        ends.append(net.expand_dims(value, axis % rank))
+        ends.append(net.expand_dims(value, net.axis_of(axis, net.rank(value) + 1)))
     return ends
 
 

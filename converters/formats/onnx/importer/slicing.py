@@ -189,9 +189,8 @@ def _one_hot(op: Op, net: Importer) -> str:
     negative = net.cast(net.add("Less", [index, net.ints(0, "zero")]), INT32)
     index = net.add("Add", [index, net.add("Mul", [negative, net.ints(depth, "depth")])])
     off, on = (net.element(values, i) for i in range(2))
-    axis = op.integer("axis", -1)
     rank = net.rank(indices)
-    axis = axis + rank + 1 if axis < 0 else axis
+    axis = net.axis_of(op.integer("axis", -1), rank + 1)
     return net.add("OneHot", [index, net.ints(depth, "depth"), on, off], axis=-1 if axis == rank else axis)
 
 
