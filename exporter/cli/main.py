@@ -76,12 +76,18 @@ def _clean_up() -> None:
 
 
 def _run(args: list[str]) -> None:
-    import io
-    import warnings
-
+    from exporter.cli.streams import whole_streams
     from signatures.cycles import look_seldom
 
     look_seldom()  # before the imports, which are a good part of an export
+    with whole_streams():
+        _command(args)
+
+
+def _command(args: list[str]) -> None:
+    import io
+    import warnings
+
     import click
 
     from exporter.cli.app import app
@@ -89,8 +95,6 @@ def _run(args: list[str]) -> None:
     from signatures.errors import ExportModelError, UsageError
 
     wants_json = "--json" in args
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a Windows console, or a pipe there, has no Δ
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)

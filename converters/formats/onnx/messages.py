@@ -18,6 +18,7 @@ from converters.files.chunks import Pieces
 from converters.files.external_data import Detached, is_readable
 from converters.files.protobuf_messages import message_classes
 from signatures.dtypes import DATA_TYPES
+from signatures.errors import UnsupportedOpError
 
 _CLASSES = message_classes(
     "export_model_onnx",
@@ -73,11 +74,22 @@ ModelProto = _CLASSES["ModelProto"]
 _DATA_TYPES = {t.dtype: t.onnx for t in DATA_TYPES}
 
 
+def data_type(dtype: np.dtype, name: str = "") -> int:
+    """TensorProto.DataType of a dtype. Raises UnsupportedOpError for text, which no policy computes with in ONNX."""
+    if dtype not in _DATA_TYPES:
+        raise UnsupportedOpError(
+            f"{name or 'a tensor'} is {'text' if dtype.kind in 'SUO' else dtype}, which is not written to ONNX",
+            why="a policy takes and gives numbers; an output that is made from text can be left out",
+            fix="leave onnx out of --to, or name the outputs: --output NODE=ROLE",
+        )
+    return _DATA_TYPES[dtype]
+
+
 def tensor(array: np.ndarray, name: str = "", raw: bytes | None = None) -> Any:
     """A TensorProto with raw bytes, which are little-endian: the array's, or ``raw`` in their place."""
     if raw is None:
         raw = (array if sys.byteorder == "little" else array.astype(array.dtype.newbyteorder("<"))).tobytes()
-    made = _CLASSES["TensorProto"](dims=array.shape, data_type=_DATA_TYPES[array.dtype], raw_data=raw)
+    made = _CLASSES["TensorProto"](dims=array.shape, data_type=data_type(array.dtype, name), raw_data=raw)
     if name:
         made.name = name
     return made
@@ -96,7 +108,7 @@ def _attribute(name: str, value: Any) -> Any:
     """An AttributeProto, its ``type`` (AttributeType) by the value's."""
     made = _CLASSES["AttributeProto"](name=name)
     if isinstance(value, np.dtype):
-        value = _DATA_TYPES[value]
+        value = data_type(value)
     if isinstance(value, Integral):
         made.i, made.type = int(value), 2
     elif isinstance(value, Real):
@@ -123,7 +135,7 @@ def _attribute(name: str, value: Any) -> Any:
 def value_info(name: str, dtype: np.dtype, dims: Sequence[int | str] | None) -> Any:
     """A ValueInfoProto: an axis is a size, or the name of one that is not known; None: any number of them."""
     made = _CLASSES["ValueInfoProto"](name=name)
-    made.type.tensor_type.elem_type = _DATA_TYPES[dtype]
+    made.type.tensor_type.elem_type = data_type(dtype)
     if dims is None:
         return made
     made.type.tensor_type.shape.SetInParent()  # a scalar has a shape of no axes

@@ -218,7 +218,7 @@ def _litert_reduction(op: str) -> Callable[[Node, LitertBuilder], Any]:
         rank, axes = builder.type_of(node.inputs[0]).rank, builder.type_of(node.inputs[1]).constant
         if axes is None or rank is None:
             raise refused(node, "the axes that it reduces over are computed while the graph runs")
-        value, chosen = builder.value(node.inputs[0]), _axes(node, axes, rank)
+        value, chosen = builder.value(node.inputs[0]), _axes(axes, rank)
         return (
             builder.emit(op, [value, ints(builder, *chosen)], keep_dims=bool(node.attrs["keep_dims"]))
             if chosen
