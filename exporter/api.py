@@ -53,6 +53,7 @@ def export_model(
     for_: str | None = None,
     dtype: str = "float32",
     quantize: str | None = None,
+    batch: int | None = None,
 ) -> list[ExportResult]:
     """Export every policy of a source to ``out/<policy>/``, and compare what was written in the runtimes that are here.
 
@@ -75,6 +76,7 @@ def export_model(
       a mapping.
     - ``dtype``: ``"float16"`` keeps weights in half the bytes, ``quantize``: ``"int8"`` in a quarter; computed is in
       float32, and verification says how many decisions become other ones.
+    - ``batch``: ONNX and LiteRT files for so many agents at a time (default: for any number).
 
     How to read it:
 
@@ -106,6 +108,7 @@ def export_model(
         labels,
         for_,
         storage(dtype, quantize),
+        batch,
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, step) as sources:

@@ -94,7 +94,7 @@ class Contract:
     signature: PolicySignature
     origin: Origin
     source: SourceMap
-    tool: Mapping[str, str]
+    tool: Mapping[str, Any]
     files: Mapping[str, FileEntry] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -168,6 +168,7 @@ def parse(content: Any) -> Contract:
         version=tool["version"].text(),
         profile=None if tool["profile"].missing else tool["profile"].text(),
         weights=None if tool["weights"].missing else tool["weights"].one_of(("float16", "int8")),
+        batch=None if tool["batch"].missing else tool["batch"].integer(1),
     )
     return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
 

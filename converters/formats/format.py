@@ -48,8 +48,8 @@ def deferred(room: str, *modules: str) -> list[Any]:
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
     """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
-    file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), and how
-    weights that were rounded are kept.
+    file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), how
+    weights that were rounded are kept, and for how many agents the file is (None: for any number).
     """
 
     contract: str
@@ -57,6 +57,7 @@ class WriteOptions:
     profile: str | None = None
     checked: bool = True
     weights: Storage = "float32"
+    batch: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +158,7 @@ class Format:
       once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
       source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
       ``answers`` are the outputs of a policy that an artefact answers (None: all). ``narrow``: it can hold weights in
-      float16 or int8.
+      float16 or int8. ``fixed``: it can be written for a fixed number of agents.
     """
 
     key: str
@@ -185,6 +186,7 @@ class Format:
     dtypes: frozenset[str] = frozenset()
     answers: Callable[[PolicySignature], list[str]] | None = None
     narrow: bool = False
+    fixed: bool = False
 
     @property
     def readable(self) -> bool:

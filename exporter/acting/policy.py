@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from exporter.acting.generator import Generator, likeliest
+from signatures.batches import Run, in_batches
 from signatures.contract import POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
 from signatures.ids import check_ids
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from converters.formats.bundle.bundle import Declared
 
 Array = np.ndarray
-Run = Callable[[Mapping[str, Array], Sequence[str]], dict[str, Array]]
 #: Runtime → the format that it runs.
 _TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}
 RUNTIMES = tuple(_TAKES)
@@ -381,8 +381,7 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
         )
     chosen = runtime or here[0]
     found.verify_hashes(WRITTEN[_TAKES[chosen]])
-    source = found.contract.source
-    kept = source.noise_kept and bool(source.noise)
+    kept = found.contract.source.noise_kept and bool(found.contract.source.noise)
     with scratch_folder() as folder_of_copy, naming(files[chosen]):
         vetted = WRITTEN[_TAKES[chosen]].vetted
         assert vetted is not None
@@ -390,7 +389,8 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
         copy = vetted(files[chosen], [s.name for s in (*signature.inputs, *signature.outputs)], folder_of_copy)
         run, declared = _RUNS[chosen](copy.read_bytes())
     found.check_fits(files[chosen], declared)
-    return LoadedPolicy(found.name, found.signature, run, chosen, seed, draws_itself=kept)
+    run = in_batches(run, found.contract.tool.get("batch") if chosen == "onnxruntime" else None, signature)
+    return LoadedPolicy(found.name, signature, run, chosen, seed, draws_itself=kept)
 
 
 def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) -> LoadedPolicy:

@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     help="The type that weights are stored in.",
 )
 @click.option("--quantize", type=click.Choice(["int8"]), help="Store each weight in one byte.")
+@click.option("--batch", type=int, metavar="N", help="Write files for N agents at a time (ONNX, LiteRT).")
 @click.option("--labels", type=PATH, metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @click.option(
@@ -91,6 +92,7 @@ def export_command(
     labels: Path | None,
     dtype: str,
     quantize: str | None,
+    batch: int | None,
     jobs: int | None,
     cluster: str | None,
     again: bool,
@@ -124,6 +126,7 @@ def export_command(
         labels,
         profile,
         storage(dtype, quantize),
+        batch,
     )
     many = again or fail_fast or is_many(sources) or address_of(out) is not None
     if many or jobs is not None or cluster is not None:

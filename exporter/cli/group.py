@@ -29,7 +29,7 @@ _OWN = frozenset(("--help", "-h", "--version"))
 GROUPS = {
     "What to write": (
         *("out", "targets", "profile", "name", "names", "noise", "deterministic", "labels", "opset", "logdir", "svg"),
-        *("dtype", "quantize", "scene", "target"),
+        *("dtype", "quantize", "batch", "scene", "target"),
     ),
     "How to read the source": (
         *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "trust_source"),

@@ -109,7 +109,7 @@ def verify_folder(
             frozen(again.policy).write(reference)
         tested = PolicyUnderTest(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
-            made_for, artefacts,
+            made_for, artefacts, contract.tool.get("batch"),
         )  # fmt: skip
         weights = contract.tool.get("weights")
         # What was rounded is held against itself; the source is asked what it decides.

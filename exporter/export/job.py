@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from exporter.verify.participants import PolicyUnderTest
 
 
+#: Agents that a file may be made for (``--batch``).
+MOST_AGENTS = 1 << 16
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """One policy to write, and where it comes from."""
@@ -41,6 +45,8 @@ class Job:
     note: str | None = None
     #: the policy with its weights as they were, where those of ``policy`` are rounded
     whole: Policy | None = None
+    #: for how many agents its files are
+    batch: int | None = None
 
 
 def artefacts_of(
@@ -55,9 +61,12 @@ def artefacts_of(
             options.read,
             None if job.profile is None else job.profile.name,
             None if job.whole is None else options.weights,
+            job.batch,
         )
         if job.profile is None:
-            how = WriteOptions(contract.compact(), checked=options.verify != "none", weights=options.weights)
+            how = WriteOptions(
+                contract.compact(), checked=options.verify != "none", weights=options.weights, batch=options.batch
+            )
             if options.opset is not None:
                 how = replace(how, opset=options.opset)
             artifacts, notes = list[Artifact](), list[str]()
@@ -88,6 +97,7 @@ def contract_of(
     read: ReadOptions,
     profile: str | None = None,
     weights: str | None = None,
+    batch: int | None = None,
 ) -> Contract:
     """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
     origin = Origin(
@@ -99,7 +109,7 @@ def contract_of(
         read.goals,
         read.activation,
     )
-    tool = known(name="export-model", version=__version__, profile=profile, weights=weights)
+    tool = known(name="export-model", version=__version__, profile=profile, weights=weights, batch=batch)
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
         parse(contract.to_dict())
@@ -139,6 +149,7 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
         keys,
         None if job.profile is None else job.profile.name,
         paths,
+        job.batch,
     )
 
 
@@ -174,6 +185,35 @@ def check_weights(options: ExportOptions, formats: Sequence[Format]) -> None:
             why=f"weights in {options.weights} are written to {', '.join(f.key for f in WRITTEN.values() if f.narrow)}",
             fix="leave one of them out",
         )
+
+
+def check_batch(options: ExportOptions, formats: Sequence[Format]) -> None:
+    """Raise UsageError where files for a fixed number of agents are asked for and all that are written take any."""
+    if options.batch is None:
+        return
+    if not 0 < options.batch <= MOST_AGENTS:
+        raise UsageError(f"--batch {options.batch}", why="it is how many agents act at once", fix=f"1 to {MOST_AGENTS}")
+    if options.profile is not None:
+        raise UsageError(
+            f"--batch does not go with --for {options.profile}",
+            why="ML-Agents feeds as many agents as ask for a decision",
+            fix="leave one of them out",
+        )
+    if not any(f.fixed for f in formats):
+        able = ",".join(f.key for f in WRITTEN.values() if f.fixed)
+        raise UsageError(
+            f"--batch does not go with --to {','.join(f.key for f in formats)}",
+            why="such files take any number of agents",
+            fix=f"write those for which some consumers ask for a fixed one: --to {able}",
+        )
+
+
+def fixed(job: Job, batch: int, formats: Sequence[Format]) -> Job:
+    """The policy of which some files are for ``batch`` agents at a time, which a note in its contract says."""
+    files = " and ".join(f.main_of(job.policy.name) for f in formats if f.fixed)
+    note = f"made for batches of {batch}, no more and no fewer (--batch): {files}"
+    signature = replace(job.policy.signature, notes=(*job.policy.signature.notes, note))
+    return replace(job, policy=replace(job.policy, signature=signature), batch=batch)
 
 
 def smaller(job: Job, weights: Storage) -> Job:

@@ -36,6 +36,8 @@ class ExportOptions:
     profile: str | None = None
     #: what weights are rounded to and kept in (``--dtype``, ``--quantize``)
     weights: Storage = "float32"
+    #: for how many agents the files are (``--batch``; None: for any number)
+    batch: int | None = None
 
 
 def _roles(given: Mapping[str, str | Role] | None, flag: str) -> dict[str, Role]:

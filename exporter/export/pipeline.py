@@ -18,7 +18,9 @@ from converters.policy.policy import Policy
 from exporter.export.job import (
     Job,
     artefacts_of,
+    check_batch,
     check_weights,
+    fixed,
     own_in,
     sizes_unrounded,
     smaller,
@@ -114,6 +116,7 @@ class Exporter:
         if not self._formats:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
         check_weights(options, self._formats)
+        check_batch(options, self._formats)
         self._profile = wanted
         #: None where the writers of its formats give a policy the consumer's names
         self._dress = None if wanted is None or self._formats[0].key in wanted.own_names else wanted.dress
@@ -163,6 +166,7 @@ class Exporter:
             own = replace(policy, name=name)
             dressed = labelled(own if dress is None else dress(own), self._labels)
             job = Job(source, model, dressed, self._profile, None if dress is None else own, note)
+            job = job if options.batch is None else fixed(job, options.batch, self._formats)
             jobs.append(job if options.weights == "float32" else smaller(job, options.weights))
         return jobs
 

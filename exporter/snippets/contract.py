@@ -7,12 +7,14 @@ import math
 import re
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from string import Template
 
 from converters.formats.bundle import bundle
 from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.registry import WRITTEN
+from signatures.contract import Contract
 from signatures.errors import naming
 from signatures.ids import bounds_text
 from signatures.records import dataclass
@@ -126,11 +128,20 @@ def read_bundle(folder: Path) -> Bundle:
         with naming(found.path(frozen)):
             nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
     made_for = found.contract.tool.get("profile")
-    return Bundle(folder, found.name, found.signature, frozenset(found.contract.files), nodes, made_for)
+    return Bundle(folder, found.name, _as_fed(found.contract), frozenset(found.contract.files), nodes, made_for)
+
+
+def _as_fed(contract: Contract) -> PolicySignature:
+    """The policy as the bundle's files take it: for a number of agents where they were made for one (``--batch``)."""
+    size = contract.tool.get("batch")
+    if size is None:
+        return contract.signature
+    inputs = tuple(replace(s, shape=(size, *s.shape[1:])) if s.batched else s for s in contract.signature.inputs)
+    return replace(contract.signature, inputs=inputs)
 
 
 def example_shape(spec: TensorSpec) -> tuple[int, ...]:
-    """The shape for one agent; 1 for every other free axis, too."""
+    """The shape for one agent, or as many as the file takes; 1 for every other free axis, too."""
     return tuple(1 if n is None else n for n in spec.shape)
 
 

@@ -16,6 +16,7 @@ from converters.formats.source import OriginalRun
 from converters.graph.nodes import Graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.findings import Finding
+from signatures.batches import batches_of, put_together, rows_of
 from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
@@ -54,6 +55,8 @@ class PolicyUnderTest:
     #: the profile that it was made for (``--for``), and format → the bundle's own file
     profile: str | None = None
     files: Mapping[str, Path] = field(default_factory=dict)
+    #: for how many agents its artefacts are (None: for any number)
+    batch: int | None = None
 
 
 @dataclass
@@ -117,6 +120,8 @@ def participants_of(
             label = kind if key in ("", "serving_default") else f"{kind}:{key}"
             limit = tested.signatures.get(key)
             running = partial(_predicting, names) if WRITTEN[kind].predicts else partial(_limited, limit)
+            if tested.batch is not None and WRITTEN[kind].fixed:
+                running = partial(_in_batches, running, tested.batch, tested.signature)
             again = loading(runtime, path, WRITTEN[kind].loader(key), running)
             try:
                 model, run = again(pool, False)
@@ -157,6 +162,22 @@ def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: Loade
         return model.run_all
     names = frozenset(signature[0])
     return lambda inputs, fetch: model.run_all([{n: a for n, a in i.items() if n in names} for i in inputs], fetch)
+
+
+def _in_batches(
+    running: Callable[[LoadedModel], Run], size: int, signature: PolicySignature, model: LoadedModel
+) -> Run:
+    """A run of any number of agents by a model that takes ``size`` at a time."""
+    run = running(model)
+    batched = {s.name for s in signature.inputs if s.batched}
+
+    def all_of(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
+        parts = [batches_of(feeds, size, batched) for feeds in inputs]
+        answers = iter(run([part for several in parts for part in several], fetch))
+        rows = [rows_of(feeds, batched) for feeds in inputs]
+        return [put_together([next(answers) for _ in p], n) for p, n in zip(parts, rows, strict=True)]
+
+    return all_of
 
 
 def _predicting(outputs: Sequence[str], model: LoadedModel) -> Run:

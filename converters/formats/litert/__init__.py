@@ -21,6 +21,7 @@ FORMATS = (
         write=_writer.write,
         main="{name}.tflite",
         narrow=True,
+        fixed=True,
         held=_artifact.held,
         ports=_artifact.ports,
         vetted=_artifact.vetted,

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.weights import Storage, compact
+from converters.compiler.passes.weights import compact
 from converters.files.chunks import equal
 from converters.files.external_data import LARGE
+from converters.formats.format import WriteOptions
 from converters.formats.intermediate_tensors import View
 from converters.formats.litert.flatbuffer import Table
 from converters.formats.litert.schema import ACTIVATIONS, BUILTINS, OPTIONS, PADDINGS, TABLES, TYPES
@@ -18,7 +20,7 @@ from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.litert.base import NONE, Value, refused, reshaped
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
-from converters.graph.types import TensorType, of_array
+from converters.graph.types import BATCH, TensorType, of_array
 from signatures.spec import TensorSpec
 
 
@@ -62,8 +64,8 @@ class Shared:
 class Subgraph:
     """One function of a model (implements converters.graph.ops.litert.base.LitertBuilder)."""
 
-    def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared, storage: Storage = "float32") -> None:
-        self.graph, self.shared, self.storage = graph, shared, storage
+    def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared, options: WriteOptions) -> None:
+        self.graph, self.shared, self.storage, self.batch = graph, shared, options.weights, options.batch
         self.types = infer_types(graph)
         self.tensors: list[Table] = []
         self.operators: list[Table] = []
@@ -157,6 +159,8 @@ class Subgraph:
     def _tensor(self, kind: TensorType, buffer: int = 0) -> Value:
         if kind.dtype not in TYPES:
             raise refused(self._node, f"LiteRT has no {kind.dtype}")
+        if self.batch is not None and kind.shape is not None:
+            kind = replace(kind, shape=tuple(self.batch if d == BATCH else d for d in kind.shape))
         entry: Table = {"type": TYPES[kind.dtype][0], "buffer": buffer}
         if kind.shape is not None:
             entry["has_rank"] = True
@@ -186,7 +190,7 @@ class Subgraph:
     def input(self, spec: TensorSpec, reference: str) -> Value:
         """A tensor that is fed."""
         self._node = self.graph.producer(reference)
-        dims = tuple(f"?{i}" if d is None else d for i, d in enumerate(spec.shape))
+        dims = tuple((f"?{i}" if i else BATCH) if d is None else d for i, d in enumerate(spec.shape))
         return self._bound(reference, self._tensor(TensorType(np.dtype(spec.dtype), dims)))
 
     def lower(self, node: Node) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.compiler.passes.weights import Storage
 from converters.compiler.targets import LITERT, prepare
 from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
@@ -34,7 +33,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         if signatures and (*inputs,) == policy.signature.inputs and (*outputs,) == policy.signature.outputs:
             signatures.append({**signatures[0], "signature_key": key})
             continue
-        subgraph, signature, views = _function(policy, graph, inputs, outputs, shared, options.weights)
+        subgraph, signature, views = _function(policy, graph, inputs, outputs, shared, options)
         signatures.append({**signature, "signature_key": key, "subgraph_index": len(subgraphs)})
         subgraphs.append({**subgraph, "name": key})
         turned.update(views)
@@ -58,12 +57,12 @@ def _function(
     inputs: list[TensorSpec],
     outputs: list[TensorSpec],
     shared: Shared,
-    storage: Storage,
+    options: WriteOptions,
 ) -> tuple[Table, Table, Mapping[str, View]]:
     """The subgraph of a signature, what the signature says of it, and which tensors have their axes otherwise."""
     fetches = [policy.fetches[s.name] for s in outputs]
     part = graph.pruned(fetches)
-    made = Subgraph(part, fetches, shared, storage)
+    made = Subgraph(part, fetches, shared, options)
     fed = {s.name: made.input(s, policy.feeds[s.name]) for s in inputs if policy.feeds[s.name] in graph}
     for node in part.nodes:
         made.lower(node)

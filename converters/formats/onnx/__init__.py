@@ -32,6 +32,7 @@ FORMATS = (
         beside="{name}.onnx.data",
         default=True,
         narrow=True,
+        fixed=True,
         held=_artifact.held,
         ports=_artifact.ports,
         vetted=_vetted.vetted,

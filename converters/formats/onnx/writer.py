@@ -253,9 +253,10 @@ class _Builder:
         return TensorMap(views, sources)
 
 
-def _value_info(spec: TensorSpec) -> Any:
+def _value_info(spec: TensorSpec, batch: int | None) -> Any:
     dims = [
-        ("batch" if i == 0 else f"{spec.name}_dim_{i}") if size is None else size for i, size in enumerate(spec.shape)
+        (batch or "batch" if i == 0 else f"{spec.name}_dim_{i}") if size is None else size
+        for i, size in enumerate(spec.shape)
     ]
     return messages.value_info(spec.name, np.dtype(spec.dtype), dims)
 
@@ -297,9 +298,9 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         policy.name,
         builder.nodes,
         [i for i in builder.initializers if i.name in used],
-        [_value_info(s) for s in policy.signature.inputs],
+        [_value_info(s, options.batch) for s in policy.signature.inputs],
         [
-            *(_value_info(s) for s in policy.signature.outputs),
+            *(_value_info(s, options.batch) for s in policy.signature.outputs),
             *(messages.value_info(name, value.dtype, value.shape) for name, value in policy.constants.items()),
         ],
         producer=PRODUCER,
