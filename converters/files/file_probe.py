@@ -15,6 +15,10 @@ from converters.files.wire_format import read_varint
 from signatures.bounded import loads
 
 _HEAD = 4096
+#: How a pickle begins, of protocol 2 on.
+PICKLES = tuple(bytes((0x80, protocol)) for protocol in (2, 3, 4, 5))
+#: PyTorch's magic number as a pickle, with which ``torch.save`` began its files before 1.6 (torch/serialization.py).
+_TORCH_MAGIC = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
 _SURROGATE = re.compile(r"[\ud800-\udfff]|\\u[dD][89a-fA-F]")
 
 
@@ -58,6 +62,11 @@ class Content:
             return zipfile.ZipFile(io.BytesIO(self.data)).namelist()
         except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, struct.error):
             return []
+
+    @property
+    def is_torch_row(self) -> bool:
+        """Whether it is pickles in a row, as PyTorch wrote them (from protocol 4 on behind the header of a frame)."""
+        return self.starts(*PICKLES) and _TORCH_MAGIC in self.head[:32]
 
     @cached_property
     def fields(self) -> list[tuple[int, int, memoryview]]:

@@ -269,15 +269,39 @@ _NAMES: dict[tuple[str, str], Any] = {
 }
 
 
+#: What the module of a name tells: (modules, why it is refused, what to do). The last row is for all others.
+_OTHERS: tuple[tuple[tuple[str, ...], str, str], ...] = (
+    (
+        ("torch.nn", "torch.optim", "torch.distributions"),
+        "the module was saved whole, and its code is not in the file",
+        "save the weights alone, torch.save(policy.state_dict(), …); or export the module with torch.onnx.export",
+    ),
+    (
+        ("numpy", "gym", "gymnasium", "stable_baselines3", "omegaconf", "argparse", "pandas", "ray", "tensorboard"),
+        "it holds settings, statistics or data beside the weights, as objects of that library",
+        "give the checkpoint with the weights; or save them alone: torch.save(policy.state_dict(), …)",
+    ),
+    (
+        ("os", "posix", "nt", "subprocess", "sys", "builtins", "__builtin__", "runpy", "socket", "shutil", "importlib"),
+        "loading it as a pickle would run that, which no weights need",
+        f"do not load it with torch.load or pickle; {_FIX}",
+    ),
+    (
+        (),
+        "a class or function of a project is not in the file, only its name",
+        "save the weights alone, torch.save(policy.state_dict(), …); or export the module with torch.onnx.export",
+    ),
+)
+
+
 def _named(module: str, name: str) -> Any:
     found = _NAMES.get((module, name))
     if found is None:
-        raise NotAPolicyError(
-            f"its pickle asks for {module[:100]}.{name[:100]}",
-            why="only tensors and plain containers are built from a checkpoint, and nothing in it is run; a file that "
-            "asks for more may be an attack, or a module that was saved whole",
-            fix=f"{_FIX}; a module that torch.save wrote whole must be exported to ONNX (torch.onnx.export)",
-        )
+        parts = module[:100].split(".")
+        above = {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
+        _, why, fix = next(row for row in _OTHERS if not row[0] or not above.isdisjoint(row[0]))
+        built = "only tensors and plain containers are built from a checkpoint, and nothing in it is run"
+        raise NotAPolicyError(f"its pickle asks for {module[:100]}.{name[:100]}", why=f"{built}; {why}", fix=fix)
     return found
 
 

@@ -24,7 +24,7 @@ def fetched(path: Path) -> tuple[Fetched, Format]:
     given = Fetched(path)
     found = recognised(given)
     if not found.readable and found is not BUNDLE:
-        raise not_readable(found, path)
+        raise not_readable(found, path, given.data)
     return given, found
 
 
@@ -76,7 +76,7 @@ def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[So
     given = folder.inside(member.path)
     found = recognised(given)
     if found.read is None:
-        raise not_readable(found, where)
+        raise not_readable(found, where, given.data)
     try:
         models = found.read(given, options)
     except ExportModelError as error:

@@ -7,9 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from converters.files.fetch import Fetched, unreadable
-from converters.files.file_probe import Content
+from converters.files.file_probe import PICKLES, Content
 from converters.formats.checkpoint import listing
 from converters.formats.format import Format
+from converters.formats.other_json import KINDS, is_kind, keys_of
 from converters.formats.registry import FORMATS
 from signatures.errors import NotAPolicyError, SourceError
 
@@ -74,7 +75,19 @@ REFUSED = (
         )
         for key, label, advice, at, *marks in _OTHERS
     ),
-    Format(key="json", label="JSON", advice="give a model file", sniff=lambda file: file.json is not None),
+    *(Format(key=k.key, label=k.label, advice=k.advice, sniff=partial(is_kind, k)) for k in KINDS),
+    Format(
+        key="json",
+        label="JSON, and not of a model",
+        advice="give the model itself: a TensorFlow.js model.json has modelTopology, a bundle is a folder",
+        sniff=lambda file: file.json is not None,
+    ),
+    Format(
+        key="pickle",
+        label="a pickle that PyTorch did not write",
+        advice="give the checkpoint itself (.pt, .pth, .zip); settings, statistics and replay buffers are not needed",
+        sniff=lambda file: file.starts(*PICKLES),
+    ),
     Format(key="zip", label="a ZIP archive", advice=_UNPACK, sniff=lambda file: file.starts(b"PK\x03\x04")),
     Format(key="gzip", label="a gzip archive", advice=_UNPACK, sniff=lambda file: file.starts(b"\x1f\x8b")),
     Format(
@@ -141,11 +154,12 @@ def _nothing_in(folder: Path) -> SourceError:
     )
 
 
-def not_readable(found: Format, path: Path) -> NotAPolicyError:
+def not_readable(found: Format, path: Path, data: bytes = b"") -> NotAPolicyError:
     """The refusal of a file that no reader takes: what it looks like instead, and what to do."""
+    why = "its content says so, whatever its name is" if found.key not in ("unknown", "sentis") else None
     return NotAPolicyError(
         f"is {found.label}" if found is not UNKNOWN else found.label,
         where=str(path),
-        why="its content says so, whatever its name is" if found.key not in ("unknown", "sentis") else None,
+        why=keys_of(Content(data)) if found.key == "json" else why,
         fix=found.advice or None,
     )

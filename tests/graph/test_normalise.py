@@ -418,3 +418,8 @@ def test_a_graph_in_the_common_spelling_stays_as_it_is() -> None:
     assert [(n.name, n.op, n.inputs, n.origin) for n in made.nodes] == [
         (n.name, n.op, n.inputs, n.origin) for n in topological(read.nodes)
     ]
+
+
+def test_what_jax_wrote_says_how_to_export_it() -> None:
+    with pytest.raises(UnsupportedOpError, match=r"XlaCallModule \(node 'y'\)(?s:.)*jax2onnx"):
+        normalised([placeholder("x"), node("y", "XlaCallModule", "x")])

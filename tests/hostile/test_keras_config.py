@@ -82,6 +82,21 @@ def test_code_is_refused_wherever_it_is_nested(name: str) -> None:
         refuse_code(model(DENSE, wrapped))
 
 
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        ({"value": ["4wEAAAAA", None, None]}, "a lambda"),  # Keras 3.15
+        ({"class_name": "__lambda__", "config": {"value": "4wEAAAAA"}}, "a lambda"),
+        ({"module": "builtins", "class_name": "function", "config": "mine", "registered_name": "function"}, "'mine'"),
+    ],
+)
+def test_a_function_of_ones_own_is_named_with_its_layer(function: dict[str, Any], said: str) -> None:
+    dense = {**DENSE, "config": {**DENSE["config"], "name": "hidden", "activation": function}}
+    with pytest.raises(NotAPolicyError, match=f"the activation of its layer 'hidden' is .*{said}") as caught:
+        refuse_code(model(DENSE, dense))
+    assert "activation or layers of Keras" in str(caught.value)
+
+
 def test_what_trains_a_model_inside_another_is_built_with_it() -> None:
     inner = layer("Sequential", "keras", compile_config={"optimizer": layer("Adam", "keras.optimizers"), "loss": "mse"})
     evil = layer("Sequential", "keras", compile_config={"loss": CODE["a class of another module"]})

@@ -12,7 +12,7 @@ import pytest
 from converters.files.fetch import Fetched
 from converters.formats.keras.source import read
 from converters.formats.source import ReadOptions
-from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 h5py = pytest.importorskip("h5py")
 
@@ -103,3 +103,27 @@ def test_settings_that_do_not_fit_are_refused(tmp_path: Path, change: dict[str, 
     config = {"class_name": "Sequential", "config": {"name": "m", "layers": [LAYERS[0], dense]}}
     with pytest.raises((DamagedFileError, NotAPolicyError)):
         read(Fetched(written(tmp_path / "m.h5", plain, config)), ReadOptions())
+
+
+@pytest.mark.parametrize(
+    ("names", "said", "error"),
+    [
+        (("observations", "actions", "rewards", "terminals", "infos/qpos"), "is a data set", NotAPolicyError),
+        (("data/demo_0/actions",), "is a data set", NotAPolicyError),
+        (("episode_0/observations",), "is a data set", NotAPolicyError),
+        (("layers/dense/vars/0", "vars"), "weights alone, or something else: layers, metadata, vars", DamagedFileError),
+        (("grid",), "something else: grid", DamagedFileError),
+        ((), "or nothing", DamagedFileError),
+    ],
+)
+def test_a_file_that_is_no_model_is_called_what_it_is(
+    names: tuple[str, ...], said: str, error: type[SourceError], tmp_path: Path
+) -> None:
+    """A text beside the arrays, which a data set has, too, is not looked at."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in names:
+            file[name] = np.zeros((3, 2), np.float32)
+        if names:
+            file["metadata/algorithm"] = "SAC"
+    with pytest.raises(error, match=said):
+        read(Fetched(tmp_path / "a.h5"), ReadOptions())

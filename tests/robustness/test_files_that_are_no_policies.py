@@ -56,12 +56,31 @@ NEVER_READ = {
     "text in Chinese, cut off by the first block": ("a.bytes", "x球".encode() * 2000, "text", ["a text file"]),
     "text in UTF-16": ("a.bytes", "Ball".encode("utf-16"), "unknown", ["not a model"]),
     "a web page": ("a.bytes", b"\n <!DOCTYPE html>\n<html><body>3DBall.bytes</body></html>", "html", ["a web page"]),
-    "JSON": ("a.json", b'\n{"behaviors": {"3DBall": {"trainer_type": "ppo"}}}', "json", ["JSON"]),
+    "JSON": ("a.json", b'\n{"behaviors": {"3DBall": {"trainer_type": "ppo"}}}', "json", ["JSON", "'behaviors'"]),
+    **{
+        f"JSON, {kind}": ("a.json", json.dumps(content).encode(), kind, words)
+        for kind, content, words in (
+            ("keras_json", {"class_name": "Functional", "config": {}}, ["without their weights", "model.save"]),
+            ("brain_js", {"type": "NeuralNetwork", "sizes": [2, 3, 1], "layers": []}, ["brain.js", "Keras or PyTorch"]),
+            ("synaptic", {"neurons": [], "connections": []}, ["synaptic"]),
+            ("neataptic", {"nodes": [], "connections": [], "input": 2, "output": 1, "dropout": 0}, ["neataptic"]),
+            ("convnetjs", {"layers": [{"layer_type": "input", "out_sx": 1}]}, ["ConvNetJS"]),
+            ("onnx_json", {"irVersion": "8", "graph": {}}, ["ONNX model as JSON", "binary"]),
+            ("graph_json", {"node": [{"name": "a", "op": "Placeholder"}]}, ["graph as JSON", "binary"]),
+            ("mlagents_timers", {"name": "root", "gauges": {}, "total": 1, "children": {}}, ["timers.json", "run's"]),
+            ("mlagents_status", {"metadata": {"stats_format_version": "0.3.0"}}, ["training_status.json"]),
+            ("hugging_face", {"architectures": ["X"], "model_type": "x"}, ["Hugging Face", "ONNX"]),
+            ("notebook", {"cells": [], "nbformat": 4}, ["notebook"]),
+            ("npm", {"name": "a", "version": "1", "dependencies": {}}, ["npm package"]),
+            ("json", {"layers": [], "metadata": 3, "node": {}}, ["'layers', 'metadata', 'node'"]),
+        )
+    },
     "JSON without an end": ("a.json", b'{"a": ', "text", ["a text file"]),
     "JSON that is nested too deep": ("a.json", b'{"a":' * 100_000 + b"1" + b"}" * 100_000, "text", ["a text file"]),
     "a Git LFS pointer": ("3DBall.bytes", LFS_POINTER, "lfs_pointer", ["Git LFS pointer", "git lfs pull"]),
     "a graph as text": ("a.pbtxt", b'node {\n  name: "state"\n  op: "Placeholder"\n}\n', "text_graph", [".pbtxt"]),
-    "a pickle": ("a.bytes", pickle.dumps({"a": [1.5] * 3}), "torch_checkpoint", ["is a pickle"]),
+    "a pickle": ("a.bytes", pickle.dumps({"a": [1.5] * 3}), "pickle", ["PyTorch did not write", "checkpoint itself"]),
+    "an array in a pickle": ("a.pkl", pickle.dumps(np.zeros(3)), "pickle", ["replay buffers"]),
     "a torch checkpoint": ("a.pt", zipped("a/data.pkl", "a/data/0"), "torch_checkpoint", ["pickle"]),
     "TFLite": ("a.tflite", b"\x1c\0\0\0TFL3" + bytes(100), "litert", ["TensorFlow Lite"]),
     "a Unity asset": ("a.asset", UNITY_YAML, "unity_asset", ["a Unity asset"]),
@@ -121,6 +140,18 @@ def test_too_little_of_another_format_is_refused(what: str, tmp_path: Path) -> N
     assert recognise(content, name).key == kind
     is_refused(export_model(tmp_path / name, "-o", tmp_path / "out"), tmp_path / name)
     assert files_in(tmp_path) == {name}
+
+
+def test_pickles_beside_a_checkpoint_are_passed_over(tmp_path: Path) -> None:
+    """Settings and buffers of a run are not models, and do not spoil the export of its folder."""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "policy.bytes").write_bytes(graph_bytes(continuous_policy()))
+    for name in ("args.pkl", "vecnormalize.pkl", "buffer.pickle"):
+        (run / name).write_bytes(pickle.dumps({name: np.zeros(3), "of": Path()}))
+    ran = export_model(run, "-o", tmp_path / "out", "--verify", "none")
+    assert ran.status == 0, ran.err
+    assert "pkl" not in ran.err + ran.out
 
 
 def test_what_this_tool_writes_is_recognised_by_its_content(tmp_path: Path) -> None:

@@ -174,7 +174,10 @@ def test_code_in_a_pickle_is_refused_by_name_and_not_run(
     path = saved(tmp_path, _forms(payload)[form])
     ran = export_model(path, "-o", tmp_path / "out", "--verify", "none")
     assert ran.status == 2
-    assert f".{name}" in ran.err and "nothing in it is run" in ran.err.replace("\n", " ")
+    if form == "bare":
+        assert "a pickle that PyTorch did not write" in ran.err
+    else:
+        assert f".{name}" in ran.err and "nothing in it is run" in ran.err.replace("\n", " ")
     assert not touched.exists() and not (tmp_path / "out").exists()
 
 
@@ -196,6 +199,29 @@ def test_every_name_that_is_not_needed_is_refused_by_name(module: str, name: str
     for data in (Writer().zip({"Policy": call}), Writer().row({"Policy": call})):
         with pytest.raises(NotAPolicyError, match=f"{module}.{name}".replace(".", r"\.")):
             archive(tmp_path, data)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "said"),
+    [
+        ("torch.nn.modules.container", "Sequential", "saved whole"),
+        ("torch.optim.adam", "Adam", "saved whole"),
+        ("numpy._core.multiarray", "_reconstruct", "settings, statistics or data"),
+        ("gymnasium.spaces.box", "Box", "settings, statistics or data"),
+        ("posix", "system", "would run that"),
+        ("builtins", "eval", "would run that"),
+        ("torch.storage", "_load_from_bytes", "only its name"),
+        ("__main__", "Args", "only its name"),
+        ("osmium", "Reader", "only its name"),
+    ],
+)
+def test_what_a_pickle_asks_for_says_what_it_is(module: str, name: str, said: str, tmp_path: Path) -> None:
+    """A file with settings beside its weights is not called an attack."""
+    with pytest.raises(NotAPolicyError) as caught:
+        archive(tmp_path, Writer().zip({"Policy": Call(module, name, ("x",))}))
+    assert said in str(caught.value)
+    assert "attack" not in str(caught.value)
+    assert caught.value.fix
 
 
 @pytest.mark.parametrize(

@@ -22,13 +22,16 @@ from signatures.records import dataclass
 
 @dataclass(frozen=True)
 class Stored:
-    """What an HDF5 file of Keras holds: (layer, name) → array, in its order, and what an ``.h5`` says of itself."""
+    """What an HDF5 file of Keras holds: (layer, name) → array, in its order, what an ``.h5`` says of itself, and
+    the first names in it.
+    """
 
     arrays: dict[tuple[str, str], np.ndarray]
     config: str | None = None
     version: str | None = None
     #: how the model was compiled, as JSON
     training: str | None = None
+    names: tuple[str, ...] = ()
 
 
 def stored_in(path: Path) -> Stored:
@@ -51,7 +54,7 @@ def stored_in(path: Path) -> Stored:
         ) from error
     index = json.loads(answer["index"].tobytes())
     arrays = {(layer, name): answer[str(i)] for i, (layer, name) in enumerate(index["arrays"])}
-    return Stored(arrays, index["config"], index["version"], index["training"])
+    return Stored(arrays, index["config"], index["version"], index["training"], tuple(index["names"]))
 
 
 def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:

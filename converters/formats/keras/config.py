@@ -7,15 +7,16 @@ layer, an initialiser or the like of Keras itself is refused, whatever the versi
 
 from __future__ import annotations
 
+import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from converters.files.fetch import read_bytes
 from converters.files.file_probe import json_in
 from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
-from signatures.errors import DamagedFileError, NotAPolicyError
+from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 #: Bytes of a configuration; Keras' largest models have one of 2 MB.
 MAX_CONFIG = 16 << 20
@@ -81,11 +82,25 @@ def config_inside(path: str) -> Any:
     return json_in(text)
 
 
-def no_configuration() -> DamagedFileError:
-    """The error of a file that does not say what it is made of."""
+#: What the arrays of a data set are called: d4rl (actions, observations, rewards), Minari (episode_0), robomimic and
+#: LIBERO (data/demo_0), and those of supervised learning.
+_DATA_SETS = re.compile(
+    r"actions?|observations|next_observations|rewards|terminals|episode_\d+|data|demo_\d+|obs|x_train"
+)
+
+
+def no_configuration(names: Sequence[str] = ()) -> SourceError:
+    """The error of an HDF5 file that does not say what it is made of; ``names`` are those that it holds."""
+    shown = ", ".join(n[:40] for n in names[:6]) + (", …" if len(names) > 6 else "")
+    if any(_DATA_SETS.fullmatch(n) for n in names):
+        return NotAPolicyError(
+            "is a data set, and holds no model",
+            why=f"it has {shown}",
+            fix="give the policy that was trained on it: .keras, .h5, .onnx, .pt",
+        )
     return DamagedFileError(
         "it has no configuration of a model",
-        why="it holds weights alone, or something else",
+        why=f"it holds weights alone, or something else: {shown}" if shown else "it holds weights alone, or nothing",
         fix="save the whole model: model.save('policy.keras')",
     )
 
@@ -107,7 +122,7 @@ def _refuse_links(group: Any, h5py: Any, depth: int = 0) -> None:
 
 def stateful_layer(config: Any) -> str | None:
     """The first layer that keeps its state in itself from call to call."""
-    inner = (entry.get("config") for entry in _objects(config))
+    inner = (entry.get("config") for _, entry in _objects(config))
     named = (str(c.get("name")) for c in inner if isinstance(c, dict) and c.get("stateful") is True)
     return next(named, None)
 
@@ -118,7 +133,9 @@ def refuse_code(config: Any, *, built: bool = False) -> None:
     Where Keras itself is to build it (``built``), what training uses is looked at, too.
     """
     rooms = _ROOMS | _TRAINING if built else _ROOMS
-    for named in _objects(config, built=built):
+    for place, named in _objects(config, built=built):
+        if (own := _own_function(named)) is not None:
+            raise _function(place, own)
         name = named.get("class_name")
         module, registered = named.get("module"), named.get("registered_name")
         if isinstance(name, str) and name in _VALUES:
@@ -138,17 +155,44 @@ def _of_keras(module: str, rooms: frozenset[str]) -> bool:
     return module in _PACKAGES or any(rest.partition(".")[0] in rooms for rest in inside)
 
 
-def _objects(config: Any, *, built: bool = False) -> Iterator[dict[str, Any]]:
-    """Every object of a configuration that names a class, or should; what training alone uses only if it is built."""
-    stack = [config]
+def _objects(config: Any, *, built: bool = False) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(where, what) of every object of a configuration that names a class, or should; what training alone uses only if
+    it is built. Where it is: ``the activation of its layer 'action'``; empty where that is not known.
+    """
+    stack = [("", "", config)]
     while stack:
-        value = stack.pop()
+        layer, key, value = stack.pop()
         if isinstance(value, dict):
-            if "class_name" in value or "registered_name" in value or "__lambda__" in value:
-                yield value
-            stack.extend(v for k, v in value.items() if built or k != "compile_config")
+            if "class_name" in value or "registered_name" in value or "__lambda__" in value or _is_bytecode(value):
+                yield f"the {key} of its layer {layer!r}" if layer and key else "", value
+            layer = str(value["name"])[:80] if key == "config" and isinstance(value.get("name"), str) else layer
+            stack.extend((layer, k[:80], v) for k, v in value.items() if built or k != "compile_config")
         elif isinstance(value, list):
-            stack.extend(value)
+            stack.extend((layer, key, v) for v in value)
+
+
+def _is_bytecode(value: dict[str, Any]) -> bool:
+    """Whether this is a lambda as Keras writes an activation: its marshalled code, its defaults, its closure."""
+    parts = value.get("value")
+    return value.keys() == {"value"} and isinstance(parts, list) and len(parts) == 3 and isinstance(parts[0], str)
+
+
+def _own_function(named: dict[str, Any]) -> str | None:
+    """What a function of the user's own is called: an activation, an initialiser; None where it is a class."""
+    if _is_bytecode(named) or named.get("class_name") == "__lambda__":
+        return "a lambda (__lambda__)"
+    if named.get("module") == "builtins" and named.get("class_name") == "function":
+        return f"the function {str(named.get('config'))[:80]!r}"
+    return None
+
+
+def _function(place: str, function: str) -> NotAPolicyError:
+    return NotAPolicyError(
+        f"{place or 'a part of the Keras model'} is {function}, which is code and no layer of Keras",
+        why="of a function the file has the bytecode or the name alone, and no code in a file is run",
+        fix="save it with an activation or layers of Keras in its place; or in the process that trains it: "
+        "export_model(keras_model=model)",
+    )
 
 
 def _code(name: str) -> NotAPolicyError:

@@ -1,8 +1,9 @@
 """The arrays and the configuration of an HDF5 file, read by h5py in a confined process.
 
 ``python -m converters.formats.keras.hdf5_child``. Loads by ``path`` an ``.h5``, or a ``.keras``'s
-``model.weights.h5``; run, it gives JSON as ``index`` ({"config", "version", "training", "arrays": [[layer, name], …]}),
-and the arrays as ``0``, ``1``, ….
+``model.weights.h5``; run, it gives JSON as ``index`` ({"config", "version", "training", "names",
+"arrays": [[layer, name], …]}), and the arrays as ``0``, ``1``, …; none of an ``.h5`` that is no model, whose names say
+what it is.
 The HDF5 library has met hostile files before: it has no network here, writes nothing, and can end without harm. What
 lies elsewhere, refers to something, or is larger than the file is refused before it is read.
 """
@@ -13,7 +14,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import count, takewhile
+from itertools import count, islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +28,20 @@ from signatures.errors import DamagedFileError, ExportModelError
 
 WEIGHTS = "model.weights.h5"
 _MAX_DEPTH, _MAX_ENTRIES = 32, 1 << 14
+#: Names of what lies in a file that are told, for a message.
+_SHOWN = 20
 #: How much larger the weights in a ``.keras`` may be than the archive: Keras does not compress them.
 _MAX_RATIO, _FREE = 8, 1 << 20
 
 
-def _opened(path: str) -> tuple[io.BytesIO, int]:
-    """(the HDF5 file's bytes, their number)."""
+def _opened(path: str) -> tuple[io.BytesIO, int, bool]:
+    """(the HDF5 file's bytes, their number, whether they lie in a ``.keras``)."""
     data = Path(path).read_bytes()
     if not data.startswith(b"PK"):
-        return io.BytesIO(data), len(data)
+        return io.BytesIO(data), len(data), False
     with opened(data) as archive:
         content = entry_of(archive, WEIGHTS, _MAX_RATIO * len(data) + _FREE)
-    return io.BytesIO(content), len(content)
+    return io.BytesIO(content), len(content), True
 
 
 class _Weights:
@@ -46,16 +49,21 @@ class _Weights:
         import h5py
 
         self.h5py = h5py
-        stream, self.left = _opened(path)
+        stream, self.left, zipped = _opened(path)
         self.entries = _MAX_ENTRIES
         with h5py.File(stream, "r") as file:
             said = ("model_config", "keras_version", "training_config")
             config, version, training = (self._text(file.attrs, key) for key in said)
-            root = self._group(file, "model_weights") or file
-            arrays = [*(self._listed(root) if "layer_names" in root.attrs else self._found(root, "", 0))]
-        index = {"config": config, "version": version, "training": training, "arrays": [name for name, _ in arrays]}
+            names = [str(name) for name in islice(file, _SHOWN)]
+            arrays = [] if config is None and not zipped else [*self._arrays(file)]
+        texts = {"config": config, "version": version, "training": training}
+        index = {**texts, "names": names, "arrays": [name for name, _ in arrays]}
         self.tensors = {str(i): array for i, (_, array) in enumerate(arrays)}
         self.tensors["index"] = np.frombuffer(json.dumps(index).encode(), np.uint8)
+
+    def _arrays(self, file: Any) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+        root = self._group(file, "model_weights") or file
+        return self._listed(root) if "layer_names" in root.attrs else self._found(root, "", 0)
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
         return self.tensors

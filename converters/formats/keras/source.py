@@ -82,7 +82,7 @@ def _stored(given: Fetched) -> tuple[Any, Weights, str, str]:
         return config, Groups({name: a for (_, name), a in stored.arrays.items()}), version, loss_of(compiled)
     stored = stored_in(path)
     if stored.config is None:
-        raise no_configuration()
+        raise no_configuration(stored.names)
     config = _configuration(stored.config)
     refuse_code(config)
     entries = [(name, array) for (_, name), array in stored.arrays.items()]

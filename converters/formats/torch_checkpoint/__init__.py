@@ -14,10 +14,8 @@ else:
 
 
 def _sniff(file: Content) -> bool:
-    """A pickle, alone or in an archive."""
-    return file.starts(b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05") or any(
-        name.endswith("data.pkl") for name in file.entries
-    )
+    """What torch.save writes: an archive with a pickle, or pickles in a row."""
+    return file.is_torch_row or any(name.endswith("data.pkl") for name in file.entries)
 
 
 FORMATS = (

@@ -58,6 +58,14 @@ FORBIDDEN = frozenset(
     )
 )
 
+#: Ops of other projects → (why they are not converted, what to do).
+_REMEDIES: Mapping[str, tuple[str, str]] = {
+    "XlaCallModule": (
+        "JAX (jax2tf) wrote the network as StableHLO inside of one op, which XLA alone runs",
+        "export it from JAX with jax2onnx (pip install jax2onnx), and give the .onnx",
+    ),
+}
+
 # Ops that have no entry, because none is left when the compiler begins: readers replace them (a variable by its value,
 # a call by what the function computes) or leave them out. TensorFlow's names, 1.0 to 2.21.
 
@@ -150,6 +158,8 @@ def unsupported(nodes: Iterable[Node]) -> UnsupportedOpError:
             f"{forbidden[0]} reaches outside the graph (files, processes, Python); such a model is not run or converted"
         )
         fix = "freeze only the policy's own outputs; the op belongs to training or to a debugging aid"
+    elif remedy := next((_REMEDIES[op] for _, op in issues if op in _REMEDIES), None):
+        why, fix = remedy
     elif loops:
         why = "a loop or branch is left whose number of steps or condition is not known before the graph runs"
         fix = "give the placeholder that decides it a value: --set NAME=VALUE (sequence_length is set to 1 by itself)"
