@@ -123,8 +123,9 @@ class RefusedError(ExportModelError):
 
     def __init__(self, errors: Sequence[ExportModelError], count: int) -> None:
         self.errors, self._count = tuple(errors), count
+        rest = "; the others were" if len(errors) < count else ""
         super().__init__(
-            f"{len(errors)} of {count} sources could not be exported; the others were",
+            f"{len(errors)} of {count} sources could not be exported{rest}",
             why="\n".join(e.message for e in errors),
         )
 

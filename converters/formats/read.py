@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from converters.files.fetch import Fetched
 from converters.formats.bundle import BUNDLE
@@ -13,8 +15,10 @@ from converters.formats.recognise import not_readable, recognised
 from converters.formats.registry import FORMATS
 from converters.formats.source import ReadOptions, SourceModel
 from signatures.contract import POLICY
-from signatures.errors import BundleError, ExportModelError, SourceError, UsageError, naming
+from signatures.errors import BundleError, ExportModelError, RefusedError, SourceError, UsageError, naming
 
+_Part = TypeVar("_Part")
+_Made = TypeVar("_Made")
 #: What only some sources have a use for: option, flag, and what to give to have one.
 _TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"), ("activation", "a state dictionary"))
 
@@ -40,8 +44,13 @@ def check_options(found: Format, path: Path, options: ReadOptions) -> None:
             )
 
 
-def read_models(given: Fetched, found: Format, options: ReadOptions) -> list[SourceModel]:
-    """The models of a source. Raises SourceError, GraphError and their kinds, UsageError."""
+def read_models(
+    given: Fetched, found: Format, options: ReadOptions, refused: list[ExportModelError] | None = None
+) -> list[SourceModel]:
+    """The models of a source. Raises SourceError, GraphError and their kinds, UsageError.
+
+    With ``refused``, which gets the errors, a member of a folder that cannot be read does not refuse the others.
+    """
     import numpy as np
 
     with np.errstate(all="ignore"):  # weights may be any numbers
@@ -49,7 +58,31 @@ def read_models(given: Fetched, found: Format, options: ReadOptions) -> list[Sou
             return found.read(given, options)
         members = [_artefact(given.path)] if found.members is None else found.members(given.path, options)
         inside = replace(options, step=None)
-        return [model for member in members for model in _of_member(member, given, inside)]
+        if refused is None or len(members) < 2:
+            return [model for member in members for model in _of_member(member, given, inside)]
+        return each_or_refused(members, lambda member: _of_member(member, given, inside), refused)
+
+
+def each_or_refused(
+    parts: Sequence[_Part], made: Callable[[_Part], Sequence[_Made]], refused: list[ExportModelError]
+) -> list[_Made]:
+    """All that is ``made`` of the parts of a source; ``refused`` gets the errors of the others.
+
+    Raises UsageError where the call is wrong, whatever the part, and the error where nothing is left.
+    """
+    found: list[_Made] = []
+    errors: list[ExportModelError] = []
+    for part in parts:
+        try:
+            found += made(part)
+        except UsageError:
+            raise
+        except ExportModelError as error:
+            errors.append(error)
+    if errors and not found:
+        raise errors[0] if len(errors) == 1 else RefusedError(errors, len(parts))
+    refused += errors
+    return found
 
 
 def _artefact(folder: Path) -> Member:

@@ -154,15 +154,15 @@ class Console:
             say_paragraph(missing)
         say_paragraph(verdict(report), colour=_COLOURS[report.passed])
 
-    def whole(self, reports: Sequence[ParityReport]) -> None:
-        """What came of several policies, in one line."""
-        if len(reports) < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
+    def whole(self, reports: Sequence[ParityReport], refused: int = 0) -> None:
+        """What came of several policies, in one line; ``refused`` sources or bundles were."""
+        if len(reports) + refused < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
             return
         from exporter.reports.summary import whole_summary
 
-        verdicts = {r.passed for r in reports}
+        verdicts = {*(r.passed for r in reports), *([False] if refused else [])}
         colour = _COLOURS[False if False in verdicts else None if None in verdicts else True]
-        say_paragraph(whole_summary(reports), colour=colour)
+        say_paragraph(whole_summary(reports, refused), colour=colour)
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""

@@ -147,7 +147,7 @@ def export_command(
             results.append(result)
             progress.clear()
             console.result(result)
-    console.whole([r.report for r in results if r.report is not None])
+    console.whole([r.report for r in results if r.report is not None], refused=len(refused))
     told = {"refused": [e.to_dict() for e in refused]} if refused else {}
     console.json({"policies": [r.to_dict() for r in results], **told})
     console.write_reports(lambda: _entries(results, options.steps))

@@ -14,7 +14,7 @@ from exporter.cli.console import Console
 from exporter.cli.options import RULES, as_given
 from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
-from exporter.fleet.sources import sources_in
+from exporter.fleet.sources import named, sources_in
 from exporter.fleet.worker import Outcome, Wanted
 from signatures.errors import UsageError
 
@@ -38,7 +38,11 @@ def run_fleet(
     """Export what the paths stand for. Ends with status 2 where a source was refused, 1 where formats disagree."""
     if cluster is not None and jobs is not None:
         raise UsageError("--jobs and --cluster contradict each other", fix="a cluster's workers are as many as it has")
-    paths = sources_in(given, options.out)
+    passed_over: list[Path] = []
+    paths = sources_in(given, options.out, passed_over)
+    if passed_over and not console.quiet:
+        many = f"{len(passed_over)} files that are not models" if len(passed_over) > 1 else "a file that is not a model"
+        say_lines(f"note: the pattern also matches {many}: {named(passed_over)}", err=True)
     wanted = Wanted(console.as_json, console.wants_reports)
     tally = _Tally(len(paths))
     entries: list[Entry] = []

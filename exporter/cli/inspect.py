@@ -93,12 +93,18 @@ def inspect_command(
         try:
             with nearby(source) as here:
                 if releases:
-                    answer, report = _unity(here, releases, sensors, actions, brain_parameters, as_json, svg)
+                    verdict, report = _unity(here, releases, sensors, actions, brain_parameters, as_json, svg)
                     found.append(report)
-                    status = max(status, answer)
+                    status = max(status, verdict)
                 else:
                     read = read_options(step, sensors, trust_source, activation)
-                    found.append(_inspected(here, compiling, read, logdir, svg, as_json))
+                    refused: list[ExportModelError] = []
+                    answer = _inspected(here, compiling, read, logdir, svg, as_json, refused)
+                    for error in refused:
+                        say_lines(f"error: {error.message}", err=True)
+                        status = 2
+                    told = {"refused": [e.to_dict() for e in refused]} if refused else {}
+                    found.append({**answer, **told})
         except ExportModelError as error:
             if len(sources) == 1:
                 raise
@@ -115,12 +121,20 @@ def inspect_command(
 
 
 def _inspected(
-    source: Path, compiling: CompileOptions, read: ReadOptions, logdir: Path | None, svg: Path | None, as_json: bool
+    source: Path,
+    compiling: CompileOptions,
+    read: ReadOptions,
+    logdir: Path | None,
+    svg: Path | None,
+    as_json: bool,
+    refused: list[ExportModelError],
 ) -> dict[str, Any]:
-    """Say what is in a source, unless it is all for a program, which gets what is returned."""
+    """Say what is in a source, unless it is all for a program, which gets what is returned; ``refused`` gets the errors
+    of a folder's files that could not be read.
+    """
     from exporter.inspect.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, compiling, read)
+    found = inspect_source(source, compiling, read, refused)
     written: list[Path] = []
     if logdir is not None or svg is not None:
         from exporter.inspect.pictures import write_pictures

@@ -13,6 +13,8 @@ import click
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
 from exporter.cli.options import JUDGING, as_given, comparing, trusting
+from exporter.cli.terminal import say_lines
+from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
 
 if TYPE_CHECKING:
     from exporter.reports.entry import Entry
@@ -49,39 +51,56 @@ def verify_command(
 
     Given a folder of bundles, it verifies all of them.
     """
-    from converters.formats.bundle.bundle import bundles_in
+    from converters.formats.bundle.bundle import bundles_in, incomplete_in
     from exporter.export.again import verify_folder
     from exporter.export.pipeline import counted
     from exporter.remote.fetching import nearby
 
     console.prepare()
-    reports = []
+    reports: list[ParityReport] = []
+    refused: list[ExportModelError] = []
     with ExitStack() as fetched, console.progress() as progress:
         near = [(given, fetched.enter_context(nearby(given))) for given in bundles]
         places = [
             (found, None if given == place else given)
             for given, place in near
-            for found in bundles_in(place) or [place]
+            for found in (*bundles_in(place), *incomplete_in(place)) or [place]
         ]
         source = None if source is None else fetched.enter_context(nearby(source))
-        for number, (folder, _) in enumerate(places, 1):
-            report = verify_folder(
-                folder,
-                source=source,
-                step=step,
-                trust_source=trust_source,
-                runtimes=runtimes,
-                options=options,
-                allow_unverified=allow_unverified,
-                progress=counted(progress, number, len(places)),
-            )
+        verified = []
+        for number, (folder, given) in enumerate(places, 1):
+            try:
+                report = verify_folder(
+                    folder,
+                    source=source,
+                    step=step,
+                    trust_source=trust_source,
+                    runtimes=runtimes,
+                    options=options,
+                    allow_unverified=allow_unverified,
+                    progress=counted(progress, number, len(places)),
+                )
+            except (UsageError, RuntimeUnavailableError):
+                raise
+            except ExportModelError as error:
+                if len(places) == 1:
+                    raise
+                refused.append(error)
+                progress.clear()
+                say_lines(f"error: {error.message}", err=True)
+                continue
             reports.append(report)
+            verified.append((folder, given))
             progress.clear()
             console.verified(report, folder)
-        console.whole(reports)
+        console.whole(reports, refused=len(refused))
         console.check_rules(reports)
-        console.json({"reports": [r.to_dict() for r in reports]})
-        console.write_reports(lambda: _bundle_entries(reports, places, options.steps))
+        told = {"refused": [e.to_dict() for e in refused]} if refused else {}
+        console.json({"reports": [r.to_dict() for r in reports], **told})
+        if reports:
+            console.write_reports(lambda: _bundle_entries(reports, verified, options.steps))
+    if refused:
+        sys.exit(2)
     if any(r.passed is False for r in reports):
         sys.exit(1)
     if any(r.undecided for r in reports) and not allow_unverified:

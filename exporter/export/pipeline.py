@@ -30,7 +30,8 @@ from exporter.export.labels import check_labels, labelled, read_labels
 from exporter.export.names import Names, Naming
 from exporter.export.options import ExportOptions
 from exporter.export.sources import Source, read_source
-from exporter.remote.fetching import nearby
+from exporter.remote.fetching import name_address, nearby
+from exporter.remote.filesystem import remote
 from exporter.remote.sending import check_free, check_sendable, landing
 from exporter.verify.checks.size import check_budget
 from exporter.verify.tolerances import check_rules
@@ -140,21 +141,33 @@ class Exporter:
         names, outputs = Names(), dict[str, list[str]]()
         for path in paths:
             with contextlib.suppress(ExportModelError), near(path) as here:
-                for job in self.compiled(here, names, progress, path):
+                for job in self.compiled(here, names, progress, path, []):
                     outputs[job.policy.name] = [s.name for s in job.policy.signature.outputs]
         check_rules(rules, outputs, {f.key: f.runtimes for f in self._formats}, self.runtimes)
         check_labels(self._labels, list(outputs))
 
     def compiled(
-        self, path: Path | str | Source, names: Naming, progress: Progress, given: Path | str | Source | None = None
+        self,
+        path: Path | str | Source,
+        names: Naming,
+        progress: Progress,
+        given: Path | str | Source | None = None,
+        refused: list[ExportModelError] | None = None,
     ) -> list[Job]:
         """The policies of a source, under the names that they will have; ``given`` is what it was called where it is
-        another's copy. Raises ExportModelError.
+        another's copy. Raises ExportModelError; with ``refused``, which gets the errors, only where all of a folder is
+        refused.
         """
         options, dress = self.options, self._dress
         progress(f"reading {path.path if isinstance(path, Source) else path}")
-        source = path if isinstance(path, Source) else read_source(path, options.read)
-        found = list(source.compiled(options.compile))
+        source = path if isinstance(path, Source) else read_source(path, options.read, refused)
+        if refused is None:
+            found = list(source.compiled(options.compile))
+        else:
+            found = source.compiled_or_refused(options.compile, refused)
+            if isinstance(given, Path | str) and (address := remote(Path(given))) is not None:
+                for error in refused:
+                    name_address(error, source.path, address)
         if options.name is not None:
             if len(found) > 1:
                 raise UsageError("--name goes with a single policy", fix="choose one with --brain, or leave --name out")
@@ -230,9 +243,9 @@ def export(
     """Export every policy of every source, one after the other; a path is read (once, if it is given twice), a Source
     was read already.
 
-    A source that is refused does not stop the others: ``refused`` is told, by default the errors of all are raised in
-    the end (``RefusedError`` where there are several sources). A disagreement is in the result, not an exception. A
-    ``pool`` that is given stays open, for callers that export many times.
+    A source that is refused, or a file of a folder, does not stop the others: ``refused`` is told, by default the
+    errors of all are raised in the end (``RefusedError`` where there are several). A disagreement is in the result, not
+    an exception. A ``pool`` that is given stays open, for callers that export many times.
     """
     if not paths:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
@@ -242,24 +255,30 @@ def export(
     exporter, names = Exporter(options), Names()
     exporter.check(paths, progress)
     errors: list[ExportModelError] = []
+    done = 0
     with contextlib.ExitStack() as opened:
         if pool is None and exporter.runtimes:
             from converters.runtimes.pool import RuntimePool
 
             pool = opened.enter_context(RuntimePool())
         for number, path in enumerate(paths, 1):
+            told = counted(progress, number, len(paths))
+            apart: list[ExportModelError] = []
             try:
-                told = counted(progress, number, len(paths))
                 with near(path) as here:
-                    yield from exporter.written(exporter.compiled(here, names, told, path), pool, told)
+                    for result in exporter.written(exporter.compiled(here, names, told, path, apart), pool, told):
+                        done += 1
+                        yield result
             except ExportModelError as error:
-                if len(paths) == 1:
+                if len(paths) == 1 and not apart:
                     raise
-                errors.append(error)
-                if refused is not None:
-                    refused(error)
+                apart.append(error)
+            errors += apart
+            if refused is not None:
+                for each in apart:
+                    refused(each)
     if errors and refused is None:
-        raise RefusedError(errors, len(paths))
+        raise RefusedError(errors, max(len(paths), len(errors) + min(done, 1)))
 
 
 def near(path: Path | str | Source) -> AbstractContextManager[Path | Source]:

@@ -10,10 +10,10 @@ from pathlib import Path
 from converters.compiler.compile import compile_graph
 from converters.compiler.options import CompileOptions
 from converters.formats.format import Format
-from converters.formats.read import check_options, fetched, read_models
+from converters.formats.read import check_options, each_or_refused, fetched, read_models
 from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.policy import Policy
-from signatures.errors import naming
+from signatures.errors import ExportModelError, naming
 from signatures.records import dataclass
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
@@ -42,10 +42,20 @@ class Source:
     def compiled(self, options: CompileOptions | None = None) -> Iterator[tuple[SourceModel, Policy]]:
         """Each model's policies; raises ExportModelError that names the file."""
         for model in self.models:
-            with naming(self.path):
-                policies = compile_graph(model.graph, self.stem(model), options, model.facts)
-                found = [(narrowed(model, policy), policy) for policy in policies]
-            yield from found
+            yield from self._of_model(model, options)
+
+    def compiled_or_refused(
+        self, options: CompileOptions | None, refused: list[ExportModelError]
+    ) -> list[tuple[SourceModel, Policy]]:
+        """The policies of all models; of several, one that is refused goes to ``refused``, and the others stay."""
+        if len(self.models) < 2:
+            return list(self.compiled(options))
+        return each_or_refused(self.models, lambda model: self._of_model(model, options), refused)
+
+    def _of_model(self, model: SourceModel, options: CompileOptions | None) -> list[tuple[SourceModel, Policy]]:
+        with naming(self.path):
+            policies = compile_graph(model.graph, self.stem(model), options, model.facts)
+            return [(narrowed(model, policy), policy) for policy in policies]
 
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
         """All policies in it."""
@@ -76,13 +86,21 @@ def live_source(kind: str, given: object) -> Iterator[Source]:
         yield Source(place, live.format, live.sha256, live.size, [live.model])
 
 
-def read_source(path: Path | str, options: ReadOptions | None = None) -> Source:
-    """Read a source. Raises SourceError, NotAPolicyError, DamagedFileError or GraphError, each naming the file."""
+def read_source(
+    path: Path | str, options: ReadOptions | None = None, refused: list[ExportModelError] | None = None
+) -> Source:
+    """Read a source. Raises SourceError, NotAPolicyError, DamagedFileError or GraphError, each naming the file.
+
+    With ``refused``, which gets the errors, a file of a folder that cannot be read does not refuse the others.
+    """
     path = Path(path)
     options = options or ReadOptions()
     given, found = fetched(path)
     check_options(found, path, options)
     with naming(path):
-        models = read_models(given, found, options)
+        errors: list[ExportModelError] = []
+        models = read_models(given, found, options, None if refused is None else errors)
+        if refused is not None:
+            refused += [error.at(str(path)) for error in errors]
         files = {f for model in models for f in model.files}
         return Source(path, found, given.digest(files), sum(f.stat().st_size for f in files), models)

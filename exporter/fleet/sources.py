@@ -25,6 +25,11 @@ _TEXT, _LINES_LOOKED_AT = "text", 1000
 _FILE_NAME = re.compile(r"\w\.[A-Za-z]\w{1,15}$")
 #: What a folder holds besides models is passed over, but for what stands there in a model's place.
 _TELLING = ("lfs_pointer",)
+#: Files that are called as models are: those that cannot be read are refused by name, not passed over.
+_MODELS = frozenset((".bytes", ".keras", ".nn", ".onnx", ".pb", ".pt", ".tflite"))
+#: What TensorFlow puts beside ``saved_model.pb``.
+_COMPANIONS = frozenset(("fingerprint.pb", "keras_metadata.pb"))
+_MOST_NAMED = 10
 
 
 def is_many(given: Sequence[Path]) -> bool:
@@ -41,8 +46,11 @@ def is_many(given: Sequence[Path]) -> bool:
         return False
 
 
-def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
+def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None = None) -> list[Path]:
     """The sources that the paths stand for, each once, in their order; those of a pattern or folder by name.
+
+    A file that is called as a model is a source, whatever it holds: its reader refuses it by name. ``passed_over`` gets
+    the other files that a pattern matched and that are not models.
 
     ``**`` goes through all folders. A ``.txt`` whose lines are paths stands for them, from where the command is called;
     ``#`` begins a comment. What is at an address is fetched later, one by one. What lies in ``out`` is no source.
@@ -52,20 +60,29 @@ def sources_in(given: Sequence[Path], out: Path) -> list[Path]:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")
     found: dict[Path, None] = {}
     for path in given:
-        here = list(_expanded(path, out.resolve()))
+        others: list[Path] = []
+        here = list(_expanded(path, out.resolve(), others))
         if not here and path.is_dir():
             recognised(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
                 f"{shown(path)} stands for no source",
-                why="nothing there is a model in any form that is read",
+                why=f"not a model in any form that is read: {named(others)}" if others else "it matches nothing",
                 fix="give model files, run folders, or folders that hold them",
             )
         found.update(dict.fromkeys(here))
+        if passed_over is not None:
+            passed_over += others
     return list(found)
 
 
-def _expanded(path: Path, out: Path) -> Iterator[Path]:
+def named(paths: Sequence[Path]) -> str:
+    """The paths, or the first and how many more."""
+    more = f" and {len(paths) - _MOST_NAMED} more" if len(paths) > _MOST_NAMED else ""
+    return ", ".join(map(shown, paths[:_MOST_NAMED])) + more
+
+
+def _expanded(path: Path, out: Path, others: list[Path]) -> Iterator[Path]:
     address = remote(path)
     if address is not None:
         yield from matching(address) if is_pattern(address) else [path]
@@ -76,21 +93,26 @@ def _expanded(path: Path, out: Path) -> Iterator[Path]:
             listed = Path(line)
             if _is_list(listed):  # one that names itself has no end
                 raise UsageError(f"{path} names another list", where=line, fix="put its lines in its place")
-            yield from _expanded(listed, out)
+            yield from _expanded(listed, out, others)
     elif not path.exists() and not _MAGIC.isdisjoint(str(path)):
-        yield from _matching(path, out)
+        yield from _matching(path, out, others)
     else:
         yield path
 
 
-def _matching(pattern: Path, out: Path) -> Iterator[Path]:
-    """What a pattern finds; of a folder that is a source itself, nothing that lies in it."""
+def _matching(pattern: Path, out: Path, others: list[Path]) -> Iterator[Path]:
+    """What a pattern finds; of a folder that is a source itself, nothing that lies in it. ``others`` gets the files
+    that are not models.
+    """
     whole: set[Path] = set()
     for match in sorted(set(_found(pattern))):
         if not whole.isdisjoint(match.parents) or _lies_in(match, out):
             continue
         if match.is_file():
-            yield from [match] if _is_source(match) else []
+            if _is_source(match) or _is_called_a_model(match):
+                yield match
+            else:
+                others.append(match)
         elif "**" not in pattern.parts or _is_source(match):  # a ** goes into the others by itself
             whole.add(match)
             yield from _walked(match, out)
@@ -164,7 +186,7 @@ def _walked(top: Path, out: Path) -> Iterator[Path]:
     while left:
         path = left.pop()
         if not path.is_dir() or (path.is_symlink() and path != top):
-            if path.is_file() and _is_source(path):
+            if path.is_file() and (_is_source(path) or _is_called_a_model(path)):
                 yield path
             continue
         if path.resolve() == out:
@@ -187,6 +209,10 @@ def _parts(folder: Path) -> list[Path]:
     members = found.members(folder, ReadOptions())
     apart = all(m.path.is_file() and m.path.parent == folder and m.path.stem == m.name for m in members)
     return [m.path for m in members] if apart else [folder]
+
+
+def _is_called_a_model(path: Path) -> bool:
+    return path.suffix.lower() in _MODELS and path.name not in _COMPANIONS
 
 
 def _is_source(path: Path) -> bool:

@@ -19,7 +19,7 @@ from exporter.export.pipeline import Exporter, ExportResult, near
 from exporter.fleet.ledger import Stamp, State, stamps, state
 from exporter.reports.entry import Entry, of_result
 from signatures.cycles import look_seldom
-from signatures.errors import ExportModelError, SourceError
+from signatures.errors import ExportModelError, RefusedError, SourceError
 from signatures.records import dataclass
 
 
@@ -66,18 +66,22 @@ class Wanted:
 def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, wanted: Wanted) -> Outcome:
     """Export one source."""
     policies: list[Written] = []
+    refused: list[ExportModelError] = []
     files: Mapping[str, Stamp] | None = None
     try:
         seen = state(path)
         with near(path) as here:
-            jobs = exporter.compiled(here, names, _silent, path)
+            jobs = exporter.compiled(here, names, _silent, path, refused)
             files = stamps(path, (f for job in jobs for f in job.model.files))
             steps = exporter.options.parity.steps
             policies.extend(_written(result, wanted, steps) for result in exporter.written(jobs, pool, _silent))
     except ExportModelError as error:
-        return Outcome(path, tuple(policies), error)
+        refused.append(error)
     except OSError as error:
         return Outcome(path, tuple(policies), SourceError("cannot be read", where=shown(path), why=error.strerror))
+    if refused:
+        told = refused[0] if len(refused) == 1 else RefusedError(refused, len(refused) + min(len(policies), 1))
+        return Outcome(path, tuple(policies), told)
     return Outcome(path, tuple(policies), seen=seen, files=files if _stays(path, seen) else None)
 
 

@@ -125,12 +125,19 @@ class Inspection:
 
 
 def inspect_source(
-    path: Path | str, options: CompileOptions | None = None, read: ReadOptions | None = None
+    path: Path | str,
+    options: CompileOptions | None = None,
+    read: ReadOptions | None = None,
+    refused: list[ExportModelError] | None = None,
 ) -> Inspection:
-    """Read and understand a source without writing anything. Raises what the export would raise."""
-    source = read_source(path, read)
+    """Read and understand a source without writing anything. Raises what the export would raise.
+
+    With ``refused``, which gets the errors, a file of a folder that is refused does not refuse the others.
+    """
+    source = read_source(path, read, refused)
+    compiled = source.compiled(options) if refused is None else source.compiled_or_refused(options, refused)
     found = []
-    for policy in source.policies(options):
+    for _, policy in compiled:
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
         targets = {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()}
         with naming(source.path):

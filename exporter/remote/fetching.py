@@ -41,11 +41,16 @@ def nearby(path: Path) -> Iterator[Path]:
         try:
             yield local
         except ExportModelError as error:
-            for part in ("what", "where", "why", "fix"):
-                if (text := getattr(error, part)) is not None:
-                    setattr(error, part, text.replace(str(local), shown(address)))
-            error.args = (error.message,)
+            name_address(error, local, address)
             raise
+
+
+def name_address(error: ExportModelError, local: Path, address: str) -> None:
+    """Have an error about a copy name the address that it came from."""
+    for part in ("what", "where", "why", "fix"):
+        if (text := getattr(error, part)) is not None:
+            setattr(error, part, text.replace(str(local), shown(address)))
+    error.args = (error.message,)
 
 
 def version(path: Path) -> str | None:

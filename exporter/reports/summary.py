@@ -101,8 +101,8 @@ def to_verify(report: ParityReport) -> str | None:
     return missing.get("onnxruntime") or next(iter(missing.values()), None)
 
 
-def whole_summary(reports: Sequence[ParityReport]) -> str:
-    """Many policies in one line."""
+def whole_summary(reports: Sequence[ParityReport], refused: int = 0) -> str:
+    """Many policies in one line, with how many files or bundles were refused."""
     counts = Counter(r.verdict for r in reports)
     said = ", ".join(f"{counts[v]} {v}" for v in ("passed", "self-consistent", "failed", "not verified") if counts[v])
     failed = [r.policy for r in reports if r.passed is False]
@@ -112,4 +112,5 @@ def whole_summary(reports: Sequence[ParityReport]) -> str:
     most = ""
     if worst is not None and not failed:
         most = f"; worst |Δ| {worst[0].cell()}: {worst[0].output} of {worst[1]}, {worst[0].where}"
-    return f"{len(reports)} policies: {said}{named}{most}"
+    told = [f"{len(reports)} {'policy' if len(reports) == 1 else 'policies'}: {said}{named}{most}"] if reports else []
+    return "; ".join([*told, *([f"{refused} REFUSED"] if refused else [])])

@@ -18,7 +18,7 @@ from converters.formats.format import Artifact, Format
 from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph
 from converters.graph.shapes import infer_types
-from signatures.contract import POLICY, Contract, FileEntry, json_of, parse
+from signatures.contract import PARITY, POLICY, Contract, FileEntry, json_of, parse
 from signatures.digest import sha256_of_file
 from signatures.errors import BundleError, UsageError
 from signatures.fields import FieldError
@@ -39,6 +39,13 @@ def bundles_in(place: Path) -> list[Path]:
     if not place.is_dir():
         return []
     return sorted(p for p in place.iterdir() if not p.name.startswith(".") and (p / POLICY).is_file())
+
+
+def incomplete_in(place: Path) -> list[Path]:
+    """The folders in ``place`` that hold a report and no contract, by name: a bundle of which that was lost."""
+    if not place.is_dir() or (place / POLICY).is_file():
+        return []
+    return sorted(p for p in place.iterdir() if (p / PARITY).is_file() and not (p / POLICY).is_file())
 
 
 @dataclass(frozen=True)
