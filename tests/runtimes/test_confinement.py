@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from converters.files.children.memory_limits import FREE
 from converters.files.children.process import RunFailedError, RuntimeProcess
 from converters.files.children.python import child_command, confined
 from converters.formats.registry import WRITTEN
+from converters.runtimes.javascript.node import _program
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from signatures.errors import RuntimeUnavailableError
@@ -37,6 +39,19 @@ ATTEMPTS = {
     "send a datagram": "import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'x', ('127.0.0.1', 9))",
     "a local socket": "import socket; socket.socket(socket.AF_UNIX)",
     "signal its parent": "import os; os.kill(os.getppid(), 0)",
+    "change a mode": "import os; os.chmod({outside!r} + '/there', 0o777)",
+    "change an owner": "import os; os.chown({outside!r} + '/there', os.getuid(), os.getgid())",
+    "change a time": "import os; os.utime({outside!r} + '/there', (1, 1))",
+    "change an attribute": "import os; os.setxattr({outside!r} + '/there', 'user.x', b'y')",
+    "start a process": "import os; os.fork() or os._exit(0); os.wait()",
+    "start a program": "import subprocess; subprocess.run(['true'], check=True)",
+    "raise a limit": "import resource as r; r.setrlimit(r.RLIMIT_DATA, (r.RLIM_INFINITY, r.RLIM_INFINITY))",
+    "limit its parent": "import os, resource as r; r.prlimit(os.getppid(), r.RLIMIT_NOFILE, (9, 9))",
+    "be nicer": "import os; os.nice(1)",
+    "choose a processor": "import os; os.sched_setaffinity(0, os.sched_getaffinity(0))",
+    "share memory": "import ctypes; exit(ctypes.CDLL(None).shmget(0, 4096, 0o1600) < 0)",
+    "use a keyring": "import ctypes; exit(ctypes.CDLL(None).syscall(250, 0, -3, 0) < 0)",
+    "leave for a namespace": "import ctypes; exit(ctypes.CDLL(None).unshare(0x10000000) < 0)",
     "trace its parent": "import ctypes, os; exit(ctypes.CDLL(None).ptrace(16, os.getppid(), 0, 0) != 0)",
 }
 
@@ -62,10 +77,13 @@ def test_it_cannot(name: str, way: str, tmp_path: Path) -> None:
     outside.mkdir()
     scratch.mkdir()
     (outside / "there").write_text("kept")
+    (outside / "there").chmod(0o644)
     with socket.create_server(("127.0.0.1", 0)) as server:
         code = ATTEMPTS[name].format(outside=str(outside), port=server.getsockname()[1])
         assert tried(code, scratch, way).returncode != 0
     assert [p.name for p in outside.iterdir()] == ["there"]
+    found = (outside / "there").stat()
+    assert (found.st_mode & 0o777, found.st_mtime > 9) == (0o644, True)
     assert (outside / "there").read_text() == "kept"
 
 
@@ -85,9 +103,22 @@ def test_it_can(code: str, tmp_path: Path) -> None:
 
 
 def test_no_core_and_no_endless_file() -> None:
-    code = "import resource as r; print(r.getrlimit(r.RLIMIT_CORE)[0], r.getrlimit(r.RLIMIT_FSIZE)[0])"
+    """For good: the hard limits are the same."""
+    code = "import resource as r; print(*r.getrlimit(r.RLIMIT_CORE), *r.getrlimit(r.RLIMIT_FSIZE))"
     done = tried(code, Path("/tmp"))
-    assert done.stdout.split() == [b"0", str(1 << 30).encode()]
+    assert done.stdout.split() == [b"0", b"0", *[str(1 << 30).encode()] * 2]
+
+
+def test_a_shim_of_node_is_looked_through(tmp_path: Path) -> None:
+    """asdf and Volta start Node as a process of their own, which a confined one cannot."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("Node is not installed")
+    shim = tmp_path / "node"
+    shim.write_text(f'#!/bin/sh\n{node} "$@"\n')
+    shim.chmod(0o755)
+    assert Path(_program(str(shim))).resolve() == Path(node).resolve()
+    assert _program(node) == node
 
 
 HUNGRY = """

@@ -2,10 +2,11 @@
 
 A model file decides what a runtime computes, and runtimes have had faults. So a child gives up, before it has seen a
 model, what it does not need: files are not written outside a scratch folder, TCP is neither listened on nor called
-(Landlock, security/landlock.rst of the kernel's documentation), no socket of any other kind is made either (seccomp),
-no core is dumped, files and their number are bounded. Memory is bounded while a request runs (process.py), because
-what is fair depends on it. All of it is Linux; elsewhere, and where a kernel lacks a part, that part is not in force,
-and ``export-model runtimes`` says so.
+(Landlock, security/landlock.rst of the kernel's documentation); no socket of any other kind is made, no process
+started, no mode, owner, time or attribute of a file changed, and nothing shared with other processes (seccomp);
+no core is dumped, files and their number are bounded, for good. Memory is bounded while a request runs (process.py),
+because what is fair depends on it. It reads what the user can read. All of it is Linux; elsewhere, and where a kernel
+lacks a part, that part is not in force, and ``export-model runtimes`` says so.
 
 A child in Python calls ``begin`` before anything else. For others this file is a program:
 ``python confinement.py FOLDER PARENT COMMAND…`` gives up the same and becomes the
@@ -40,14 +41,47 @@ _SCOPES = 0b11  # abstract sockets, signals
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2
 _SET_PDEATHSIG, _SIGKILL = 1, 9
 
-#: Machine → (its number in audit.h, the system calls that make sockets or look into other processes).
-_CALLS = {
-    # socket, socketpair, ptrace, process_vm_readv, process_vm_writev, io_uring_setup (which makes sockets, too)
-    "x86_64": (0xC000003E, (41, 53, 101, 310, 311, 425)),
-    "aarch64": (0xC00000B7, (198, 199, 117, 270, 271, 425)),
+#: What is refused → the numbers of its system calls on x86-64 and on AArch64 (asm/unistd.h of Linux 6.12).
+_REFUSED: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+    # socket, socketpair, io_uring_setup (which makes sockets, too)
+    "sockets": ((41, 53, 425), (198, 199, 425)),
+    # ptrace, process_vm_readv, process_vm_writev, kcmp, pidfd_getfd, process_madvise, perf_event_open
+    "other processes": ((101, 310, 311, 312, 438, 440, 298), (117, 270, 271, 272, 438, 440, 241)),
+    # fork, vfork (AArch64 has clone alone)
+    "processes": ((57, 58), ()),
+    # chmod, fchmod, fchmodat, fchmodat2
+    "modes": ((90, 91, 268, 452), (52, 53, 452)),
+    # chown, fchown, lchown, fchownat
+    "owners": ((92, 93, 94, 260), (54, 55)),
+    # utime, utimes, futimesat, utimensat
+    "times": ((132, 235, 261, 280), (88,)),
+    # setxattr, lsetxattr, fsetxattr, removexattr, lremovexattr, fremovexattr, setxattrat, removexattrat
+    "attributes": ((188, 189, 190, 197, 198, 199, 463, 466), (5, 6, 7, 14, 15, 16, 463, 466)),
+    # setrlimit, setpriority, ioprio_set, sched_setparam, sched_setscheduler, sched_setaffinity, sched_setattr
+    "limits and priorities": ((160, 141, 251, 142, 144, 203, 314), (164, 140, 30, 118, 119, 122, 274)),
+    # shmget, shmat, shmctl, semget, semop, semctl, semtimedop, msgget, msgsnd, msgrcv, msgctl, mq_open, mq_unlink
+    "what is shared": (
+        (29, 30, 31, 64, 65, 66, 220, 68, 69, 70, 71, 240, 241),
+        (194, 196, 195, 190, 193, 191, 192, 186, 189, 188, 187, 180, 181),
+    ),
+    # add_key, request_key, keyctl
+    "keyrings": ((248, 249, 250), (217, 218, 219)),
+    # unshare, setns, mount, umount2, pivot_root, chroot, open_tree, move_mount, fsopen, fsmount, mount_setattr, bpf,
+    # userfaultfd
+    "namespaces": (
+        (272, 308, 165, 166, 155, 161, 428, 429, 430, 432, 442, 321, 323),
+        (97, 268, 40, 39, 41, 51, 428, 429, 430, 432, 442, 280, 282),
+    ),
 }
+#: clone, clone3, prlimit64.
+_ASKED = ((56, 435, 302), (220, 435, 261))
+#: Machine → (its number in audit.h, its place in the rows above).
+_MACHINES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
+_THREAD = 0x10000  # CLONE_THREAD
+_NO_SUCH_CALL = 38  # ENOSYS, at which the C library asks for clone in the place of clone3
 _X32 = 0x40000000  # the calls of x86-64's other numbering begin here
 _PERMISSION = 1  # EPERM
+_ALLOW, _ERROR = 0x7FFF0000, 0x00050000  # SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO
 
 
 def landlock_version() -> int:
@@ -63,7 +97,7 @@ def in_force() -> dict[str, bool]:
     version, linux = landlock_version(), sys.platform == "linux"
     return {
         "writing": version >= 1,
-        "network": version >= 4 or (linux and os.uname().machine in _CALLS),
+        "network": version >= 4 or (linux and os.uname().machine in _MACHINES),
         "memory": linux,
         "processor": sys.platform != "win32",
     }
@@ -89,7 +123,7 @@ def confine(scratch: str | None) -> None:
 
 
 def limit() -> None:
-    """Bound what a process may write, open and compute. POSIX only."""
+    """Bound what a process may write, open and compute, for good. POSIX only."""
     try:
         import resource
     except ImportError:  # Windows
@@ -100,10 +134,8 @@ def limit() -> None:
         (resource.RLIMIT_NOFILE, MAX_OPEN),
         (resource.RLIMIT_CPU, MAX_CPU),
     ):
-        soft, hard = resource.getrlimit(kind)
-        least = bound if hard == resource.RLIM_INFINITY else min(bound, hard)
-        if soft == resource.RLIM_INFINITY or soft > least:
-            resource.setrlimit(kind, (least, hard))
+        soft, hard = (bound if n == resource.RLIM_INFINITY else min(n, bound) for n in resource.getrlimit(kind))
+        resource.setrlimit(kind, (soft, hard))
 
 
 def _libc() -> ctypes.CDLL:
@@ -140,25 +172,60 @@ def _landlock(scratch: str | None) -> None:
 
 
 def _seccomp() -> None:
-    """Refuse the system calls that make sockets: datagrams, raw and local ones are no matter of Landlock's."""
-    known = _CALLS.get(os.uname().machine)
+    """Refuse the system calls of ``_REFUSED``, and to start processes or to set limits; threads go on."""
+    known = _MACHINES.get(os.uname().machine)
     if known is None:
         return
-    machine, calls = known
-    load, equal, least, answer = 0x20, 0x15, 0x35, 0x06  # BPF_LD|W|ABS, BPF_JMP|JEQ|K, BPF_JMP|JGE|K, BPF_RET|K
-    allow, refuse = 0x7FFF0000, 0x00050000 | _PERMISSION
-    # The machine (offset 4 of seccomp_data), else refuse; then the call's number. Jumps count from the next step.
-    steps = [(load, 0, 0, 4), (equal, 0, len(calls) + 3, machine), (load, 0, 0, 0), (least, len(calls) + 1, 0, _X32)]
-    for position, call in enumerate(calls):
-        steps.append((equal, len(calls) - position, 0, call))
-    steps += [(answer, 0, 0, allow), (answer, 0, 0, refuse)]
-    program = ctypes.create_string_buffer(b"".join(struct.pack("<HBBI", *step) for step in steps))
+    machine, column = known
+    program = _program(machine, [n for row in _REFUSED.values() for n in row[column]], _ASKED[column])
+    steps = ctypes.create_string_buffer(program)
 
     class Program(ctypes.Structure):
         _fields_ = (("length", ctypes.c_ushort), ("steps", ctypes.c_void_p))
 
-    whole = Program(len(steps), ctypes.cast(program, ctypes.c_void_p))
+    whole = Program(len(program) // _STEP.size, ctypes.cast(steps, ctypes.c_void_p))
     _libc().prctl(_SET_SECCOMP, _FILTER, ctypes.byref(whole), 0, 0)
+
+
+#: sock_filter of linux/filter.h: the instruction, how many steps to jump where it is so and where not, the operand.
+_STEP = struct.Struct("<HBBI")
+_Step = tuple[int, int | str, int | str, int]
+_LOAD, _IF_EQUAL, _IF_LEAST, _IF_ANY, _ANSWER = 0x20, 0x15, 0x35, 0x45, 0x06
+
+
+def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int]) -> bytes:
+    """The filter: seccomp_data has the call's number at 0, the machine at 4, its arguments from 16 on, 8 bytes each."""
+    clone, clone3, prlimit = asked
+    end: list[tuple[str, _Step]] = [  # what the jumps lead to, by name
+        ("clone", (_LOAD, 0, 0, 16)),
+        ("", (_IF_ANY, "allow", "refuse", _THREAD)),
+        ("prlimit", (_LOAD, 0, 0, 32)),  # the new limit: where it is no pointer, limits are read
+        ("", (_IF_EQUAL, 0, "refuse", 0)),
+        ("", (_LOAD, 0, 0, 36)),
+        ("", (_IF_EQUAL, "allow", "refuse", 0)),
+        ("absent", (_ANSWER, 0, 0, _ERROR | _NO_SUCH_CALL)),
+        ("allow", (_ANSWER, 0, 0, _ALLOW)),
+        ("refuse", (_ANSWER, 0, 0, _ERROR | _PERMISSION)),
+    ]
+    start: list[tuple[str, _Step]] = [
+        ("", (_LOAD, 0, 0, 4)),
+        ("", (_IF_EQUAL, 0, "refuse", machine)),
+        ("", (_LOAD, 0, 0, 0)),
+        ("", (_IF_LEAST, "refuse", 0, _X32)),
+        *(("", (_IF_EQUAL, "refuse", 0, call)) for call in refused),
+        ("", (_IF_EQUAL, "clone", 0, clone)),
+        ("", (_IF_EQUAL, "absent", 0, clone3)),
+        ("", (_IF_EQUAL, "prlimit", "allow", prlimit)),
+    ]
+    steps = [*start, *end]
+    places = {name: at for at, (name, _) in enumerate(steps) if name}
+
+    def jump(to: int | str, at: int) -> int:
+        return to if isinstance(to, int) else places[to] - at - 1
+
+    return b"".join(
+        _STEP.pack(code, jump(yes, at), jump(no, at), operand) for at, (_, (code, yes, no, operand)) in enumerate(steps)
+    )
 
 
 def main(arguments: Sequence[str]) -> None:

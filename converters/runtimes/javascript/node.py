@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from functools import partial
+import subprocess
+from functools import cache, partial
 from pathlib import Path
 
 from converters.files.children.python import module_origin
@@ -179,7 +180,18 @@ def node_command(script: Path, *arguments: str) -> list[str]:
     node = node_executable()
     if node is None:
         raise RuntimeUnavailableError("Node is not installed", fix=INSTALL_NODE)
-    return [node, str(script), *arguments]
+    return [_program(node), str(script), *arguments]
+
+
+@cache
+def _program(node: str) -> str:
+    """Node itself behind a shim (asdf, nodenv, Volta), which would start it as a process: a confined one cannot."""
+    path = Path(node).resolve()
+    with path.open("rb") as file:
+        if path.stem == "node" and file.read(2) != b"#!":
+            return node
+    said = subprocess.run([node, "-p", "process.execPath"], capture_output=True, text=True, check=False)
+    return said.stdout.strip() if said.returncode == 0 and Path(said.stdout.strip()).is_file() else node
 
 
 def runner_command(script: str, name: str, *arguments: str) -> list[str]:
