@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.graph.ops.approximations import APPROXIMATIONS, RANGES
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes
@@ -62,7 +62,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     place = tmp_path_factory.mktemp("functions")
     (place / "functions.bytes").write_bytes(graph_bytes(nodes))
-    (result,) = export([place / "functions.bytes"], ExportOptions(place / "out", verify="none"))
+    (result,) = export([place / "functions.bytes"], ExportOptions(place / "out", (*DEFAULTS, "litert"), verify="none"))
     return result.folder
 
 
@@ -70,7 +70,7 @@ def artefacts(bundle: Path) -> Iterator[tuple[str, str, Path]]:
     """(format, runtime, path): each runtime once."""
     installed = {r.name for r in available_runtimes() if r.installed}
     for runtime in RUNTIMES:
-        key = next((k for k in ("bytes", "onnx", "tfjs") if runtime.name in WRITTEN[k].runtimes), None)
+        key = next((k for k in ("bytes", "onnx", "tfjs", "litert") if runtime.name in WRITTEN[k].runtimes), None)
         if runtime.independent and key is not None and runtime.name in installed and "@" not in runtime.name:
             yield key, runtime.name, bundle / WRITTEN[key].main_of("functions")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, TypeAlias
 
-Arithmetic: TypeAlias = Literal["processor", "graphics"]
+Arithmetic: TypeAlias = Literal["processor", "graphics", "phone"]
 
 #: Op → (units in the last place of the result, absolute): the farther of both counts. The worst of TensorFlow 1.4, 1.7
 #: and 2.21 (Eigen), onnxruntime 1.31 and its wasm build 1.30 (MLAS), TensorFlow.js 4.22's cpu and wasm (XNNPACK).
@@ -47,6 +47,15 @@ _GRAPHICS = {
     "Softplus": (7, 1.1e-7),
     "Tanh": (6, 1.4e-7),
 }
+#: LiteRT 2.3, with XNNPACK and without, where it is worse: XNNPACK's exp, and formulas for what it has no operator for.
+_PHONE = {
+    "Erf": (5, 4.9e-7),
+    "Exp": (27, 0),
+    "Expm1": (27, 9e-8),
+    "Log": (3, 5.7e-7),
+    "Log1p": (3, 3.1e-7),
+    "Softplus": (7, 5.8e-7),
+}
 #: One unit in the last place above 1: Eigen's tanh in TensorFlow 1.4 gives that.
 _ONE = 1 + 2.0**-23
 #: What no runtime's function goes beyond, however it approximates it (measured there, too): log(1 - tanh(x)² + 1e-6) of
@@ -58,4 +67,5 @@ RANGES: Mapping[str, tuple[float, float]] = {
 APPROXIMATIONS: Mapping[Arithmetic, Mapping[str, tuple[float, float]]] = {
     "processor": _PROCESSOR,
     "graphics": {**_PROCESSOR, **_GRAPHICS},
+    "phone": {**_PROCESSOR, **_PHONE},
 }

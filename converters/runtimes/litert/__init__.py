@@ -1,5 +1,6 @@
 """LiteRT: with XNNPACK, as it comes and as phones run it, and with its own kernels alone, as boards do."""
 
+from dataclasses import replace
 from functools import partial
 
 from converters.runtimes.packages import package_runtime
@@ -11,4 +12,5 @@ _litert = partial(
     distributions=DISTRIBUTIONS,
     package="ai_edge_litert",
 )
-RUNTIMES = (_litert("litert"), _litert("litert-plain", child=("litert", "plain")))
+_BOTH = (_litert("litert"), _litert("litert-plain", child=("litert", "plain")))
+RUNTIMES = tuple(replace(runtime, arithmetic="phone") for runtime in _BOTH)
