@@ -1,1 +1,1 @@
-"""Trainers' networks rebuilt from a state dictionary, one recipe each."""
+"""Trainers' networks rebuilt from a state dictionary: a room each, listed in ``registry.py``."""

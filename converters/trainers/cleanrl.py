@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from converters.files.torch_archive import Archive
@@ -16,15 +17,17 @@ from converters.graph.nn.activations import Activation
 from converters.graph.nn.normalisation import layer
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
+from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights, pytorch_alone
 from converters.trainers.rsl_rl import per_action
+from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
 from signatures.roles import Role
 
-USUAL = "CleanRL's scripts have tanh in PPO, relu elsewhere and before images"
-EXPORT_ONNX = "export the policy to ONNX in its own project (torch.onnx.export), and give that"
+_USUAL = "CleanRL's scripts have tanh in PPO, relu elsewhere and before images"
+_EXPORT_ONNX = "export the policy to ONNX in its own project (torch.onnx.export), and give that"
 #: The logarithm of SAC's deviation lies between these.
 _LOWEST, _HIGHEST = -5.0, 2.0
 #: (kernel, stride) of the convolutions before Atari's images.
@@ -64,7 +67,7 @@ class _Making:
     memory: tuple[str, ...] = ()
 
 
-def state_of(value: Any) -> tuple[Mapping[Any, Any], _Script] | None:
+def _state_of(value: Any) -> tuple[Mapping[Any, Any], _Script] | None:
     """The policy's state dictionary in what was saved, and the kind of script; None where it is none of CleanRL's."""
     candidates = [value, *(value if isinstance(value, tuple | list) else ())]
     if isinstance(value, dict):
@@ -78,14 +81,14 @@ def state_of(value: Any) -> tuple[Mapping[Any, Any], _Script] | None:
     return None
 
 
-def to_graph(
+def _to_graph(
     archive: Archive, state: Mapping[Any, Any], script: _Script, activation: Activation, told: Sequence[tuple[int, ...]]
 ) -> tuple[Graph, SourceFacts]:
     """The policy and what is known of it; ``told`` says the image's shape, where there is one.
 
     Raises SourceError for parts that are not known, DamagedFileError, UsageError.
     """
-    weights = Weights(archive, state, holder="its policy", maker="CleanRL", fix=EXPORT_ONNX)
+    weights = Weights(archive, state, holder="its policy", maker="CleanRL", fix=_EXPORT_ONNX)
     weights.forget("critic", "_critic")
     making = _Making(Network(weights), activation, told, {}, [])
     meaning = script.build(making)
@@ -238,7 +241,7 @@ def _ppo_discrete(making: _Making) -> str:
             raise SourceError(
                 "its actor and its critic are of no PPO",
                 why="its critic reads other numbers than its actor: what bounds the actor's action is not in the file",
-                fix=EXPORT_ONNX,
+                fix=_EXPORT_ONNX,
             )
     if "lstm.weight_ih_l0" in net.state:
         x, making.memory = net.remembering(x, "lstm")
@@ -319,3 +322,13 @@ _SCRIPTS = (
     _Script(("network.0.", "atoms"), "C51", _values, "relu", "c51.py and c51_atari.py"),
     _Script(("network.0.",), "DQN or PQN", _values, "relu", "dqn.py, dqn_atari.py and pqn.py"),
 )
+
+
+def _rebuild(saved: Saved, found: tuple[Mapping[Any, Any], _Script]) -> Rebuilt:
+    state, script = found
+    activation, files, notes = activation_of(saved.given, saved.activation, _USUAL, script.default)
+    graph, facts = _to_graph(saved.archive, state, script, activation, saved.sensors)
+    return Rebuilt(graph, replace(facts, notes=(*facts.notes, *notes)), files)
+
+
+TRAINER = Trainer("CleanRL", lambda saved: _state_of(saved.value), _rebuild)

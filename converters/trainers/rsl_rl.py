@@ -8,6 +8,7 @@ runners/on_policy_runner.py of 2.3 and 3.1; rsl_rl/models/*.py and algorithms/pp
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,15 @@ from converters.graph.nn.activations import Activation
 from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32
 from converters.policy.facts import SourceFacts
+from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights, pytorch_alone
+from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.records import dataclass
 from signatures.roles import Role
 
-USUAL = "rsl_rl's default is elu"
-EXPORT_ONNX = "export the policy to ONNX in its own project (rsl_rl's exporter, torch.onnx.export), and give that"
+_USUAL = "rsl_rl's default is elu"
+_EXPORT_ONNX = "export the policy to ONNX in its own project (rsl_rl's exporter, torch.onnx.export), and give that"
 #: Added to the deviation by ``EmpiricalNormalization``.
 _EPSILON = 1e-2
 _NORMALISER = "obs_norm"
@@ -51,7 +54,7 @@ _LAYOUTS = (
 _TRAINING = ("critic", "memory_c.", "teacher", "memory_t.", "distribution.distribution")
 
 
-def layout_of(value: Any) -> _Layout | None:
+def _layout_of(value: Any) -> _Layout | None:
     """Where the policy is in a checkpoint; None where it is none of rsl_rl's."""
     for layout in _LAYOUTS:
         state = value.get(layout.key) if isinstance(value, dict) else None
@@ -60,13 +63,13 @@ def layout_of(value: Any) -> _Layout | None:
     return None
 
 
-def to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts]:
+def _to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts]:
     """The policy and what is known of it. Raises SourceError for parts that are not known, DamagedFileError."""
     state: Mapping[Any, Any] = archive.value[layout.key]
     beside = archive.value.get("obs_norm_state_dict")
     if isinstance(beside, dict):  # up to 2.3
         state = {**state, **{f"{_NORMALISER}.{k}": v for k, v in beside.items()}}
-    weights = Weights(archive, state, holder="its policy", maker="rsl_rl", fix=EXPORT_ONNX)
+    weights = Weights(archive, state, holder="its policy", maker="rsl_rl", fix=_EXPORT_ONNX)
     weights.forget(*_TRAINING)
     net = Network(weights)
     recurrent = f"{layout.memory}.weight_ih_l0" in weights
@@ -129,3 +132,12 @@ def per_action(net: Network, mean: str, values: np.ndarray, name: str) -> None:
     """An output that is the same for every agent: one number per action, a row per agent."""
     net.at(name)
     net.output(name, net.add("Add", [net.add("ZerosLike", [mean]), net.const(values, "value")]))
+
+
+def _rebuild(saved: Saved, layout: _Layout) -> Rebuilt:
+    activation, files, notes = activation_of(saved.given, saved.activation, _USUAL)
+    graph, facts = _to_graph(saved.archive, layout, activation)
+    return Rebuilt(graph, replace(facts, notes=(*facts.notes, *notes)), files)
+
+
+TRAINER = Trainer("rsl_rl", lambda saved: _layout_of(saved.value), _rebuild)

@@ -143,6 +143,16 @@ def test_rooms_import_only_those_below_them() -> None:
     assert not upward
 
 
+def test_readers_name_no_trainer() -> None:
+    """A trainer is a room and a line of the registry: no reader asks one by its name."""
+    from converters.trainers.registry import ROOMS
+
+    names = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", ".") for p in MODULES}
+    theirs = {n for n in names for room in ROOMS if f"{n}.".startswith(f"converters.trainers.{room}.")}
+    outside = [p for p in MODULES if not p.is_relative_to(ROOT / "converters/trainers")]
+    assert importing(outside, lambda m: own_imports(m, names) & theirs) == {}
+
+
 def test_every_module_of_converters_lies_in_a_room() -> None:
     rooms = {path.relative_to(ROOT).parts[1] for path in MODULES if path.is_relative_to(ROOT / "converters")}
     assert rooms == {"__init__.py", *ROOMS_FROM_BELOW}

@@ -14,8 +14,9 @@ from converters.files.file_probe import json_in
 from converters.files.torch_archive import Archive
 from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
 from converters.formats.source import ReadOptions, SourceModel
-from converters.trainers.stable_baselines3.policy import to_graph
-from signatures.errors import DamagedFileError, NotAPolicyError
+from converters.trainers.registry import rebuild
+from converters.trainers.trainer import Saved
+from signatures.errors import DamagedFileError
 
 _DATA, _POLICY = "data", "policy.pth"
 #: Stable-Baselines3 does not compress; a ZIP that was packed again shrinks JSON to a tenth, weights hardly.
@@ -40,13 +41,8 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         raise DamagedFileError("its data is not JSON", why=str(error)[:200], fix=_COPY_AGAIN) from error
     if not isinstance(content, dict):
         raise DamagedFileError("its data is no JSON object", why="what was saved is one", fix=_COPY_AGAIN)
-    archive = Archive(policy)
-    if not isinstance(archive.value, dict):
-        raise NotAPolicyError(
-            "its policy.pth is no state dictionary", why="model.save writes one", fix="save the model again: model.save"
-        )
-    graph, facts = to_graph(content, archive, archive.value, options.activation)
-    return [SourceModel(graph, files, facts)]
+    made = rebuild(Saved(given, Archive(policy), content, activation=options.activation))
+    return [SourceModel(made.graph, files, made.facts)]
 
 
 def _entries(data: bytes) -> list[bytes]:

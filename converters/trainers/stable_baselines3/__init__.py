@@ -1,1 +1,21 @@
-"""Stable-Baselines3's policies, rebuilt from their description and weights."""
+"""Policies of Stable-Baselines3 and sb3-contrib, whose settings (``data``) lie beside the weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from converters.trainers.stable_baselines3.policy import to_graph
+from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from signatures.errors import NotAPolicyError
+
+
+def _rebuild(saved: Saved, data: Mapping[str, Any]) -> Rebuilt:
+    if not isinstance(saved.value, dict):
+        raise NotAPolicyError(
+            "its policy.pth is no state dictionary", why="model.save writes one", fix="save the model again: model.save"
+        )
+    return Rebuilt(*to_graph(data, saved.archive, saved.value, saved.activation))
+
+
+TRAINER = Trainer("Stable-Baselines3", lambda saved: saved.settings, _rebuild, by_names=False)

@@ -1,0 +1,80 @@
+"""The list of trainers: all that there is to register. A room's ``TRAINER`` says what it recognises and rebuilds."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from converters.files.unpickle import Tensor
+from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from signatures.errors import NotAPolicyError
+
+#: Rooms of ``converters/trainers``, in the order in which they are asked.
+ROOMS = (
+    "stable_baselines3",
+    "mlagents",
+    "rsl_rl",
+    "cleanrl",
+)
+TRAINERS: tuple[Trainer, ...] = tuple(importlib.import_module(f"converters.trainers.{room}").TRAINER for room in ROOMS)
+#: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (rl_games 1.6, skrl 2,
+#: Tianshou 2, RLlib 2, Sample Factory 2).
+_OTHERS: Mapping[str, str] = {
+    "a2c_network.": "rl_games",
+    **dict.fromkeys(("log_std_parameter", "policy_layer.", "net_container.", "state_preprocessor"), "skrl"),
+    **dict.fromkeys(("actor.preprocess.", "model.model.model."), "Tianshou"),
+    **dict.fromkeys(("encoder.actor_encoder.", "_logits._model.", "_hidden_layers.0._model."), "RLlib"),
+    "action_parameterization.": "Sample Factory",
+}
+
+
+def rebuild(saved: Saved) -> Rebuilt:
+    """The policy of the first trainer that knows what was saved.
+
+    Raises NotAPolicyError where none does, and what the trainer raises.
+    """
+    for trainer in TRAINERS:
+        found = trainer.recognise(saved)
+        if found is not None:
+            return trainer.rebuild(saved, found)
+    raise _unknown(saved.value)
+
+
+def _unknown(value: Any) -> NotAPolicyError:
+    if maker := _other_trainer(value):
+        return NotAPolicyError(
+            f"is a checkpoint of {maker}, whose networks are not rebuilt",
+            why=f"it holds weights ({_content(value)}); which activations and layers they belong to stands in "
+            "the run's configuration and code",
+            fix=f"load it in {maker}, export the module that gives the action (torch.onnx.export, the "
+            "observation's normaliser included), and give the .onnx",
+        )
+    *labels, last = (t.label for t in TRAINERS if t.by_names)
+    return NotAPolicyError(
+        "is no checkpoint of a policy whose network is known",
+        why=f"it holds {_content(value)}, not the names that {', '.join(labels)} or {last} give; a state "
+        "dictionary does not say what is computed with it",
+        fix="export the model to ONNX in its own project (torch.onnx.export), and give that; of "
+        "Stable-Baselines3 give the .zip that model.save wrote",
+    )
+
+
+def _other_trainer(value: Any) -> str:
+    """Who else wrote it, by its tensors' names."""
+    names = [n for n in value if isinstance(n, str)] if isinstance(value, dict) else []
+    for part in ("model", "policy"):
+        inner = value.get(part) if names else None
+        names += [n for n in inner if isinstance(n, str)] if isinstance(inner, dict) else []
+    return next((maker for start, maker in _OTHERS.items() if any(n.startswith(start) for n in names)), "")
+
+
+def _content(value: Any) -> str:
+    if not isinstance(value, dict):
+        return f"a {type(value).__name__.lower()}" if not isinstance(value, Tensor) else "one tensor"
+    return _listed(k for k in value if isinstance(k, str)) or "nothing that has a name"
+
+
+def _listed(names: Iterable[str]) -> str:
+    found = [n[:60] for n in names]
+    return ", ".join(found[:6]) + (f" and {len(found) - 6} more" if len(found) > 6 else "")

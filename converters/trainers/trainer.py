@@ -1,0 +1,68 @@
+"""What a trainer is: one object that recognises what was saved and rebuilds the policy's network from it.
+
+A room of ``converters/trainers`` declares one as ``TRAINER``; ``registry.py`` lists the rooms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from converters.files.fetch import Fetched
+from converters.files.torch_archive import Archive
+from converters.graph.nodes import Graph
+from converters.policy.facts import SourceFacts
+from signatures.errors import UsageError
+from signatures.records import dataclass
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What was saved, and what the user says of it.
+
+    ``archive`` is PyTorch's file; ``settings`` what the trainer wrote beside it in the same source (None: nothing).
+    ``sensors`` are the shapes of what is observed, ``goals`` the places of those that are goals, ``activation`` the one
+    between layers: what weights do not tell.
+    """
+
+    given: Fetched
+    archive: Archive
+    settings: Mapping[str, Any] | None = None
+    sensors: tuple[tuple[int, ...], ...] = ()
+    goals: tuple[int, ...] = ()
+    activation: str | None = None
+
+    @property
+    def value(self) -> Any:
+        """What ``torch.save`` was given, its tensors still in the file."""
+        return self.archive.value
+
+    def refuse_activation(self, maker: str, why: str) -> None:
+        """Raise UsageError where ``--activation`` is given to a trainer whose networks have one of their own."""
+        if self.activation is not None:
+            raise UsageError(f"--activation says nothing about {maker}", why=why, fix="leave it out")
+
+
+@dataclass(frozen=True, slots=True)
+class Rebuilt:
+    """A policy, what is known of it, and the files beside the checkpoint that said something."""
+
+    graph: Graph
+    facts: SourceFacts
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Trainer:
+    """- ``label``: what people call it.
+    - ``recognise`` looks at what was saved and gives what it found, for ``rebuild``; None where another wrote it.
+    - ``rebuild`` gives the policy. It raises SourceError for parts that are not known, DamagedFileError, UsageError for
+      options that do not fit.
+    - ``by_names``: the names of its tensors alone tell it, nothing that lies beside them.
+    """
+
+    label: str
+    recognise: Callable[[Saved], Any]
+    rebuild: Callable[[Saved, Any], Rebuilt]
+    by_names: bool = True
