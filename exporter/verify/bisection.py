@@ -25,6 +25,7 @@ from converters.graph.ops.table import traits
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.difference import Difference, compare
+from exporter.verify.drawn_columns import drawn_columns
 from exporter.verify.findings import Bisection
 from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
@@ -184,7 +185,9 @@ class _Search:
             for tensor in chunk:
                 if tensor in got and (found := self._wrong(tensor, expected[tensor], got[tensor], seen)) is not None:
                     return found
-        if samplers:  # one for each branch, in their order; a joint one for all
+        if samplers and not drawn_columns(
+            self.graph, [output]
+        ):  # one for each branch, in their order; a joint one for all
             sampler = samplers[min(branch, len(samplers) - 1)]
             reason = "what it draws from agrees, what it draws does not"
             return Bisection(sampler.name, sampler.op, self.source(sampler), reason=reason)

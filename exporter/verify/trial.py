@@ -16,6 +16,7 @@ from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
 from exporter.verify.choices import Choices, broken_ties
 from exporter.verify.difference import SHARE, Difference, compare, compare_all, floored, spread, ties
+from exporter.verify.drawn_columns import without_draws
 from exporter.verify.findings import Bisection, Finding, Shape
 from exporter.verify.golden import Golden, read_golden
 from exporter.verify.options import VerifyOptions
@@ -61,7 +62,8 @@ class Trial:
         reference.remember(inputs)
         self.expected = reference.answers(inputs)
         self._apart = reference.apart()
-        if self.signature.memory is not None and self.signature.memory.output in reference.drawn:
+        drawn = {*reference.drawn, *reference.partly_drawn}
+        if self.signature.memory is not None and self.signature.memory.output in drawn:
             self.steps = []  # it keeps what was drawn: every run goes another way
         self.expected_steps = self.rolled(lambda feeds: reference.answers([feeds])[0])
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
@@ -271,9 +273,14 @@ class Trial:
         return True
 
     def _settled(self, values: Feeds) -> Arrays:
-        """Values as they are compared: log-probabilities that say "never" are all the same."""
+        """Values as they are compared: log-probabilities that say "never" are all the same, drawn columns are zeros."""
+        partly = self.reference.partly_drawn
         return {
-            n: floored(a, self.signature.branches) if n in self._scores and a.dtype.kind == "f" and a.ndim else a
+            n: floored(a, self.signature.branches)
+            if n in self._scores and a.dtype.kind == "f" and a.ndim
+            else without_draws(a, partly[n])
+            if n in partly
+            else a
             for n, a in values.items()
         }
 

@@ -27,7 +27,10 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     tested by itself (Kolmogorov-Smirnov for two samples of one size).
     """
     names = [
-        n for n in participant.outputs if trial.drawn(n, participant) and trial.signature.output(n).dtype == "float32"
+        n
+        for n in participant.outputs
+        if (trial.drawn(n, participant) or n in trial.reference.partly_drawn)
+        and trial.signature.output(n).dtype == "float32"
     ]
     if not names:
         return
