@@ -76,6 +76,8 @@ REFUSALS: Mapping[str, tuple[str, ...]] = {
     "Gather": ("int64 matrix of indices",),
     "GatherV2": ("negative axis",),
     "OneHot": ("axis 1 of 3",),
+    "SparseToDense": ("places of a matrix",),
+    "Where": ("numbers, NaN among them",),
 }
 
 #: (op, title) → why the layers give something else: the rules are float64 here, and numbers of no policy are fed.

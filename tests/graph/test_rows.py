@@ -13,7 +13,7 @@ from tests.graph.samples import SAMPLES, Sample
 
 ROWS = 3
 #: Op → what is said, where an agent cannot have an operand of its own.
-REFUSED = dict.fromkeys(("Fill", "Range", "_FusedConv2D", "_FusedMatMul"), "no form")
+REFUSED = dict.fromkeys(("Fill", "Range", "SparseToDense", "Where", "_FusedConv2D", "_FusedMatMul"), "no form")
 
 
 def others(array: np.ndarray, rng: np.random.Generator) -> np.ndarray:
