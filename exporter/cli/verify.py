@@ -15,6 +15,7 @@ from exporter.cli.group import PATH, command
 from exporter.cli.options import JUDGING, as_given, comparing, trusting
 from exporter.cli.terminal import say_lines
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
+from signatures.fields import printable
 
 if TYPE_CHECKING:
     from exporter.reports.entry import Entry
@@ -51,7 +52,8 @@ def verify_command(
 
     Given a folder of bundles, it verifies all of them.
     """
-    from converters.formats.bundle.bundle import bundles_in, incomplete_in
+    from converters.files.fetch import shown
+    from converters.formats.bundle.bundle import bundles_in, other_folders_in
     from exporter.export.again import verify_folder
     from exporter.export.pipeline import counted
     from exporter.remote.fetching import nearby
@@ -61,14 +63,16 @@ def verify_command(
     refused: list[ExportModelError] = []
     with ExitStack() as fetched, console.progress() as progress:
         near = [(given, fetched.enter_context(nearby(given))) for given in bundles]
-        places = [
-            (found, None if given == place else given)
-            for given, place in near
-            for found in (*bundles_in(place), *incomplete_in(place)) or [place]
-        ]
+        places: list[tuple[Path, Path | None]] = []
+        for given, place in near:
+            whole, (broken, others) = bundles_in(place), other_folders_in(place)
+            places += [(found, None if given == place else given) for found in (*whole, *broken) or [place]]
+            if (whole or broken) and others and not console.quiet:
+                names = ", ".join(f"{p.name} (it holds some)" if bundles_in(p) else p.name for p in others)
+                say_lines(f"note: {shown(given)} also holds folders that are not bundles: {printable(names)}", err=True)
         source = None if source is None else fetched.enter_context(nearby(source))
         verified = []
-        for number, (folder, given) in enumerate(places, 1):
+        for number, (folder, address) in enumerate(places, 1):
             try:
                 report = verify_folder(
                     folder,
@@ -90,7 +94,7 @@ def verify_command(
                 say_lines(f"error: {error.message}", err=True)
                 continue
             reports.append(report)
-            verified.append((folder, given))
+            verified.append((folder, address))
             progress.clear()
             console.verified(report, folder)
         console.whole(reports, refused=len(refused))

@@ -114,7 +114,11 @@ def test_a_changed_bundle_does_not_keep_the_others_from_being_verified(tmp_path:
     (tmp_path / "out/continuous/continuous.onnx").write_bytes(b"other")
     (tmp_path / "out/visual/parity.json").write_text("{}")
     (tmp_path / "out/visual/policy.json").unlink()
+    (tmp_path / "out/.left/").mkdir()
+    (tmp_path / "out/.left/parity.json").write_text("{}")
+    shutil.copytree(tmp_path / "out/discrete", tmp_path / "out/more/discrete")
     ran = export_model("verify", tmp_path / "out", "--runtimes", "onnxruntime", "--junit", tmp_path / "j.xml")
+    assert "also holds folders that are not bundles: more (it holds some)" in ran.err
     assert ran.status == 2
     assert "continuous.onnx" in ran.err
     assert "visual" in ran.err

@@ -41,11 +41,15 @@ def bundles_in(place: Path) -> list[Path]:
     return sorted(p for p in place.iterdir() if not p.name.startswith(".") and (p / POLICY).is_file())
 
 
-def incomplete_in(place: Path) -> list[Path]:
-    """The folders in ``place`` that hold a report and no contract, by name: a bundle of which that was lost."""
+def other_folders_in(place: Path) -> tuple[list[Path], list[Path]]:
+    """Return (folders in ``place`` with a report and no contract, which are bundles that lost it, all others that are
+    not bundles), by name.
+    """
     if not place.is_dir() or (place / POLICY).is_file():
-        return []
-    return sorted(p for p in place.iterdir() if (p / PARITY).is_file() and not (p / POLICY).is_file())
+        return [], []
+    inside = sorted(p for p in place.iterdir() if not p.name.startswith(".") and p.is_dir())
+    others = [p for p in inside if not (p / POLICY).is_file()]
+    return [p for p in others if (p / PARITY).is_file()], [p for p in others if not (p / PARITY).is_file()]
 
 
 @dataclass(frozen=True)
