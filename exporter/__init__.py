@@ -16,13 +16,13 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from exporter.acting.policy import load_policy
+    from exporter.acting.loading import load_policy
     from exporter.api import export_model, inspect_model, verify_bundle
     from exporter.compare.comparison import compare_artefacts
 
 __all__ = ["__version__", "compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"]
 
-_HOMES = {"load_policy": "exporter.acting.policy", "compare_artefacts": "exporter.compare.comparison"}
+_HOMES = {"load_policy": "exporter.acting.loading", "compare_artefacts": "exporter.compare.comparison"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,32 +1,22 @@
-"""A policy out of a bundle, ready to decide."""
+"""A policy that was loaded: what it decides, and an agent of it."""
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from exporter.acting.generator import Generator, likeliest
-from signatures.batches import Run, in_batches
-from signatures.contract import POLICY
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
+from signatures.batches import Run
+from signatures.errors import BundleError, UsageError
 from signatures.ids import check_ids
 from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
 
-if TYPE_CHECKING:
-    from converters.formats.bundle.bundle import Declared
-
 Array = np.ndarray
-#: Runtime → the format that it runs.
-_TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}
-RUNTIMES = tuple(_TAKES)
 
 
 @dataclass(frozen=True)
@@ -329,122 +319,3 @@ def _cleared(array: Array | None, rows: Array) -> Array | None:
     copy = array.copy()
     copy[rows] = 0
     return copy
-
-
-def load_policy(
-    source: Path | str, *, runtime: str | None = None, seed: int = 0, brain: str | None = None
-) -> LoadedPolicy:
-    """A policy that acts in this process.
-
-    - ``source``: a bundle, or anything that can be exported (an ``.onnx``, a ``.bytes``, a run's folder): that is
-      converted in memory, and nothing is written. ``brain`` chooses one of several policies in it.
-    - ``runtime``: ``onnxruntime`` (``pip install 'export-model[onnxruntime]'``; of a bundle it needs the ``.onnx``) or
-      ``numpy`` (of a bundle it needs the ``.bytes``; slower). Without it, the first that is there. A
-      bundle's file must be the one that was exported, by its hash.
-    - ``seed`` starts the draws: the same seed gives the same actions.
-
-    Raises BundleError, RuntimeUnavailableError, UsageError, and for a source what an export would raise::
-
-        policy = load_policy("exported/3DBall")
-        action = policy.decide(observation, deterministic=True).action
-    """
-    if runtime not in (None, *RUNTIMES):
-        raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
-    path = Path(source)
-    if path.is_dir() and (path / POLICY).exists():
-        if brain is not None:
-            raise UsageError(f"brain={brain!r}", why="a bundle holds one policy", fix="leave brain out")
-        return _of_bundle(path, runtime, seed)
-    return _of_source(path, runtime, seed, brain)
-
-
-def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
-    from converters.files.folders import scratch_folder
-    from converters.formats.bundle.bundle import Bundle
-    from converters.formats.registry import WRITTEN
-
-    found = Bundle.open(folder)
-    named = {r: found.path(WRITTEN[key]) for r, key in _TAKES.items() if found.has(WRITTEN[key])}
-    files = {r: path for r, path in named.items() if path.is_file()}
-    here = [r for r in RUNTIMES if r in files and (r == "numpy" or importlib.util.find_spec(r) is not None)]
-    if runtime is not None and runtime not in here:
-        if runtime not in files:
-            wanted = found.path(WRITTEN[_TAKES[runtime]]).name
-            raise BundleError(f"has no {wanted}", where=str(folder), fix="export the policy with it again")
-        raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
-    if not here:
-        raise BundleError(
-            "has nothing that can be run here",
-            where=str(folder),
-            why="onnxruntime runs its .onnx, numpy its .bytes",
-            fix="export the policy with --to bytes,onnx",
-        )
-    chosen = runtime or here[0]
-    found.verify_hashes(WRITTEN[_TAKES[chosen]])
-    kept = found.contract.source.noise_kept and bool(found.contract.source.noise)
-    with scratch_folder() as folder_of_copy, naming(files[chosen]):
-        vetted = WRITTEN[_TAKES[chosen]].vetted
-        assert vetted is not None
-        signature = found.signature
-        copy = vetted(files[chosen], [s.name for s in (*signature.inputs, *signature.outputs)], folder_of_copy)
-        run, declared = _RUNS[chosen](copy.read_bytes())
-    found.check_fits(files[chosen], declared)
-    run = in_batches(run, found.contract.tool.get("batch") if chosen == "onnxruntime" else None, signature)
-    return LoadedPolicy(found.name, signature, run, chosen, seed, draws_itself=kept)
-
-
-def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) -> LoadedPolicy:
-    """A source's only policy, compiled and written in memory."""
-    from converters.compiler.options import CompileOptions
-    from converters.formats.format import WriteOptions
-    from converters.formats.registry import WRITTEN
-    from exporter.export.sources import read_source
-
-    policies = read_source(path).policies(CompileOptions(brain=brain))
-    if len(policies) != 1:
-        raise UsageError(
-            f"{path} holds {len(policies)} policies",
-            fix=f"choose one: brain=…, or export it and load a bundle ({', '.join(p.name for p in policies)})",
-        )
-    (policy,) = policies
-    chosen = runtime or next(r for r in RUNTIMES if r == "numpy" or importlib.util.find_spec(r) is not None)
-    if importlib.util.find_spec(chosen) is None:
-        raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
-    with naming(path):
-        artifact = WRITTEN[_TAKES[chosen]].artifact(policy, WriteOptions("{}"))
-        run, _ = _RUNS[chosen](artifact.files[artifact.main].joined())
-    kept = policy.source.noise_kept and bool(policy.source.noise)
-    return LoadedPolicy(policy.name, policy.signature, run, chosen, seed, draws_itself=kept)
-
-
-def _in_onnxruntime(model: bytes) -> tuple[Run, Declared]:
-    import onnxruntime  # noqa: TID251  the caller asked for a policy that acts
-    from onnxruntime.capi import onnxruntime_pybind11_state as state  # noqa: TID251
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # a policy is small: threads cost more than they bring
-    options.log_severity_level = 3
-    faults: tuple[type[Exception], ...] = tuple(
-        kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)
-    )
-    try:
-        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except faults as error:
-        raise BundleError("onnxruntime does not load it", why=str(error), fix="export the policy again") from error
-
-    def run(feeds: Mapping[str, Array], fetch: Sequence[str]) -> dict[str, Array]:
-        return dict(zip(fetch, session.run(list(fetch), dict(feeds)), strict=True))
-
-    return run, {t.name: (None, t.shape) for t in (*session.get_inputs(), *session.get_outputs())}
-
-
-def _in_numpy(model: bytes) -> tuple[Run, Declared]:
-    from converters.formats.bundle.bundle import declared_by
-    from converters.formats.bundle.embed import read_runnable
-    from converters.graph.run import run_graph
-
-    graph = read_runnable(model)
-    return lambda feeds, fetch: run_graph(graph, feeds, fetch), declared_by(graph)
-
-
-_RUNS: Mapping[str, Callable[[bytes], tuple[Run, Declared]]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}

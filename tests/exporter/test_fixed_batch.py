@@ -13,7 +13,7 @@ import pytest
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
-from exporter.acting.policy import load_policy
+from exporter.acting.loading import load_policy
 from exporter.api import verify_bundle
 from exporter.export.pipeline import ExportOptions, export
 from exporter.reports.summary import failure_lines

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from converters.runtimes.pool import RuntimePool
-from exporter.acting.policy import load_policy
+from exporter.acting.loading import load_policy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.participants import Feeds
 from signatures.errors import UsageError

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from converters.files import tensorflow_messages as schema
 from converters.runtimes.pool import RuntimePool
-from exporter.acting.policy import load_policy
+from exporter.acting.loading import load_policy
 from exporter.serve import site
 from fixtures import path as fixture
 from signatures.contract import EMBEDDED

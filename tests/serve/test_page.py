@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.acting.policy import load_policy
+from exporter.acting.loading import load_policy
 from exporter.serve.site import assemble, assemble_one_file, write_site
 from fixtures.trained import run_folder
 from tests.commands import export_model

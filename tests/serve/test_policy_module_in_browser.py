@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.acting.policy import load_policy
+from exporter.acting.loading import load_policy
 from exporter.serve.site import assemble
 from fixtures import path as fixture
 from tests.acting.test_load_policy import observed

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from converters.runtimes.javascript import node as javascript
-from exporter.acting.policy import load_policy
+from exporter.acting.loading import load_policy
 from exporter.serve.onefile import one_file
 from exporter.serve.scenes import other_side
 from exporter.serve.server import TYPES

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.files.external_data import Detached
-from converters.files.fetch import read_bytes
+from converters.files.fetch import Fetched, read_bytes
 from converters.formats.onnx.messages import files_of
 from converters.formats.onnx.proto import decoded, inside, load_external
 from signatures.errors import UnsupportedOpError
@@ -71,6 +71,38 @@ def contained(path: Path, detached: Detached | None = None) -> Any:
             if length.HasField("dim_value") and length.dim_value <= 0:  # free, as the importer has it
                 length.ClearField("dim_value")
     return model
+
+
+def flat(path: Path, wanted: Sequence[str]) -> bytes:
+    """A model of a bundle, for the caller's own process: within the bounds of a source, with names of ours.
+
+    ``wanted`` are the names that stay, of inputs and outputs. onnxruntime prints a node's name as it is where the node
+    fails, and a loop of the model would have no end there. Raises what ``read_onnx`` raises, UnsupportedOpError where
+    the file has functions or graphs inside: export-model writes none.
+    """
+    from converters.formats.onnx.reader import read_onnx
+
+    read_onnx(Fetched(path))
+    model = contained(path)
+    if model.functions or any(a.HasField("g") or a.graphs for n in model.graph.node for a in n.attribute):
+        raise UnsupportedOpError(
+            "the model has functions, or graphs inside its operators",
+            why="it would run in your own process, and export-model writes none",
+            fix="export the policy again",
+        )
+    graph = model.graph
+    names = {"": "", **{name: name for name in wanted}}
+    graph.name = "policy"
+    del graph.value_info[:]
+    values = (*graph.input, *graph.output, *graph.initializer)
+    for number, node in enumerate(graph.node):
+        node.name = f"n{number}"
+        for field in (node.input, node.output):
+            field[:] = [names.setdefault(name, f"v{len(names)}") for name in field]
+    for value in values:
+        value.name = names.setdefault(value.name, f"v{len(names)}")
+    whole: bytes = model.SerializeToString(deterministic=True)
+    return whole
 
 
 def _computes(domain: str, kind: str, own: Set[tuple[str, str]]) -> bool:

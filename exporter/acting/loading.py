@@ -1,0 +1,167 @@
+"""A policy out of a bundle or a source, loaded into this process, ready to decide."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from exporter.acting.policy import LoadedPolicy
+from signatures.batches import Run, in_batches
+from signatures.contract import POLICY
+from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
+from signatures.fields import printable
+
+if TYPE_CHECKING:
+    from converters.formats.bundle.bundle import Declared
+
+Array = np.ndarray
+#: Runtime → the format that it runs.
+_TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}
+RUNTIMES = tuple(_TAKES)
+
+
+def load_policy(
+    source: Path | str, *, runtime: str | None = None, seed: int = 0, brain: str | None = None
+) -> LoadedPolicy:
+    """A policy that acts in this process.
+
+    - ``source``: a bundle, or anything that can be exported (an ``.onnx``, a ``.bytes``, a run's folder): that is
+      converted in memory, and nothing is written. ``brain`` chooses one of several policies in it.
+    - ``runtime``: ``onnxruntime`` (``pip install 'export-model[onnxruntime]'``; of a bundle it needs the ``.onnx``) or
+      ``numpy`` (of a bundle it needs the ``.bytes``; slower). Without it, the first that is there. A
+      bundle's file must be the one that was exported, by its hash.
+    - ``seed`` starts the draws: the same seed gives the same actions.
+
+    Raises BundleError, RuntimeUnavailableError, UsageError, and for a source what an export would raise::
+
+        policy = load_policy("exported/3DBall")
+        action = policy.decide(observation, deterministic=True).action
+    """
+    if runtime not in (None, *RUNTIMES):
+        raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
+    path = Path(source)
+    if path.is_dir() and (path / POLICY).exists():
+        if brain is not None:
+            raise UsageError(f"brain={brain!r}", why="a bundle holds one policy", fix="leave brain out")
+        return _of_bundle(path, runtime, seed)
+    return _of_source(path, runtime, seed, brain)
+
+
+def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
+    from converters.formats.bundle.bundle import Bundle
+    from converters.formats.registry import WRITTEN
+
+    found = Bundle.open(folder)
+    named = {r: found.path(WRITTEN[key]) for r, key in _TAKES.items() if found.has(WRITTEN[key])}
+    files = {r: path for r, path in named.items() if path.is_file()}
+    here = [r for r in RUNTIMES if r in files and (r == "numpy" or importlib.util.find_spec(r) is not None)]
+    if runtime is not None and runtime not in here:
+        if runtime not in files:
+            wanted = found.path(WRITTEN[_TAKES[runtime]]).name
+            raise BundleError(f"has no {wanted}", where=str(folder), fix="export the policy with it again")
+        raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
+    if not here:
+        raise BundleError(
+            "has nothing that can be run here",
+            where=str(folder),
+            why="onnxruntime runs its .onnx, numpy its .bytes",
+            fix="export the policy with --to bytes,onnx",
+        )
+    chosen = runtime or here[0]
+    found.verify_hashes(WRITTEN[_TAKES[chosen]])
+    kept = found.contract.source.noise_kept and bool(found.contract.source.noise)
+    signature = found.signature
+    with naming(files[chosen]):
+        model = _READS[chosen](files[chosen], [s.name for s in (*signature.inputs, *signature.outputs)])
+        run, declared = _RUNS[chosen](model)
+    found.check_fits(files[chosen], declared)
+    run = in_batches(run, found.contract.tool.get("batch") if chosen == "onnxruntime" else None, signature)
+    return LoadedPolicy(found.name, signature, run, chosen, seed, draws_itself=kept)
+
+
+def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) -> LoadedPolicy:
+    """A source's only policy, compiled and written in memory."""
+    from converters.compiler.options import CompileOptions
+    from converters.formats.format import WriteOptions
+    from converters.formats.registry import WRITTEN
+    from exporter.export.sources import read_source
+
+    policies = read_source(path).policies(CompileOptions(brain=brain))
+    if len(policies) != 1:
+        raise UsageError(
+            f"{path} holds {len(policies)} policies",
+            fix=f"choose one: brain=…, or export it and load a bundle ({', '.join(p.name for p in policies)})",
+        )
+    (policy,) = policies
+    chosen = runtime or next(r for r in RUNTIMES if r == "numpy" or importlib.util.find_spec(r) is not None)
+    if importlib.util.find_spec(chosen) is None:
+        raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
+    with naming(path):
+        artifact = WRITTEN[_TAKES[chosen]].artifact(policy, WriteOptions("{}"))
+        run, _ = _RUNS[chosen](artifact.files[artifact.main].joined())
+    kept = policy.source.noise_kept and bool(policy.source.noise)
+    return LoadedPolicy(policy.name, policy.signature, run, chosen, seed, draws_itself=kept)
+
+
+def _in_onnxruntime(model: bytes) -> tuple[Run, Declared]:
+    import onnxruntime  # noqa: TID251  the caller asked for a policy that acts
+    from onnxruntime.capi import onnxruntime_pybind11_state as state  # noqa: TID251
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # a policy is small: threads cost more than they bring
+    options.log_severity_level = 4  # errors come as exceptions; onnxruntime would print them as the file has it, too
+    known = (kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception))
+    faults: tuple[type[Exception], ...] = (*known, RuntimeError)
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except faults as error:
+        raise _fault("onnxruntime does not load it", error) from error
+
+    def run(feeds: Mapping[str, Array], fetch: Sequence[str]) -> dict[str, Array]:
+        try:
+            return dict(zip(fetch, session.run(list(fetch), dict(feeds)), strict=True))
+        except faults as error:
+            raise _fault("onnxruntime failed while it ran the policy", error) from error
+
+    return run, {t.name: (None, t.shape) for t in (*session.get_inputs(), *session.get_outputs())}
+
+
+def _fault(what: str, error: Exception) -> BundleError:
+    return BundleError(what, why=printable(str(error))[:600], fix="export the policy again")
+
+
+def _in_numpy(model: bytes) -> tuple[Run, Declared]:
+    from converters.formats.bundle.bundle import declared_by
+    from converters.formats.bundle.embed import read_runnable
+    from converters.graph.run import run_graph
+
+    graph = read_runnable(model)
+    return lambda feeds, fetch: run_graph(graph, feeds, fetch), declared_by(graph)
+
+
+def _for_onnxruntime(path: Path, names: Sequence[str]) -> bytes:
+    from converters.formats.onnx.vetted import flat
+
+    return flat(path, names)
+
+
+def _for_numpy(path: Path, names: Sequence[str]) -> bytes:
+    from converters.files.folders import scratch_folder
+    from converters.formats.registry import WRITTEN
+
+    vetted = WRITTEN["bytes"].vetted
+    assert vetted is not None
+    with scratch_folder() as folder:
+        return vetted(path, names, folder).read_bytes()
+
+
+#: What a runtime is given of a bundle's file: (the file, the names of its inputs and outputs) → a model.
+_READS: Mapping[str, Callable[[Path, Sequence[str]], bytes]] = {
+    "onnxruntime": _for_onnxruntime,
+    "numpy": _for_numpy,
+}
+_RUNS: Mapping[str, Callable[[bytes], tuple[Run, Declared]]] = {"onnxruntime": _in_onnxruntime, "numpy": _in_numpy}
