@@ -62,6 +62,11 @@ class TensorSpec:
         return f"[{', '.join('?B'[i == 0] if n is None else str(n) for i, n in enumerate(self.shape))}]"
 
     @property
+    def is_sequence(self) -> bool:
+        """Whether it observes several rows of numbers: a list of entities, or a history."""
+        return self.role in (Role.ENTITIES, Role.VECTOR) and len(self.shape) == 3
+
+    @property
     def is_continuous(self) -> bool:
         """Whether an action is of numbers, not of choices."""
         return self.role is Role.CONTINUOUS or (self.role is Role.DETERMINISTIC and self.dtype.startswith("float"))

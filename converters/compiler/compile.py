@@ -26,6 +26,7 @@ from converters.compiler.passes.passed_through import drop_passed_through
 from converters.compiler.passes.ranks import settle_ranks
 from converters.compiler.passes.signature import sign, source_map, understand_actions
 from converters.compiler.passes.simplify import collapse_views, drop_identities
+from converters.compiler.passes.small_integers import widen_small_integers
 from converters.compiler.passes.transposes import cancel_transposes
 from converters.compiler.passes.unroll import MAX_NODES, unroll
 from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
@@ -90,7 +91,7 @@ def compile_graph(
 
 def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> list[tuple[str, Compilation]]:
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
-    graph, facts = narrow_doubles(graph, facts)
+    graph, facts = widen_small_integers(*narrow_doubles(graph, facts))
     options = _by_nodes(graph, options)
     facts = drop_passed_through(graph, options, facts)
     graph, facts = _for_any_number(graph, options, facts)

@@ -25,6 +25,7 @@ class SourceFacts:
     - ``memory_layout``: the memory's parts in order; empty: found from the graph.
     - ``constants``: the ones that are no nodes of the graph.
     - ``distributions``: placeholder → what it is fed, where the format says it.
+    - ``bounds``: placeholder → the lowest and highest integer of the source's own dtype, where it was widened.
     - ``outputs``: the nodes that the format declares as outputs, with their roles where it says them; empty: it
       declares none, and any node may be an output.
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
@@ -42,6 +43,7 @@ class SourceFacts:
     memory_layout: tuple[str, ...] = ()
     constants: Mapping[str, Constant] = field(default_factory=dict)
     distributions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     outputs: Mapping[str, Role | None] = field(default_factory=dict)
     rows: int | None = None
     notes: tuple[str, ...] = ()

@@ -5,6 +5,7 @@ What is not decided is a parameter, or an error that lists the candidates.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,8 +14,13 @@ from converters.graph.nodes import Graph, Node, downstream, node_of
 from converters.graph.ops.table import is_fed, passes_on, traits
 from converters.policy.brains import Brain, close_names
 from converters.policy.memories import looks_like_state
+from converters.policy.observations import highest_colour
 from signatures.errors import SignatureError, UsageError
 from signatures.roles import INPUT_PATTERNS, INPUT_ROLES, OBSERVATIONS, Role
+
+#: Names of cameras: ML-Agents' own, and words that say so.
+_CAMERA = re.compile(r"^obs_\d+$|^observation_\d+$|visual|camera|image|pixel|rgb|screen|frame")
+_LEAST_IMAGE = 20
 
 
 def classify_inputs(
@@ -96,6 +102,8 @@ def role_by_name(base: str, node: Node) -> Role | None:
         if not pattern.fullmatch(base) or (ranks is not None and rank is not None and rank not in ranks):
             continue
         integer = isinstance(dtype, np.dtype) and dtype.kind in "iu"
+        if role is Role.VISUAL and is_board(base, node):
+            continue
         if role in (Role.SEQUENCE_LENGTH, Role.BATCH_SIZE, Role.PREV_ACTION):
             if integer:
                 return role
@@ -114,7 +122,8 @@ def _by_structure(
     for node in unknown:
         dtype = node.attrs.get("dtype")
         integer = isinstance(dtype, np.dtype) and dtype.kind in "iu"
-        if placeholder_rank(node) == 4 and (not integer or dtype == np.uint8):
+        camera = placeholder_rank(node) == 4 and (not integer or dtype == np.uint8)
+        if camera and (not is_board(node.name, node) or highest_colour(graph, node.name) > 1):
             roles[node.name] = Role.VISUAL
         elif integer and placeholder_rank(node) in (1, 2) and _feeds_one_hot(node, consumers):
             if recurrent and any(r in OBSERVATIONS for r in roles.values()):
@@ -128,7 +137,9 @@ def _by_structure(
         elif placeholder_rank(node) == 2 and not integer and _is_mask(graph, node, consumers):
             roles[node.name] = Role.MASKS
         elif declared and _has_rows(node) and not integer and not looks_like_state(node.name):
-            roles[node.name] = Role.VECTOR if placeholder_rank(node) == 2 else Role.ENTITIES
+            roles[node.name] = Role.VECTOR if _is_fixed(node) else Role.ENTITIES
+        elif declared and _is_fixed(node) and (placeholder_rank(node) or 0) > 2 and not looks_like_state(node.name):
+            roles[node.name] = Role.VECTOR  # a board
     if any(r in OBSERVATIONS for r in roles.values()):
         open_roles = [n for n in unknown if roles[n.name] is Role.PARAMETER and _is_free(n)]
         if declared and not recurrent and open_roles:
@@ -146,6 +157,24 @@ def _by_structure(
     numbered = [n for n in unknown if declared and roles[n.name] is Role.PARAMETER and placeholder_rank(n) in (1, 2)]
     if not floats and len(numbered) == 1:  # a discrete state, given as its number
         roles[numbered[0].name] = Role.VECTOR
+
+
+def is_board(name: str, node: Node) -> bool:
+    """Whether a placeholder of rank 4 is a board of a game (or a grid of objects): smaller than any camera's image.
+
+    The least that an encoder of ML-Agents takes is 20x20 (match3, for boards, takes 5x5: what is called as ML-Agents
+    calls its cameras is one), of Stable-Baselines3 36x36; Connect Four is 6x7, MiniGrid 7x7, chess 8x8, Go 19x19.
+    """
+    dims = node.dims or ()
+    sizes = [n for n in dims[1:] if n is not None]
+    named = _CAMERA.search(name.rpartition("/")[2].lower()) is not None
+    return len(dims) == len(sizes) + 1 == 4 and sorted(sizes)[1] < _LEAST_IMAGE and not named
+
+
+def _is_fixed(node: Node) -> bool:
+    """Whether a placeholder has rows of a fixed shape."""
+    dims = node.dims or ()
+    return len(dims) > 1 and dims[0] is None and None not in dims[1:]
 
 
 def _has_time_first(node: Node) -> bool:

@@ -249,7 +249,9 @@ def _label_lines(labels: Mapping[str, Any]) -> list[str]:
 def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
     known = spec.distribution or {}
     if spec.role is Role.VECTOR and known.get("kind") == "integer":
-        return f"the discrete state, {bounds_text(spec)}"
+        return f"{'a history or a board' if len(spec.shape) > 2 else 'the discrete state'}, {bounds_text(spec)}"
+    if spec.role is Role.VECTOR and len(spec.shape) > 2:
+        return "numbers along several axes (a history, a board), as the environment gives them"
     own = preprocess.get("range") == [0, 255]
     colours = "from 0 to 255 (bytes as they are)" if own else "from 0 to 1 (divide bytes by 255)"
     return _FEED.get(spec.role, spec.role.value).format(

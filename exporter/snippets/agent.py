@@ -16,7 +16,7 @@ from signatures.spec import TensorSpec
 def agent(bundle: Bundle) -> str:
     """The class, and the settings as a comment above it."""
     sensors = _sensors(bundle)
-    vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR), None)
+    vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR and len(s.shape) < 3), None)
     received, own = _actions(bundle)
     return filled(
         "agent.cs",

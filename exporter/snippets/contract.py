@@ -160,7 +160,9 @@ def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
         text = f"camera image, {how.get('layout', 'NHWC')}, colours {colours}, first row at the top"
     known = spec.distribution or {}
     if spec.role is Role.VECTOR and known.get("kind") == "integer":
-        text = f"discrete state, {bounds_text(spec)}"
+        text = f"{'history or board' if len(spec.shape) > 2 else 'discrete state'}, {bounds_text(spec)}"
+    elif spec.role is Role.VECTOR and len(spec.shape) > 2:
+        text = "numbers along several axes (a history, a board)"
     names = signature.labels.get("observations", {}).get(spec.name, [])
     return folded(f"{spec.name}: {text}", numbered(names))
 

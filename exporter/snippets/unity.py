@@ -148,6 +148,7 @@ def _scope(bundle: Bundle) -> str:
 def _faults(bundle: Bundle, generation: Generation) -> list[str]:
     signature, previous = bundle.signature, bundle.previous
     roles = [s.role for s in signature.inputs]
+    board = any(s.role is Role.VECTOR and len(s.shape) > 2 for s in signature.inputs)
     hybrid, remembers = len(bundle.heads) > 1, signature.memory is not None
     counted = not bundle.heads[0].is_continuous and _action(bundle).dtype != "int64"
     asked = [n for n in ("memory_size", "sequence_length") if f"{_scope(bundle)}{n}" not in bundle.nodes]
@@ -158,7 +159,7 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
         (counted and not hybrid, "it reads discrete actions as int64"),
         (len(signature.branches) > 1 and not generation.branches, "it has one branch of discrete actions"),
         (Role.MASKS in roles and not generation.masks, "it does not feed action masks"),
-        (Role.ENTITIES in roles or roles.count(Role.VECTOR) > 1, "it feeds one vector observation"),
+        (Role.ENTITIES in roles or roles.count(Role.VECTOR) > 1 or board, "it feeds one vector observation"),
         (remembers and not generation.memory, "its memory does not work"),
         (remembers and generation.asks and asked, f"it asks a policy with memory for {' and '.join(asked)}: {wanted}"),
         (previous and generation.previous_rank != len(previous.shape), f"it does not feed {unfed}"),

@@ -247,7 +247,7 @@ def history(folder: Path) -> None:
     keep(
         folder,
         "history",
-        {"entities_0": feeds["observation"], "recurrent_in": memory[0]},
+        {"state": feeds["observation"], "recurrent_in": memory[0]},
         {"action": results["action"], "recurrent_out": memory[1]},
     )
 

@@ -88,6 +88,16 @@ def test_gives_what_predict_gives(name: str, tmp_path: Path) -> None:
             assert answers[name_of] == pytest.approx(golden[name_of], abs=ATOL, rel=RTOL)
 
 
+def test_the_bounds_of_discrete_observations_are_known_column_by_column(tmp_path: Path) -> None:
+    """``nvec`` of a MultiDiscrete, ``n`` of a Discrete."""
+    wanted = {"ppo_branches": ("state", 0, [2, 1]), "ppo_state": ("state", 0, 5), "ppo_mixed": ("gear", 0, 2)}
+    for name, (source, low, high) in wanted.items():
+        specs = compiled(saved(name, tmp_path)).signature.inputs
+        (spec,) = [s for s in specs if source in (s.name, s.source)]
+        lows = [low] * len(high) if isinstance(high, list) else low
+        assert spec.distribution == {"kind": "integer", "low": lows, "high": high}
+
+
 def test_an_unpacked_folder_is_the_same_model(tmp_path: Path) -> None:
     with zipfile.ZipFile(FOLDER / "ppo_box.zip") as archive:
         archive.extractall(tmp_path / "ppo_box")

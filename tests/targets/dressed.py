@@ -196,7 +196,7 @@ class Pair:
                 feeds[spec.name] = value.transpose(0, 2, 3, 1)
             elif spec.role is Role.MEMORY_IN:
                 feeds[spec.name] = value.reshape(rows, 1, -1, 1)
-            elif spec.role is Role.ENTITIES:
+            elif spec.is_sequence:
                 feeds[spec.name] = value.transpose(0, 2, 1)[:, None]
             else:
                 feeds[spec.name] = value.reshape(rows, 1, 1, -1)

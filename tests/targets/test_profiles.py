@@ -22,7 +22,6 @@ from exporter import export_model
 from exporter.verify.checks.consumer import consumers
 from signatures.contract import EMBEDDED
 from signatures.errors import ProfileError, UsageError
-from signatures.roles import Role
 from tests import commands, known
 from tests.handmade import NodeDef, constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, Plain, compiled, runner_of
@@ -74,7 +73,7 @@ def is_held(path: Path, plain: Plain, wanted: Profile, folder: Path) -> bool:
         named = "it has a memory"
     elif memory is not None and memory.output is None:
         named = "not given back"
-    elif wanted.name == "barracuda-1.0" and any(s.role is Role.ENTITIES for s in policy.signature.inputs):
+    elif wanted.name == "barracuda-1.0" and any(s.is_sequence for s in policy.signature.inputs):
         named = "list of entities"
     if named:
         with pytest.raises(ProfileError, match=named):

@@ -272,7 +272,10 @@ def _inputs(compiled: Compilation, types: Types, notes: list[str]) -> tuple[dict
                 fix="give one of them another role: --input NAME=ROLE",
             )
         feeds[name] = node.name
-        distribution = compiled.facts.distributions.get(node.name) or _distribution(graph, types, node, role)
+        facts = compiled.facts
+        distribution = facts.distributions.get(node.name) or _distribution(graph, types, node, role)
+        if node.name in facts.bounds:
+            distribution = _within(distribution, facts.bounds[node.name])
         specs.append(TensorSpec(name, role, node.attrs["dtype"].name, _known_shape(node), node.origin, distribution))
         if node.name in compiled.draws:
             notes.append(f"the noise drawn inside the graph ({node.origin}) is now the input {name}; feed N(0, 1)")
@@ -307,6 +310,17 @@ def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[st
         normal = normaliser(graph, node.name) if role is Role.VECTOR else None
         return normal or id_distribution(graph, types, node)
     return None
+
+
+def _within(distribution: Mapping[str, Any] | None, bounds: tuple[int, int]) -> Mapping[str, Any]:
+    """A distribution of integers, where a bound is not known that of their dtype."""
+    known = dict(distribution or {"kind": "integer", "low": None, "high": None})
+    for key, bound in zip(("low", "high"), bounds, strict=True):
+        given = known.get(key)
+        known[key] = (
+            [bound if n is None else n for n in given] if isinstance(given, list) else bound if given is None else given
+        )
+    return known
 
 
 # ------------------------------------------------------------------ facts

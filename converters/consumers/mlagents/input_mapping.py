@@ -6,8 +6,10 @@ and its cameras numbered, gets buffers first, then cameras, then the vector (Buf
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
@@ -49,6 +51,9 @@ def take_observation(dressing: Dressing, name: str, spec: TensorSpec, *, transpo
     sizes = [d for d in shape[1:] if d is not None]
     if len(sizes) < len(shape) - 1:
         _unknown_length(dressing, spec)
+    if len(sizes) > 2:  # Unity takes three axes for an image
+        _take_flat(dressing, name, spec)
+        return
     taken = dressing.take(name, spec, (None, *sizes))
     if transposed and len(sizes) == 2 and min(sizes) > 1:
         builder = dressing.builder
@@ -56,6 +61,18 @@ def take_observation(dressing: Dressing, name: str, spec: TensorSpec, *, transpo
         taken = builder.add("Reshape", [flat, builder.ints([-1, *sizes], "shape")], f"{spec.name}/as_written")
         dressing.notes.append(f"{name} is put in order behind the input, as this consumer writes it transposed")
     dressing.give_in(spec, taken)
+
+
+def _take_flat(dressing: Dressing, name: str, spec: TensorSpec) -> None:
+    """An input [B, n] for an observation of several axes, a history or a board."""
+    sizes = [d or 0 for d in spec.shape[1:]]
+    width, known = math.prod(sizes), dict(spec.distribution or {})
+    for bound in ("low", "high", "mean", "std"):  # one for each number of the last axis
+        if isinstance(known.get(bound), list):
+            known[bound] = known[bound] * (width // sizes[-1])
+    dressing.give_in(spec, dressing.take(name, replace(spec, distribution=known or None), (None, width)))
+    shape = "x".join(map(str, sizes))
+    dressing.notes.append(f"{name} takes the {shape} numbers of {spec.name} as a row, the last axis side by side")
 
 
 #: Layout that the consumer has → the axes of an image of the other one in it, and the way back.
@@ -78,7 +95,10 @@ def take_image(dressing: Dressing, name: str, spec: TensorSpec, layout: str) -> 
 def take_joined(dressing: Dressing, name: str, vectors: list[TensorSpec]) -> None:
     """One input for all vectors, which the C# side joins in the order of its sensors."""
     if len(vectors) == 1:
-        take_observation(dressing, name, vectors[0])
+        if len(vectors[0].shape) > 2 and None not in vectors[0].shape[1:]:
+            _take_flat(dressing, name, vectors[0])
+        else:
+            take_observation(dressing, name, vectors[0])
         return
     widths = [s.shape[-1] for s in vectors]
     if any(w is None or len(s.shape) != 2 for w, s in zip(widths, vectors, strict=True)):

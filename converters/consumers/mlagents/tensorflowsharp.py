@@ -87,7 +87,7 @@ def _take_observations(dressing: Dressing, generation: Generation) -> None:
     if dressing.images and generation.pictures is not None:
         dressing.notes.append(f"pictures are taken from 0 to 1; {generation.pictures}")
     vectors = [s for s in signature.observations if s.role is Role.VECTOR]
-    if len(vectors) == 1 and np.dtype(vectors[0].dtype).kind in "iu":
+    if len(vectors) == 1 and np.dtype(vectors[0].dtype).kind in "iu" and vectors[0].shape[1:] in ((), (1,)):
         # a discrete state space is fed as int32 [B, 1] up to 0.4
         whole = generation.masks
         taken = dressing.take(generation.vector, vectors[0], (None, 1), FLOAT32 if whole else INT32)

@@ -47,10 +47,10 @@ def dress(policy: Policy, profile: str) -> Policy:
 
 def _take_observations(dressing: Dressing) -> None:
     signature = dressing.policy.signature
-    entities = [s.name for s in signature.observations if s.role is Role.ENTITIES]
+    entities = [s.name for s in signature.observations if s.is_sequence]
     if entities:
         dressing.refuse(
-            f"its observation {entities[0]} is a list of entities",
+            f"its observation {entities[0]} is a list of entities or a history",
             why="ML-Agents before 1.8 has no sensor of variable length, and no Barracuda of 1.x was seen to read one",
             fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
         )

@@ -369,7 +369,8 @@ def dressed_model(policy: Policy) -> NnModel:
 def _as_fed(spec: TensorSpec) -> Value:
     """An input as it lies in the file."""
     shape: tuple[Dim, ...] = (BATCH, *(d or 0 for d in spec.shape[1:]))
-    return Value(shape, _AXES.get(spec.role, (N, C)))
+    role = Role.ENTITIES if spec.is_sequence else spec.role
+    return Value(shape, _AXES.get(role, (N, C)))
 
 
 def _input(b: NnBuilder, spec: TensorSpec) -> Value:

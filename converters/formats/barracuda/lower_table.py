@@ -132,7 +132,7 @@ def _unknown(b: NnBuilder, node: Node) -> UnsupportedOpError:
     if node.op == "Placeholder":
         return b.refused(
             "ML-Agents of those years has nothing to feed it with",
-            "it feeds vectors, images, masks, the previous action, noise and memories; observations of variable length "
+            "it feeds vectors, images, masks, the previous action, noise and memories; lists of entities "
             "and other inputs have no place in version 16 of the format",
             "give it a value with --set NAME=VALUE or its role with --input NAME=ROLE, or leave nn out of --to",
         )

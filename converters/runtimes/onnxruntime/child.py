@@ -33,11 +33,14 @@ def main() -> None:
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
     def fitting(array: Any, shape: Sequence[Any], kind: str) -> Any:
-        """A row as the model takes it: one without an axis for the agents, and doubles."""
+        """A row as the model takes it: one without an axis for the agents, doubles, and integers of fewer bits."""
         dims = [d if isinstance(d, int) else 1 for d in shape]
         if array.ndim != len(dims) and dims and array.size == math.prod(dims):
             array = array.reshape(dims)
-        return array.astype(np.float64) if kind == "tensor(double)" else array
+        stored = {f"tensor({name})": name for name in ("int8", "uint8", "int16", "uint16")} | {
+            "tensor(double)": "float64"
+        }
+        return array.astype(stored[kind]) if kind in stored else array
 
     class Written:
         """A model that is run as it is."""

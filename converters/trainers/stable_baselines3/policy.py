@@ -203,8 +203,9 @@ def _encoded(made: _Built, key: str, space: Space, module: str) -> str:
     name = f"{name}_observation" if name in _TAKEN or name in made.roles else name
     whole = bool(space.counts)
     shape = ((len(space.counts),) if space.kind == "MultiDiscrete" else ()) if whole else space.shape
+    nature = f"{module}.cnn.0.weight" in net.state
     x = net.named_input(name, INT64 if whole else FLOAT32, (None, *shape), name)
-    made.roles[name] = {4: Role.VISUAL, 3: Role.ENTITIES}.get(len(shape) + 1, Role.VECTOR)
+    made.roles[name] = Role.VISUAL if len(shape) == 3 and (space.image or nature) else Role.VECTOR
     net.at(f"{module}.{key}")
     if whole:
         columns = [x] if not shape else [_column(net, x, i) for i in range(shape[0])]
@@ -215,7 +216,7 @@ def _encoded(made: _Built, key: str, space: Space, module: str) -> str:
         return net.concat(hot, 1)
     if space.image and _flag(made.kwargs, "normalize_images", default=True):
         x = net.add("RealDiv", [x, net.floats(255)])
-    if f"{module}.cnn.0.weight" in net.state:
+    if nature:
         return _nature(net, x, module)
     return x if len(shape) == 1 else net.reshape(x, (-1, space.size))
 
