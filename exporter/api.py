@@ -160,10 +160,12 @@ def inspect_model(
     trust_source: bool = False,
     goals: Sequence[int] = (),
     activation: str | None = None,
+    why: bool = False,
 ) -> Inspection:
     """What is in a source: its policies with their signatures. Nothing is written.
 
-    The parameters are those of ``export_model``. Raises ExportModelError::
+    The parameters are those of ``export_model``; ``why``: each policy has its ``decisions``, which rule decided what a
+    tensor is for. Raises ExportModelError::
 
         for found in inspect_model("results/first_run").policies:
             print(found.policy.name, found.policy.signature.inputs, found.targets)
@@ -171,7 +173,7 @@ def inspect_model(
     options = compile_options("canonical", "lift", False, brain, inputs, outputs, values)
     read = ReadOptions(step, tuple(tuple(s) for s in sensors), trust_source, tuple(goals), activation)
     with nearby(Path(source)) as here:
-        return inspect_source(here, options, read)
+        return inspect_source(here, options, read, why=why)
 
 
 def verify_bundle(

@@ -79,24 +79,24 @@ ALIASES = {
     "recurrent_out": Role.MEMORY_OUT,
 }
 
-#: Name patterns of inputs (scope removed), with the ranks they may have; None: any.
-INPUT_PATTERNS: tuple[tuple[re.Pattern[str], Role, tuple[int, ...] | None], ...] = (
-    (re.compile(r"state(_\d+)?"), Role.VECTOR, (1, 2)),
-    (re.compile(r"vector_observation(_\d+)?"), Role.VECTOR, (1, 2)),
-    (re.compile(r"obs_\d+"), Role.VECTOR, (2,)),
-    (re.compile(r"(visual_)?observation(_?\d+)?"), Role.VISUAL, (4,)),
-    (re.compile(r"obs_\d+"), Role.VISUAL, (4,)),
-    (re.compile(r"obs_\d+|entities_\d+"), Role.ENTITIES, (3,)),
-    # other trainers: Stable-Baselines3, CleanRL, rsl_rl; PyTorch's own input.1
-    (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VECTOR, (2,)),
-    (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VISUAL, (4,)),
-    (re.compile(r"epsilon(_\d+)?"), Role.NOISE, None),
-    (re.compile(r"action_masks"), Role.MASKS, (2,)),
-    (re.compile(r"prev_action"), Role.PREV_ACTION, (1, 2)),
-    (re.compile(r"recurrent_in|memories"), Role.MEMORY_IN, (2, 3)),
+#: Name patterns of inputs (scope removed), with the ranks they may have (None: any), and who calls them so.
+INPUT_PATTERNS: tuple[tuple[re.Pattern[str], Role, tuple[int, ...] | None, str], ...] = (
+    (re.compile(r"state(_\d+)?"), Role.VECTOR, (1, 2), "ML-Agents 0.1 and 0.2"),
+    (re.compile(r"vector_observation(_\d+)?"), Role.VECTOR, (1, 2), "ML-Agents 0.3 to 0.23"),
+    (re.compile(r"obs_\d+"), Role.VECTOR, (2,), "ML-Agents from PyTorch on"),
+    (re.compile(r"(visual_)?observation(_?\d+)?"), Role.VISUAL, (4,), "ML-Agents 0.1 to 0.23"),
+    (re.compile(r"obs_\d+"), Role.VISUAL, (4,), "ML-Agents from PyTorch on"),
+    (re.compile(r"obs_\d+|entities_\d+"), Role.ENTITIES, (3,), "ML-Agents from PyTorch on"),
+    # PyTorch's own is input.1
+    (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VECTOR, (2,), "trainers on PyTorch"),
+    (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VISUAL, (4,), "trainers on PyTorch"),
+    (re.compile(r"epsilon(_\d+)?"), Role.NOISE, None, "ML-Agents 0.1 to 0.23"),
+    (re.compile(r"action_masks"), Role.MASKS, (2,), "ML-Agents"),
+    (re.compile(r"prev_action"), Role.PREV_ACTION, (1, 2), "ML-Agents"),
+    (re.compile(r"recurrent_in|memories"), Role.MEMORY_IN, (2, 3), "ML-Agents"),
     # 0.10 and 0.14 SAC name the placeholder sequence_length_1.
-    (re.compile(r"sequence_length(_\d+)?"), Role.SEQUENCE_LENGTH, (0, 1)),
-    (re.compile(r"batch_size(_\d+)?"), Role.BATCH_SIZE, (0, 1)),
+    (re.compile(r"sequence_length(_\d+)?"), Role.SEQUENCE_LENGTH, (0, 1), "ML-Agents 0.3 to 0.23"),
+    (re.compile(r"batch_size(_\d+)?"), Role.BATCH_SIZE, (0, 1), "ML-Agents"),
 )
 
 #: Output names (scope removed) of the TensorFlow and torch generations.

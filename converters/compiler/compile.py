@@ -16,7 +16,7 @@ from converters.compiler.passes.best_action import rank_actions
 from converters.compiler.passes.doubles import narrow_doubles
 from converters.compiler.passes.fold import fold
 from converters.compiler.passes.inputs import complete_shapes, set_values, settle_inputs
-from converters.compiler.passes.memories import join_memories
+from converters.compiler.passes.memories import Joined, join_memories
 from converters.compiler.passes.mixtures import settle_mixtures
 from converters.compiler.passes.naming import name_ports
 from converters.compiler.passes.noise import settle_noise, settle_single_draws, unseeded
@@ -31,10 +31,11 @@ from converters.compiler.passes.transposes import cancel_transposes
 from converters.compiler.passes.unroll import MAX_NODES, unroll
 from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
 from converters.graph.ops.table import is_fed
-from converters.policy.brains import Brain, find_brains
+from converters.policy.brains import Brain, explain_outputs, find_brains
 from converters.policy.facts import SourceFacts
-from converters.policy.inputs import classify_inputs
+from converters.policy.inputs import classify_inputs, explain_inputs
 from converters.policy.policy import Policy
+from converters.policy.rules import Decision
 from signatures.errors import NotAPolicyError, UsageError
 
 FOLD = Pass("fold", on_graph(fold), (has.no_control_flow,), (has.constants_folded,))
@@ -91,14 +92,10 @@ def compile_graph(
 
 def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> list[tuple[str, Compilation]]:
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
-    graph, facts = widen_small_integers(*narrow_doubles(graph, facts))
-    options = _by_nodes(graph, options)
-    facts = drop_passed_through(graph, options, facts)
-    graph, facts = _for_any_number(graph, options, facts)
-    joined = join_memories(graph, options, facts)
+    joined = _prepared(graph, options, facts)
     original, options, facts = joined.graph, joined.options, joined.facts
     graph = set_values(original, options.values)
-    brains = find_brains(graph, options.outputs, facts.outputs)
+    brains = find_brains(graph, options.outputs, facts.outputs, facts.decisions)
     found = []
     for brain in _chosen_brains(brains, options.brain):
         roles = classify_inputs(graph, brain, options.inputs, facts.roles, declared=bool(facts.outputs))
@@ -126,6 +123,39 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         c = Compilation(pinned, brain, options, facts, original, pinned, roles, fetches, sources, joined.parts)
         found.append((brain.label if len(brains) > 1 else "", c))
     return found
+
+
+def explanations(
+    graph: Graph, name: str, options: CompileOptions | None = None, facts: SourceFacts | None = None
+) -> dict[str, tuple[Decision, ...]]:
+    """Policy → why its inputs and outputs have their roles, by the source's names. Raises as ``compile_graph``."""
+    with np.errstate(all="ignore"):
+        joined = _prepared(graph, options or CompileOptions(), facts or SourceFacts())
+        graph, options, facts = set_values(joined.graph, joined.options.values), joined.options, joined.facts
+        brains = find_brains(graph, options.outputs, facts.outputs, facts.decisions)
+        found = {}
+        for brain in _chosen_brains(brains, options.brain):
+            own = f"{name}-{brain.label}" if len(brains) > 1 and brain.label else name
+            told, declared = facts.decisions, bool(facts.outputs)
+            inputs = explain_inputs(graph, brain, options.inputs, facts.roles, told, declared=declared)
+            decisions = (*inputs, *explain_outputs(brain, told))
+            found[own] = tuple(replace(d, tensor=_shown(graph, d.tensor)) for d in decisions)
+    return found
+
+
+def _shown(graph: Graph, reference: str) -> str:
+    """The source's name for a tensor, or the node's."""
+    origin = _source_of(graph, reference)
+    return origin if isinstance(origin, str) else ", ".join(origin) if origin else reference
+
+
+def _prepared(graph: Graph, options: CompileOptions, facts: SourceFacts) -> Joined:
+    """A source's graph with one memory, any number of rows, and inputs of the dtypes that every target has."""
+    graph, facts = widen_small_integers(*narrow_doubles(graph, facts))
+    options = _by_nodes(graph, options)
+    facts = drop_passed_through(graph, options, facts)
+    graph, facts = _for_any_number(graph, options, facts)
+    return join_memories(graph, options, facts)
 
 
 def _for_any_number(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tuple[Graph, SourceFacts]:
@@ -170,4 +200,4 @@ def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain
     return chosen
 
 
-__all__ = ["PASSES", "compilations", "compile_graph"]
+__all__ = ["PASSES", "compilations", "compile_graph", "explanations"]

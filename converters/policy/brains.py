@@ -15,6 +15,7 @@ import numpy as np
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
 from converters.policy.memories import looks_like_state
+from converters.policy.rules import Decision, Rule
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
 from signatures.records import dataclass
 from signatures.roles import (
@@ -61,6 +62,8 @@ class Brain:
     constants: Mapping[str, Constant] = field(default_factory=dict)
     #: tensors that nothing reads and that could be outputs too, in a graph whose names say nothing
     left_out: tuple[str, ...] = ()
+    #: output's tensor → why it has its role
+    says: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -98,29 +101,59 @@ class Brain:
         return tuple(reference for _, _, reference in self.outputs)
 
 
+#: Why a tensor is an output, where no rule decides.
+_TOLD, _KNOWN, _DECLARED = "--output says so", "the format says so", "the format declares it, and no name explains it"
+_BEST = "it is the only choice of the best beside the values of actions"
+_BY_NAME = "its name is that of {} in ML-Agents' files and this tool's"
+_ALONE = "it is the only tensor made from an observation that nothing reads"
+#: Which tensors may be the action, where none is called so: the one that the first of these holds for.
+_ACTIONS: tuple[Rule[tuple[Graph, Node], Role], ...] = (
+    Rule(
+        Role.ACTION,
+        lambda s: re.search(r"action|policy|^pi$|/pi$", s[1].name.lower()) is not None,
+        "its name has the word of an action or a policy",
+    ),
+    Rule(
+        Role.ACTION,
+        lambda s: Q_NAMES.fullmatch(plain_name(s[1].name)) is not None,
+        "its name is that of the values of actions",
+    ),
+    # asked where the format declares outputs
+    Rule(Role.ACTION, lambda s: _is_choice(*s), "it is a choice, the best of some scores or drawn from them"),
+)
+
+
 def find_brains(
-    graph: Graph, wanted: Mapping[str, Role] | None = None, declared: Mapping[str, Role | None] | None = None
+    graph: Graph,
+    wanted: Mapping[str, Role] | None = None,
+    declared: Mapping[str, Role | None] | None = None,
+    told: Mapping[str, Decision] | None = None,
 ) -> tuple[Brain, ...]:
     """The policies in a graph, in graph order.
 
     ``wanted`` (source output name → role, from ``--output``) decides instead of names. ``declared`` are the outputs
-    that the format names, with their roles where it knows them. Raises NotAPolicyError when
-    there is nothing that depends on a placeholder, SignatureError when several nodes could be the action.
+    that the format names, with their roles where it knows them, and ``told`` is what its reader decided of tensors.
+    Raises NotAPolicyError when there is nothing that depends on a placeholder, SignatureError when several nodes could
+    be the action.
     """
+    told = told or {}
     if wanted:
-        return _chosen(graph, wanted, declared)
+        return _chosen(graph, wanted, declared, told)
     fed = depends_on_input(graph)
     given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
+    says = {n: told[n].says if n in told and told[n].role is role else _KNOWN for n, role in given.items()}
     if Role.ACTION not in given.values() and Role.Q_VALUES in given.values():  # an argmax beside the values
         choices = [n for n in declared or () if n in fed and n not in given and _is_choice(graph, graph[n])]
-        given |= {n: Role.ACTION for n in choices if len(choices) == 1}
+        if len(choices) == 1:
+            given[choices[0]], says[choices[0]] = Role.ACTION, _BEST
     values = [n for n, role in given.items() if role is Role.Q_VALUES]
     given |= dict.fromkeys(values[1:], Role.OTHER)
     if not {*given.values()}.isdisjoint(ACTING):
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
         scope = _scope_of(graph, [n for n, role in given.items() if role in ACTING])
         rest = [n for n in declared or () if n in fed and n not in given]
-        return (Brain(scope, (*outputs, *_others(outputs, rest)), _constants(graph, scope)),)
+        others = _others(graph, outputs, rest, told)
+        return (Brain(scope, (*outputs, *others), _constants(graph, scope), says=says | _declared(others)),)
     if declared:
         fed &= set(declared)
     scopes: dict[str, int] = {}
@@ -131,7 +164,18 @@ def find_brains(
     if scopes:
         depth = min(scopes.values())
         return tuple(_brain(graph, scope, fed) for scope, d in scopes.items() if d == depth)
-    return (_unnamed(graph, fed, set(declared or ()), given),)
+    return (_unnamed(graph, fed, set(declared or ()), given, told),)
+
+
+def explain_outputs(brain: Brain, told: Mapping[str, Decision]) -> tuple[Decision, ...]:
+    """Why a brain's outputs have their roles, and what speaks against it; ``told`` is what the reader decided."""
+    found = []
+    for _, role, reference in brain.outputs:
+        known = told.get(reference)
+        against = () if known is None else known.against if known.role is role else (known.says, *known.against)
+        found.append(Decision(reference, role, brain.says.get(reference, _KNOWN), against))
+    left = "nothing reads it, as an output, and another tensor is the action"
+    return (*found, *(Decision(name, None, left) for name in brain.left_out))
 
 
 def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
@@ -150,13 +194,14 @@ def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
 
 
 def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
-    outputs = []
+    outputs, says = [], {}
     for node in graph.nodes:
         base = node.name[len(scope) :]
         named = node.name.startswith(scope) and base in OUTPUT_NAMES
         if named and node.name in fed and not is_fed(node):
             outputs.append((base, OUTPUT_NAMES[base], node.name))
-    return Brain(scope, tuple(outputs), _constants(graph, scope))
+            says[node.name] = _BY_NAME.format(OUTPUT_NAMES[base])
+    return Brain(scope, tuple(outputs), _constants(graph, scope), says=says)
 
 
 def depends_on_input(graph: Graph, left_out: Callable[[Node], bool] = lambda node: False) -> set[str]:
@@ -190,7 +235,9 @@ def _shows_one_of(graph: Graph, name: str, nodes: Collection[str]) -> bool:
     return node.name in nodes
 
 
-def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None) -> tuple[Brain, ...]:
+def _chosen(
+    graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None, told: Mapping[str, Decision]
+) -> tuple[Brain, ...]:
     outputs: list[tuple[str, Role, str]] = []
     for name, role in wanted.items():
         node_name, _ = split_ref(name)
@@ -219,11 +266,12 @@ def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Rol
     acted = {n for n in acted if not _shows_one_of(graph, n, nodes)}
     if Role.ACTION in given or (Role.Q_VALUES in given and not acted):
         scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
-        return (Brain(scope, tuple(outputs), _constants(graph, scope)),)
+        says = {reference: _TOLD for _, _, reference in outputs}
+        return (Brain(scope, tuple(outputs), _constants(graph, scope), says=says),)
     # Naming one output is enough to say that the rest is where it always is.
     named = {reference for _, _, reference in outputs}
     rest = {n: role for n, role in (declared or {}).items() if n not in named}
-    brains = find_brains(graph, declared=rest or declared)
+    brains = find_brains(graph, declared=rest or declared, told=told)
     owners = [
         max((b for b in brains if o[2].startswith(b.scope)), key=lambda b: len(b.scope), default=brains[0])
         for o in outputs
@@ -235,6 +283,7 @@ def _chosen(graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Rol
                 *(o for o, owner in zip(outputs, owners, strict=True) if owner is brain),
                 *(o for o in brain.outputs if o[2] not in named),
             ),
+            says={**brain.says, **dict.fromkeys(named, _TOLD)},
         )
         for brain in brains
     )
@@ -255,7 +304,9 @@ def close_names(name: str, names: Sequence[str]) -> str | None:
     return f"close to it: {', '.join(near)}" if near else None
 
 
-def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role]) -> Brain:
+def _unnamed(
+    graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role], told: Mapping[str, Decision]
+) -> Brain:
     """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
     read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
     fed = fed - set(known)
@@ -268,25 +319,35 @@ def _unnamed(graph: Graph, fed: set[str], declared: set[str], known: Mapping[str
             why="no node depends on a placeholder, so nothing is computed from an observation",
             fix="give the frozen graph of the policy, or name its output with --output NAME=action",
         )
-    likely = [n for n in sinks if re.search(r"action|policy|^pi$|/pi$", n.name.lower())]
-    likely = likely or [n for n in sinks if Q_NAMES.fullmatch(plain_name(n.name))]
-    chosen = sinks if len(sinks) == 1 else likely
-    if declared and not chosen:  # where no name says anything: the one output that is a choice
-        chosen = [n for n in sinks if _is_choice(graph, n)]
+    chosen, why = _likely(graph, sinks, declared=bool(declared))
     if len(chosen) != 1:
         shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
+        several = f"; of each of {', '.join(n.name for n in chosen[:8])}: {why}" if chosen else ""
         raise SignatureError(
             "no policy found: it is not clear which output is the action",
-            why=f"no node is called 'action'; candidates are {shown}",
+            why=f"no node is called 'action'; candidates are {shown}{several}",
             fix="name them: --output NAME=action (and, if it has them, --output NAME=value_estimate …)",
         )
     node = chosen[0]
     output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
     outputs = (output, *((name.rsplit("/", 1)[-1], role, name) for name, role in known.items()))
+    says = {name: told[name].says if name in told else _KNOWN for name in known} | {node.name: why}
     rest = [n.name for n in (*sinks, *(e for e in echoes if e not in sinks)) if n is not node]
     if declared:
-        return Brain("", (*outputs, *_others(outputs, rest)), _constants(graph, ""))
-    return Brain("", outputs, _constants(graph, ""), tuple(rest))
+        others = _others(graph, outputs, rest, told)
+        return Brain("", (*outputs, *others), _constants(graph, ""), says=says | _declared(others))
+    return Brain("", outputs, _constants(graph, ""), tuple(rest), says)
+
+
+def _likely(graph: Graph, sinks: Sequence[Node], *, declared: bool) -> tuple[list[Node], str]:
+    """The tensors that may be the action, and why they may."""
+    if len(sinks) == 1:
+        return [*sinks], _ALONE
+    for rule in _ACTIONS if declared else _ACTIONS[:-1]:
+        fitting = [n for n in sinks if rule.when((graph, n))]
+        if fitting:
+            return fitting, rule.says
+    return [], ""
 
 
 def _is_choice(graph: Graph, node: Node) -> bool:
@@ -295,7 +356,13 @@ def _is_choice(graph: Graph, node: Node) -> bool:
     return node.op == "ArgMax" or traits(node).sampler == "categorical"
 
 
-def _others(outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str]) -> list[tuple[str, Role, str]]:
+def _declared(outputs: Sequence[tuple[str, Role, str]]) -> dict[str, str]:
+    return {reference: _DECLARED for _, _, reference in outputs}
+
+
+def _others(
+    graph: Graph, outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str], told: Mapping[str, Decision]
+) -> list[tuple[str, Role, str]]:
     """Outputs that the format declares and no name explains: kept as they are, under names that nothing else has.
 
     Raises SignatureError where one looks like a memory: a policy that forgets is another policy.
@@ -304,9 +371,11 @@ def _others(outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str]) -> li
     found = []
     for name in rest:
         if looks_like_state(name):
+            unpaired = [d for d in told.values() if d.role is None and d.tensor in graph and is_fed(graph[d.tensor])]
             raise SignatureError(
                 f"the output {name!r} looks like a memory, and it is not clear which input it is fed back to",
-                why="a pair agrees in name and shape (h_in and h_out); without its memory the policy acts otherwise",
+                why="a pair agrees in name and shape (h_in and h_out); without its memory the policy acts otherwise"
+                + "".join(f"; {d.tensor}: {d.says}" for d in unpaired),
                 fix=f"--input NAME=memory_in --output {name}=memory_out, or --output {name}=other if it is none",
             )
         wish = name.rsplit("/", 1)[-1]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
+from converters.policy.rules import Decision
 from signatures.memories import SeparateMemory
 from signatures.records import dataclass
 from signatures.roles import Constant, Role
@@ -34,6 +35,7 @@ class SourceFacts:
     - ``model_name``, ``loss``: what the model is called, and what it was trained with, where the format says it.
     - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined; None:
       names and shapes tell.
+    - ``decisions``: tensor → why the reader gave it its role, for ``inspect --why``.
     """
 
     roles: Mapping[str, Role] = field(default_factory=dict)
@@ -51,3 +53,4 @@ class SourceFacts:
     model_name: str = ""
     loss: str = ""
     memories: tuple[SeparateMemory, ...] | None = None
+    decisions: Mapping[str, Decision] = field(default_factory=dict)

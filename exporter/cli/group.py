@@ -40,7 +40,7 @@ GROUPS = {
     ),
     "Many sources": ("jobs", "cluster", "again", "fail_fast"),
     "The server": ("host", "port", "opens", "no_open"),
-    "Output": ("verbose", "quiet", "as_json", "html", "markdown", "junit", "help"),
+    "Output": ("verbose", "quiet", "why", "as_json", "html", "markdown", "junit", "help"),
 }
 
 

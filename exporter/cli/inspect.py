@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 )
 @click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SOURCE...")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.option("--why", is_flag=True, help="Say which rule decided what each tensor is for.")
 @click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=PATH, metavar="DIR", help="Write its graph for TensorBoard.")
 @click.option("--svg", type=PATH, metavar="FILE", help="Draw the policy (with --unity: Behavior Parameters).")
@@ -59,6 +60,7 @@ def inspect_command(
     brain_parameters: Path | None,
     trust_source: bool,
     as_json: bool,
+    why: bool,
     logdir: Path | None,
     svg: Path | None,
     compiling: CompileOptions,
@@ -78,6 +80,7 @@ def inspect_command(
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
     unasked = {
         "--logdir": logdir is not None,
+        "--why": why,
         "--step": step is not None,
         "--activation": activation is not None,
         "--trust-source": trust_source,
@@ -99,7 +102,7 @@ def inspect_command(
                 else:
                     read = read_options(step, sensors, trust_source, activation)
                     refused: list[ExportModelError] = []
-                    answer = _inspected(here, compiling, read, logdir, svg, as_json, refused)
+                    answer = _inspected(here, compiling, read, logdir, svg, refused, as_json=as_json, why=why)
                     for error in refused:
                         say_lines(f"error: {error.message}", err=True)
                         status = 2
@@ -126,15 +129,17 @@ def _inspected(
     read: ReadOptions,
     logdir: Path | None,
     svg: Path | None,
-    as_json: bool,
     refused: list[ExportModelError],
+    *,
+    as_json: bool,
+    why: bool,
 ) -> dict[str, Any]:
     """Say what is in a source, unless it is all for a program, which gets what is returned; ``refused`` gets the errors
     of a folder's files that could not be read.
     """
     from exporter.inspect.inspection import inspect_source, inspection_text
 
-    found = inspect_source(source, compiling, read, refused)
+    found = inspect_source(source, compiling, read, refused, why=why)
     written: list[Path] = []
     if logdir is not None or svg is not None:
         from exporter.inspect.pictures import write_pictures

@@ -7,12 +7,13 @@ from contextlib import contextmanager
 from dataclasses import field, replace
 from pathlib import Path
 
-from converters.compiler.compile import compile_graph
+from converters.compiler.compile import compile_graph, explanations
 from converters.compiler.options import CompileOptions
 from converters.formats.format import Format
 from converters.formats.read import check_options, each_or_refused, fetched, read_models
 from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.policy import Policy
+from converters.policy.rules import Decision
 from signatures.errors import ExportModelError, naming
 from signatures.records import dataclass
 
@@ -56,6 +57,11 @@ class Source:
         with naming(self.path):
             policies = compile_graph(model.graph, self.stem(model), options, model.facts)
             return [(narrowed(model, policy), policy) for policy in policies]
+
+    def explained(self, model: SourceModel, options: CompileOptions | None) -> dict[str, tuple[Decision, ...]]:
+        """Why the tensors of a model's policies have their roles, by policy."""
+        with naming(self.path):
+            return explanations(model.graph, self.stem(model), options, model.facts)
 
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
         """All policies in it."""

@@ -16,6 +16,7 @@ from converters.formats.registry import WRITTEN
 from converters.formats.source import ReadOptions
 from converters.graph.nodes import Graph
 from converters.policy.policy import Policy
+from converters.policy.rules import Decision
 from exporter.export.sources import read_source
 from exporter.reports.layers import blocks_of, chain
 from exporter.tables import paragraph, size_text, table
@@ -67,6 +68,8 @@ class PolicyInspection:
     parameters: int = 0
     #: action → the layers from an observation to it, in words
     layers: Mapping[str, str] = field(default_factory=dict)
+    #: why inputs and outputs have their roles, where it was asked
+    decisions: Sequence[Decision] = ()
 
     def __repr__(self) -> str:
         able = [target for target, reason in self.targets.items() if reason is None]
@@ -81,6 +84,7 @@ class PolicyInspection:
             "layers": dict(self.layers),
             "ops": dict(self.ops),
             "targets": {t: {"ok": reason is None, "reason": reason} for t, reason in self.targets.items()},
+            **({"why": [_reason(d) for d in self.decisions]} if self.decisions else {}),
         }
 
 
@@ -129,21 +133,28 @@ def inspect_source(
     options: CompileOptions | None = None,
     read: ReadOptions | None = None,
     refused: list[ExportModelError] | None = None,
+    *,
+    why: bool = False,
 ) -> Inspection:
     """Read and understand a source without writing anything. Raises what the export would raise.
 
-    With ``refused``, which gets the errors, a file of a folder that is refused does not refuse the others.
+    With ``refused``, which gets the errors, a file of a folder that is refused does not refuse the others. ``why``: the
+    rule that decided on each tensor is found, too.
     """
     source = read_source(path, read, refused)
     compiled = source.compiled(options) if refused is None else source.compiled_or_refused(options, refused)
     found = []
-    for _, policy in compiled:
+    decided: dict[str, tuple[Decision, ...]] = {}
+    for model, policy in compiled:
+        if why and policy.name not in decided:
+            decided |= source.explained(model, options)
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
         targets = {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()}
         with naming(source.path):
             layers = _layers(policy)
         parameters = sum(v.size for v in policy.graph.values() if v.ndim and v.dtype.kind == "f")
-        found.append(PolicyInspection(policy, ops, targets, parameters, layers))
+        decisions = decided.get(policy.name, ())
+        found.append(PolicyInspection(policy, ops, targets, parameters, layers, decisions))
     return Inspection(
         source.path,
         source.format.label,
@@ -199,6 +210,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
         facts.append(f"memory {signature.memory.size}{layout}")
     head = f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}"
     lines = [paragraph(head, "", "  "), "", "\n\n".join(table(head, rows) for head, rows in _tables(signature))]
+    lines += _reason_lines(inspected.decisions)
     lines += ["", f"parameters: {inspected.parameters:,}"]
     for name, way in inspected.layers.items():
         lines.append(paragraph(way, "layers: " if len(inspected.layers) == 1 else f"layers to {name}: ", "  "))
@@ -213,6 +225,25 @@ def _policy_text(inspected: PolicyInspection) -> str:
     refused = {t: reason for t, reason in inspected.targets.items() if reason is not None}
     lines += [paragraph(reason, f"cannot be written as {t}: ", "  ") for t, reason in refused.items()]
     return "\n".join(lines)
+
+
+def _reason(decision: Decision) -> dict[str, Any]:
+    return {
+        "tensor": decision.tensor,
+        "role": decision.role,
+        "because": decision.says,
+        "against": list(decision.against),
+    }
+
+
+def _reason_lines(decisions: Sequence[Decision]) -> list[str]:
+    """A tensor's role and the rule that decided, and what spoke against it."""
+    lines = []
+    for decision in decisions:
+        head = printable(f"{decision.tensor}: {decision.role or 'left out'}, because ")
+        lines.append(paragraph(decision.says, head, "  "))
+        lines += [paragraph(text, "  but ", "      ") for text in decision.against]
+    return ["", *lines] if lines else []
 
 
 def _tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[list[str]]]]:

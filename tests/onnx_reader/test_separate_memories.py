@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.compiler.options import CompileOptions
-from converters.formats.onnx.memories import separate_memories
+from converters.formats.onnx.memories import FoundMemories, separate_memories
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
@@ -266,10 +266,10 @@ def test_what_has_another_length_than_the_batch_keeps_it(tmp_path: Path) -> None
 def test_more_layers_than_a_policy_has_are_not_looked_through() -> None:
     message = recurrent()
     found = separate_memories(message.graph, SHAPES[0], SHAPES[1], frozenset(SHAPES[0]))
-    assert [m.input for m in found[0]] == ["h_in", "c_in"]
+    assert [m.input for m in found.memories] == ["h_in", "c_in"]
     cell = next(n for n in message.graph.node if n.op_type == "LSTM")
     message.graph.node.extend([cell] * 64)
-    assert separate_memories(message.graph, SHAPES[0], SHAPES[1], frozenset(SHAPES[0])) == ((), {})
+    assert separate_memories(message.graph, SHAPES[0], SHAPES[1], frozenset(SHAPES[0])) == FoundMemories()
 
 
 def test_naming_the_action_alone_keeps_the_memory(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from converters.graph.types import FLOAT32, static_shape
 from converters.policy.facts import SourceFacts
 from converters.policy.inputs import role_by_name
 from converters.policy.memories import paired_memories
+from converters.policy.rules import Decision
 from signatures.errors import SignatureError
 from signatures.memories import SeparateMemory, SourcePart
 from signatures.records import dataclass
@@ -57,12 +58,35 @@ def join_memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> 
             roles={**facts.roles, taken: Role.MEMORY_IN},
             outputs={**declared, given: Role.MEMORY_OUT},
             memory_layout=tuple(m.part for m in memories) if all(m.part for m in memories) else (),
+            decisions={**facts.decisions, **_reasons(memories, options, facts, (taken, given), origins)},
         ),
         {
             Role.MEMORY_IN: tuple(SourcePart(origins[m.input], m.taken) for m in memories),
             Role.MEMORY_OUT: tuple(SourcePart(origins[m.output], m.given) for m in memories),
         },
     )
+
+
+def _reasons(
+    memories: Sequence[SeparateMemory],
+    options: CompileOptions,
+    facts: SourceFacts,
+    made: tuple[str, str],
+    origins: Mapping[str, str],
+) -> dict[str, Decision]:
+    """Why the inputs and outputs that were joined are the memory."""
+    said = []
+    for memory in memories:
+        known = facts.decisions.get(memory.input)
+        why = "its name and shape agree with those of {}" if known is None or known.role is None else known.says
+        why = "the user says so" if options.inputs.get(memory.input) is Role.MEMORY_IN else why
+        said.append(f"{origins[memory.input]}: {why.format(origins[memory.output])}")
+    text = f"it stands for {'; '.join(said)}"
+    taken, given = made
+    return {
+        taken: Decision(taken, Role.MEMORY_IN, text),
+        given: Decision(given, Role.MEMORY_OUT, f"it is fed back to {', '.join(origins[m.input] for m in memories)}"),
+    }
 
 
 def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tuple[SeparateMemory, ...]:

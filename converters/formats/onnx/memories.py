@@ -9,10 +9,13 @@ Operands and outputs by position: onnx/docs/Operators.md (LSTM, GRU).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import field
 from typing import Any
 
 from converters.formats.onnx.importer.node import STANDARD
+from converters.policy.rules import Decision, Rule, always, first
 from signatures.records import dataclass
+from signatures.roles import Role
 
 Dims = tuple[int | None, ...] | None
 
@@ -40,19 +43,79 @@ class OnnxMemory:
     axis: int
 
 
+@dataclass(frozen=True, slots=True)
+class Start:
+    """An input that recurrent layers begin with: (layer, part) of each, the outputs that give the last of the same
+    states and may have its shape, and its batch axis, where they tell it.
+    """
+
+    states: frozenset[tuple[int, str]]
+    ends: tuple[str, ...]
+    axis: int | None
+
+    @property
+    def parts(self) -> set[str]:
+        """Which states of a layer it is: h, c, or both."""
+        return {part for _, part in self.states}
+
+
+#: Whether an input is a memory that is fed back from an output.
+_RULES: tuple[Rule[Start, Role | None], ...] = (
+    Rule(None, lambda s: len(s.parts) != 1, "it begins the hidden and the cell state alike"),
+    Rule(
+        None, lambda s: not s.ends, "a recurrent layer begins with it, and no output of its shape gives the last state"
+    ),
+    Rule(None, lambda s: len(s.ends) > 1, "a recurrent layer begins with it, and several outputs give the last state"),
+    Rule(
+        None, lambda s: s.axis is None, "a recurrent layer begins with it, and several of its axes may be the agents'"
+    ),
+    Rule(Role.MEMORY_IN, always, "a recurrent layer begins with it, and one output gives the last state"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundMemories:
+    """The memories in the order of the inputs, input → its batch axis, and input → what was decided of it.
+
+    There are no memories where it is not plain for each of them which output belongs to it; the states of several
+    layers have a batch axis all the same.
+    """
+
+    memories: tuple[OnnxMemory, ...] = ()
+    axes: Mapping[str, int] = field(default_factory=dict)
+    decisions: Mapping[str, Decision] = field(default_factory=dict)
+
+
 def separate_memories(
     graph: Any, inputs: Mapping[str, Dims], outputs: Mapping[str, Dims], floats: frozenset[str]
-) -> tuple[tuple[OnnxMemory, ...], dict[str, int]]:
-    """(the memories of a GraphProto in the order of its inputs, input → its batch axis).
+) -> FoundMemories:
+    """The memories of a GraphProto that are inputs and outputs of their own.
 
-    ``inputs`` and ``outputs`` have the declared shapes, ``floats`` are the inputs of float32. There are no memories
-    where it is not plain for each of them which output belongs to it; the states of several layers have a batch axis
-    all the same.
+    ``inputs`` and ``outputs`` have the declared shapes, ``floats`` are the inputs of float32.
     """
     if max(sum(1 for n in graph.node if _states(n)), len(outputs)) > _MOST:
-        return (), {}
+        return FoundMemories()
+    starts = _starts(graph, inputs, outputs, floats)
+    decisions, memories = {}, []
+    for name, start in starts.items():
+        rule = first(_RULES, start)
+        assert rule is not None
+        decisions[name] = Decision(name, rule.role, rule.says)
+        if rule.role is not None and start.axis is not None:
+            memories.append(OnnxMemory(name, start.ends[0], start.parts.pop(), start.axis))
+    axes = {name: start.axis for name, start in starts.items() if start.axis is not None}
+    if len(memories) == len(starts):
+        return FoundMemories(tuple(memories), axes, decisions)
+    axes = {name: axis for name, axis in axes.items() if (inputs[name] or (1,))[0] != 1}
+    return FoundMemories((), axes, decisions)
+
+
+def _starts(
+    graph: Any, inputs: Mapping[str, Dims], outputs: Mapping[str, Dims], floats: frozenset[str]
+) -> dict[str, Start]:
+    """The inputs that recurrent layers begin with, in their order."""
     walk = _Walk(graph)
-    starts: dict[str, set[tuple[int, str]]] = {}
+    states: dict[str, set[tuple[int, str]]] = {}
     turned: set[str] = set()
     for number, node in enumerate(graph.node):
         for part, operand, _ in _states(node):
@@ -65,25 +128,19 @@ def separate_memories(
                 dims = inputs.get(name)
                 if dims is None or len(dims) not in (2, 3) or dims[-1] != hidden:
                     continue
-                starts.setdefault(name, set()).add((number, part))
+                states.setdefault(name, set()).add((number, part))
                 if transposed != batch_first:
                     turned.add(name)
     ends = {name: walk.states(name) for name in outputs}
-    memories, axes, plain = [], {}, True
-    for name in (n for n in inputs if n in starts):
-        states, dims = starts[name], inputs[name]
-        parts = {part for _, part in states}
-        candidates = [o for o, found in ends.items() if found == states and _fits(dims, outputs[o])]
-        axis = _batch_axis(dims, name in turned)
-        if axis is not None:
-            axes[name] = axis
-        if len(parts) != 1 or len(candidates) != 1 or axis is None:
-            plain = False
-        else:
-            memories.append(OnnxMemory(name, candidates[0], parts.pop(), axis))
-    if plain:
-        return tuple(memories), axes
-    return (), {name: axis for name, axis in axes.items() if (inputs[name] or (1,))[0] != 1}
+    return {
+        name: Start(
+            frozenset(states[name]),
+            tuple(o for o, found in ends.items() if found == states[name] and _fits(inputs[name], outputs[o])),
+            _batch_axis(inputs[name], name in turned),
+        )
+        for name in inputs
+        if name in states
+    }
 
 
 class _Walk:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,12 @@ from converters.formats.onnx.half_precision import widen
 from converters.formats.onnx.importer.importer import Importer, joined_errors
 from converters.formats.onnx.importer.node import DTYPES
 from converters.formats.onnx.importer.table import TABLE
-from converters.formats.onnx.memories import OnnxMemory, separate_memories
+from converters.formats.onnx.memories import FoundMemories, OnnxMemory, separate_memories
 from converters.formats.onnx.proto import array_of, decoded, load_external, tensors
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import BATCH, Dim, TensorType
 from converters.policy.memories import looks_like_state
+from converters.policy.rules import Decision
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
 from signatures.records import dataclass
@@ -70,6 +71,8 @@ class OnnxModel:
     halves: bool = False
     #: what the graph is called
     name: str = ""
+    #: node → what was decided of an input that a recurrent layer begins with
+    decisions: Mapping[str, Decision] = field(default_factory=dict)
 
 
 def read_onnx(given: Fetched) -> OnnxModel:
@@ -81,7 +84,8 @@ def read_onnx(given: Fetched) -> OnnxModel:
     graph = model.graph
     constants = {t.name for t in graph.initializer}
     declared = [v for v in graph.input if v.name not in constants]
-    memories, axes = _memories(graph, declared)
+    found = _memories(graph, declared)
+    memories, axes = found.memories, found.axes
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
     ends = {m.output: m.axis for m in memories}
     imported = partial(_imported, graph, detached, opsets, declared, axes)
@@ -109,6 +113,11 @@ def read_onnx(given: Fetched) -> OnnxModel:
         reading.alone,
         halves,
         graph.name,
+        decisions={
+            importer.values[n]: replace(d, tensor=importer.values[n])
+            for n, d in found.decisions.items()
+            if n in importer.values
+        },
     )
 
 
@@ -161,7 +170,7 @@ def _check_names(names: Sequence[str]) -> None:
 # ------------------------------------------------------------------ inputs and outputs
 
 
-def _memories(graph: Any, declared: Sequence[Any]) -> tuple[tuple[OnnxMemory, ...], dict[str, int]]:
+def _memories(graph: Any, declared: Sequence[Any]) -> FoundMemories:
     floats = frozenset(v.name for v in declared if v.type.tensor_type.elem_type == _FLOAT)
     return separate_memories(
         graph, {v.name: dims_of(v) for v in declared}, {v.name: dims_of(v) for v in graph.output}, floats

@@ -14,27 +14,20 @@ import numpy as np
 
 from converters.formats.bundle.embed import contract_of, redrawn
 from converters.formats.bundle.embed import facts_of as facts_of_contract
+from converters.formats.onnx.output_roles import is_scores, output_roles, positional
 from converters.formats.onnx.reader import OnnxModel
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
-from converters.policy.action_values import is_q_name
 from converters.policy.brains import depends_on_input
 from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from converters.policy.generations import SAC_MEAN, torch_generation
 from signatures.contract import EMBEDDED
-from signatures.roles import CONSTANT_NAMES, OUTPUT_NAMES, STATE_VALUE_NAMES, Role
+from signatures.roles import CONSTANT_NAMES, Role
 
-#: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
-_ACTION = re.compile(r"actions?|act|action_mean|mean_actions?|action_logits|logits|outputs?|mean|mu|pi|policy")
-_SCORES = re.compile(r"(action_)?logits")
 #: What only policies (and critics) call their inputs and outputs.
 _OF_A_POLICY = re.compile(
     r"obs|state|act(ion)?s?($|_)|polic|logits|value|critic|actor|agent|goal|vec|mean|(^|_)(pi|mu|q|vf|std|sigma)($|_)"
 )
-#: ... and the spread of a Gaussian action (rl_games, skrl, tianshou, CleanRL), its logarithm, the log-probability.
-_STD = re.compile(r"(action_?)?(std|stddev|std_dev|sigma|scale)s?")
-_LOG_STD = re.compile(r"(action_?)?log_?(std|stddev|std_dev|sigma|scale)s?")
-_LOG_PROB = re.compile(r"(action_?)?log_?probs?")
 _COLOURS = (1, 3, 4)
 _IMAGE = 4
 
@@ -55,17 +48,20 @@ def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
         outputs=dict.fromkeys(model.outputs.values()),
         memories=model.memories or None,
         model_name=model.name,
+        decisions=model.decisions,
     )
     if model.producer.startswith("tf2onnx"):
         facts = _of_tensorflow(model, facts, number)
     elif number:
         facts = _of_torch(model, facts, number)
     else:
-        roles = _roles_by_name(model)
+        decisions = output_roles(model)
+        roles = {n: d.role for n, d in decisions.items()}
         graph = _with_spreads(model, graph, roles)
         notes += _notes_of_constants(model, roles)
         facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model, roles))
-        if _positional(model):
+        facts = replace(facts, decisions={**model.decisions, **decisions})
+        if positional(model):
             facts = replace(facts, family="Stable-Baselines3")
     return graph, replace(facts, notes=(*facts.notes, *notes, *_common_notes(model)))
 
@@ -158,73 +154,6 @@ def _with_rows_first(model: OnnxModel) -> tuple[Graph, list[str]]:
 # ------------------------------------------------------------------ other trainers
 
 
-def _roles_by_name(model: OnnxModel) -> dict[str, Role | None]:
-    """Output node → role, by the names that other trainers use; by position where no name says anything."""
-    if _positional(model):
-        return dict(zip(model.outputs.values(), (Role.ACTION, Role.VALUE, Role.LOG_PROB), strict=False))
-    roles: dict[str, Role | None] = {}
-    for name, node in model.outputs.items():
-        base = _base(node)
-        known = OUTPUT_NAMES.get(base)
-        roles[node] = known or (Role.ACTION if _ACTION.fullmatch(base) else None)
-        if known is None and STATE_VALUE_NAMES.fullmatch(base) and _columns(model, name) == 1:
-            roles[node] = Role.VALUE
-        shape = model.shapes.get(node) or ()
-        if roles[node] in (None, Role.Q_VALUES) and is_q_name(node):
-            roles[node] = Role.Q_VALUES if len(shape) == 2 and shape[1] != 1 else None
-    values = [n for n, role in roles.items() if role is Role.Q_VALUES]
-    if len(values) > 1:
-        roles |= dict.fromkeys(values)
-    actions = [n for n, role in roles.items() if role is Role.ACTION]
-    if len(actions) > 1:  # beside one that is called so, a mean or logits are what it was made of
-        called = [[n for n in actions if _base(n) == name] for name in ("action", "actions")]
-        plain = next((c for c in (*called, [n for n in actions if not _is_scores(n)]) if len(c) == 1), None)
-        if plain is not None:
-            roles |= {n: None for n in actions if n not in plain}
-            actions = plain
-    if not actions and len(values) == 1:
-        return roles
-    if len(actions) != 1:  # none, or more than one: names and structure decide, or ask
-        return dict.fromkeys(roles)
-    width = (model.shapes.get(actions[0]) or ())[1:]
-    for node in (n for n, role in roles.items() if role is None):
-        base, shape = _base(node), model.shapes.get(node) or ()
-        if shape[-1:] == width and shape[1:] in ((), width):  # [size], as a parameter of the network has it, too
-            roles[node] = Role.STD if _STD.fullmatch(base) else Role.LOG_STD if _LOG_STD.fullmatch(base) else None
-        if (
-            roles[node] is None
-            and _LOG_PROB.fullmatch(base)
-            and len(shape) in (1, 2)
-            and shape[1:] in ((), (1,))
-            and shape != (1,)
-        ):
-            roles[node] = Role.LOG_PROB
-    return roles
-
-
-def _is_scores(node: str) -> bool:
-    return _SCORES.fullmatch(_base(node)) is not None
-
-
-def _base(node: str) -> str:
-    return node.rpartition("/")[2].lower()
-
-
-def _positional(model: OnnxModel) -> bool:
-    """Stable-Baselines3's policies return (actions, values, log_prob); its recipe names none of the outputs.
-
-    Unnamed outputs are numbers, or what PyTorch calls its inner tensors.
-    """
-    names = list(model.outputs)
-    said = [
-        n for n in names if _ACTION.fullmatch(n.lower()) or n in OUTPUT_NAMES or STATE_VALUE_NAMES.fullmatch(n.lower())
-    ]
-    if said or len(names) not in (2, 3):
-        return False
-    ranks = [len(model.shapes.get(n) or ()) for n in model.outputs.values()]
-    return _columns(model, names[1]) == 1 and ranks[1] == 2 and ranks[2:] in ([], [1])
-
-
 def _with_spreads(model: OnnxModel, graph: Graph, roles: Mapping[str, Role | None]) -> Graph:
     """The graph with spreads that depend on no input as rows: a parameter of the network has none of its own.
 
@@ -247,20 +176,15 @@ def _with_spreads(model: OnnxModel, graph: Graph, roles: Mapping[str, Role | Non
     return graph
 
 
-def _columns(model: OnnxModel, name: str) -> int | str | None:
-    shape = model.shapes.get(model.outputs[name])
-    return shape[-1] if shape else None
-
-
 def _notes_of_others(model: OnnxModel, roles: Mapping[str, Role | None]) -> tuple[str, ...]:
-    if not _positional(model):
+    if not positional(model):
         names = [n.lower() for n in (*model.inputs, *model.outputs)]
         if not any(_OF_A_POLICY.search(n) for n in names):
             return (
                 "nothing marks this file as a policy: no input or output has a name that trainers give "
                 f"({', '.join((*model.inputs, *model.outputs))}); what it computes is exported all the same",
             )
-        scores = [n for n, role in roles.items() if role is Role.ACTION and _is_scores(n)]
+        scores = [n for n, role in roles.items() if role is Role.ACTION and is_scores(n)]
         return tuple(f"{n} are scores of a choice, not normalised: the best is the largest" for n in scores)
     names = list(model.outputs)
     order = f"{names[0]} is the action, {names[1]} the value"

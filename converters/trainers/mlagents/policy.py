@@ -28,6 +28,7 @@ from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
+from converters.policy.rules import Decision
 from converters.trainers.mlagents.body import attended, body_width, goal_width, hidden_layers
 from converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
 from converters.trainers.mlagents.state import LET_IT_EXPORT, State
@@ -36,6 +37,7 @@ from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import pytorch_alone
 from signatures.errors import SourceError
 from signatures.records import dataclass
+from signatures.roles import Role
 
 _BODY = "network_body"
 #: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.
@@ -136,6 +138,7 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
         memory_layout=() if memory is None else ("h", "c"),
         outputs=dict.fromkeys(("version_number", "memory_size", *names)),
         notes=tuple(_notes(generation, sensors, joined, squashed=conditional is True, guessed=trainer is None)),
+        decisions=_reasons(generation, sensors),
     )
     return net.graph(), facts
 
@@ -180,6 +183,28 @@ def _notes(
 # ------------------------------------------------------------------ observations
 
 
+#: All vectors of 0.20 to 0.22, one behind the other.
+_JOINED = "vector_observation"
+_SENSOR_ROLES = {1: Role.VECTOR, 2: Role.ENTITIES, 3: Role.VISUAL}
+
+
+def _input_names(generation: _Generation, sensors: Sequence[Sensor]) -> list[str]:
+    """What the generation calls the input of each sensor."""
+    names, images = list[str](), 0
+    for index, sensor in enumerate(sensors):
+        image = len(sensor.shape) == 3
+        by_number = generation.by_sensor or len(sensor.shape) == 2
+        names.append(f"obs_{index}" if by_number else f"visual_observation_{images}" if image else _JOINED)
+        images += image
+    return names
+
+
+def _reasons(generation: _Generation, sensors: Sequence[Sensor]) -> dict[str, Decision]:
+    """Input → why it is an observation, and what of."""
+    pairs = zip(_input_names(generation, sensors), sensors, strict=True)
+    return {name: Decision(name, _SENSOR_ROLES.get(len(s.shape), Role.VECTOR), s.says) for name, s in pairs}
+
+
 def _observed(
     net: Network, generation: _Generation, sensors: Sequence[Sensor], goals: Sequence[int]
 ) -> tuple[str, str | None]:
@@ -187,27 +212,24 @@ def _observed(
     vectors = [s for s in sensors if len(s.shape) == 1]
     shared = None
     if vectors and not generation.by_sensor:
-        shared = net.input("vector_observation", sum(s.shape[0] for s in vectors))
+        shared = net.input(_JOINED, sum(s.shape[0] for s in vectors))
     parts: dict[int, str] = {}
     entities: list[tuple[str, str]] = []
-    start = images = 0
-    for index, sensor in enumerate(sensors):
+    start = 0
+    for index, (sensor, name) in enumerate(zip(sensors, _input_names(generation, sensors), strict=True)):
         image = len(sensor.shape) == 3
         if len(sensor.shape) == 2:
             assert sensor.module is not None
-            entities.append((sensor.module, net.input(f"obs_{index}", *sensor.shape)))
+            entities.append((sensor.module, net.input(name, *sensor.shape)))
             continue
-        if generation.by_sensor:
-            x = net.input(f"obs_{index}", *sensor.shape)
-        elif image:
-            x = net.input(f"visual_observation_{images}", *sensor.shape)
+        if generation.by_sensor or image:
+            x = net.input(name, *sensor.shape)
         else:
             assert shared is not None
             net.at(sensor.module or _BODY)
             whole = len(vectors) == 1
             x = shared if whole else net.slice(shared, 1, start, start + sensor.shape[0])
             start += sensor.shape[0]
-        images += image
         if image and sensor.module is not None:
             x = _image(net, x, sensor.module)
         elif sensor.module is not None:

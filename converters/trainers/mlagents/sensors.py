@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from converters.policy.rules import Rule, first
 from converters.trainers.mlagents.state import LET_IT_EXPORT
 from converters.trainers.pytorch.weights import Weights
 from signatures.errors import SourceError, UsageError
@@ -24,12 +25,13 @@ _SAY = "say what the agent observes, sensor by sensor in the order of their name
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One input of the network: its shape (lists of entities [most, numbers], images C, H, W), and its module (None:
-    the numbers go in as they are).
+    """One input of the network: its shape (lists of entities [most, numbers], images C, H, W), its module (None:
+    the numbers go in as they are), and why it is one.
     """
 
     shape: tuple[int, ...]
     module: str | None
+    says: str = "--sensors says so"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,65 @@ def dense_name(state: Weights, module: str) -> str:
 # ------------------------------------------------------------------ in which order
 
 
+@dataclass(frozen=True, slots=True)
+class Module:
+    """A module of a checkpoint that encodes a sensor."""
+
+    state: Weights
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What the weights tell of all sensors: modules in their order (None: one without weights), the columns that each
+    takes of the first layer, and how many are left over; ``two_lists``: vectors stand before the images.
+    """
+
+    modules: Sequence[str | None]
+    known: Mapping[str, int]
+    images: Sequence[str]
+    rest: int
+    two_lists: bool
+
+    @property
+    def only_images(self) -> bool:
+        """Whether all that have weights are images, and vectors stand at one end."""
+        ends = self.two_lists or None not in self.modules
+        return bool(self.images) and len(self.images) == len(self.known) and ends
+
+
+#: What a module encodes.
+_IMAGE, _VECTOR, _LIST = "an image", "a normalised vector", "a list of entities"
+_KINDS: tuple[Rule[Module, str], ...] = (
+    Rule(_IMAGE, lambda m: encoder_of(m.state, m.name) is not None, "its module has the layers of a visual encoder"),
+    Rule(
+        _VECTOR,
+        lambda m: f"{m.name}.normalizer.running_mean" in m.state,
+        "its module has the mean and the variance of a normaliser",
+    ),
+    Rule(_LIST, lambda m: _is_list(m.state, m.name), "its module encodes entities for attention"),
+)
+#: Where the columns go that no module takes: nowhere, into the one vector, into one beside images.
+_NONE_LEFT, _ONE_VECTOR, _BESIDE_IMAGES = "none left", "one vector", "a vector beside images"
+_LAYOUTS: tuple[Rule[Layout, str], ...] = (
+    Rule(
+        _NONE_LEFT,
+        lambda s: s.rest == 0 and None not in s.modules,
+        "the modules take all columns of the first layer",
+    ),
+    Rule(
+        _ONE_VECTOR,
+        lambda s: not s.images and not s.known,
+        "no sensor has weights of its own, so that the first layer takes vectors alone",
+    ),
+    Rule(
+        _BESIDE_IMAGES,
+        lambda s: s.only_images,
+        "it has the columns of the first layer that the images do not take",
+    ),
+)
+
+
 def find_sensors(
     state: Weights, lists: Sequence[str], encoder: str, width: int, told: Sequence[tuple[int, ...]]
 ) -> tuple[list[Sensor], bool]:
@@ -87,25 +148,10 @@ def find_sensors(
     user gives, one per sensor. Raises SourceError where they do not follow from the weights, UsageError where what
     the user says contradicts them.
     """
-    modules: list[str | None] = []
-    for prefix in lists:
-        indices = state.indices(prefix)
-        if indices and len(lists) == 1:  # what has no weights is a vector that is not normalised
-            modules.extend(f"{prefix}{i}" if i in indices else None for i in range(indices[-1] + 1))
-        else:
-            modules.extend(f"{prefix}{i}" for i in indices)
-    for module in modules:
-        if (
-            module is not None
-            and encoder_of(state, module) is None
-            and f"{module}.normalizer.running_mean" not in state
-            and not _is_list(state, module)
-        ):
-            raise state.unknown(
-                f"{module} ({', '.join(state.under(module + '.')[:3])})",
-                "it encodes a sensor as no ML-Agents does; a plugin may have made it",
-            )
-    lengths = {m: _entity_length(state, m, encoder) for m in modules if m is not None and _is_list(state, m)}
+    modules = _modules(state, lists)
+    kinds = {m: _kind(state, m).role for m in modules if m is not None}
+    entities = [m for m in kinds if _is_list(state, m)]
+    lengths = {m: _entity_length(state, m, encoder) for m in entities}
     if lengths:
         width -= state.length(f"{encoder}.rsa.fc_q.weight", 0)
     if told:
@@ -118,28 +164,55 @@ def find_sensors(
             fix=f"{_SAY} 8 for a vector, 3x84x84 for an image, 20x{next(iter(lengths.values()))} for a list of at "
             "most 20 entities",
         )
-    known = [(m, _known_width(state, m)) for m in modules if m is not None]
-    rest = width - sum(n for _, n in known)
-    if rest < 0:
+    known = {m: _known_width(state, m) for m in kinds}
+    images = [m for m, kind in kinds.items() if kind == _IMAGE]
+    layout = Layout(modules, known, images, width - sum(known.values()), len(lists) > 1)
+    if layout.rest < 0:
         raise state.damaged(
-            f"its sensors have {width - rest} columns, and its first layer takes {width}",
+            f"its sensors have {width - layout.rest} columns, and its first layer takes {width}",
             "the checkpoint is of a network that ML-Agents did not build, or damaged",
         )
-    images = [m for m, _ in known if encoder_of(state, m) is not None]
-    two_lists = len(lists) > 1
-    if rest == 0 and None not in modules:
-        return [_told_by_weights(state, m) for m, _ in known], False
-    if not images and len(known) == 0:
-        return [Sensor((rest,), None)], True
-    if images and len(images) == len(known) and (two_lists or None not in modules):
-        vector, pictures = Sensor((rest,), None), [_told_by_weights(state, m) for m, _ in known]
-        return ([vector, *pictures] if two_lists else [*pictures, vector]), True
-    raise SourceError(
-        "the checkpoint does not tell the agent's sensors",
-        why=f"{rest} of the {width} columns of its first layer belong to vectors that leave no trace, and images stand "
-        "between them",
-        fix=f"{_SAY} 8 for a vector and 3x84x84 for an image; or {LET_IT_EXPORT}",
-    )
+    return _arranged(state, layout, width)
+
+
+def _modules(state: Weights, lists: Sequence[str]) -> list[str | None]:
+    """The modules of all sensors in their order; what has no weights is a vector that is not normalised."""
+    modules: list[str | None] = []
+    for prefix in lists:
+        indices = state.indices(prefix)
+        if indices and len(lists) == 1:
+            modules.extend(f"{prefix}{i}" if i in indices else None for i in range(indices[-1] + 1))
+        else:
+            modules.extend(f"{prefix}{i}" for i in indices)
+    return modules
+
+
+def _kind(state: Weights, module: str) -> Rule[Module, str]:
+    """The rule that says what a module encodes. Raises SourceError."""
+    rule = first(_KINDS, Module(state, module))
+    if rule is None:
+        raise state.unknown(
+            f"{module} ({', '.join(state.under(module + '.')[:3])})",
+            "it encodes a sensor as no ML-Agents does; a plugin may have made it",
+        )
+    return rule
+
+
+def _arranged(state: Weights, layout: Layout, width: int) -> tuple[list[Sensor], bool]:
+    """The sensors, and whether vectors stand joined. Raises SourceError."""
+    rule, rest = first(_LAYOUTS, layout), layout.rest
+    if rule is None:
+        raise SourceError(
+            "the checkpoint does not tell the agent's sensors",
+            why=f"{rest} of the {width} columns of its first layer belong to vectors that leave no trace, and images "
+            "stand between them",
+            fix=f"{_SAY} 8 for a vector and 3x84x84 for an image; or {LET_IT_EXPORT}",
+        )
+    seen = [_told_by_weights(state, m) for m in layout.known]
+    if rule.role == _NONE_LEFT:
+        return seen, False
+    vector = Sensor((rest,), None, rule.says)
+    return ([vector, *seen] if layout.two_lists else [*seen, vector]), True
 
 
 def find_goals(
@@ -211,19 +284,19 @@ def _known_width(state: Weights, module: str | None) -> int:
 
 def _told_by_weights(state: Weights, module: str) -> Sensor:
     """A sensor whose shape follows from its module."""
-    encoder = encoder_of(state, module)
+    encoder, says = encoder_of(state, module), _kind(state, module).says
     if encoder is None:
-        return Sensor(state.shape(f"{module}.normalizer.running_mean"), module)
+        return Sensor(state.shape(f"{module}.normalizer.running_mean"), module, says)
     columns = state.length(f"{dense_name(state, module)}.weight", 1)
     sizes = _sizes(state, module, encoder, columns)
     if len(sizes) == 1:
-        return Sensor(sizes[0], module)
+        return Sensor(sizes[0], module, says)
     squares = [s for s in sizes if s[1] == s[2]]
     example = squares[0] if squares else sizes[0] if sizes else (3, 84, 84)
     shown = ", ".join("x".join(map(str, s)) for s in (squares or sizes)[:8])
     raise SourceError(
         f"the checkpoint does not tell the size of the image that {module} sees",
-        why=f"its encoder ({encoder.key}) ends in {columns} numbers, and {len(sizes)} sizes give that"
+        why=f"{says} ({encoder.key}), which ends in {columns} numbers, and {len(sizes)} sizes give that"
         + (f"; {'square ones' if squares else 'some'}: {shown}" if shown else ""),
         fix=f"{_SAY} 8 for a vector and {'x'.join(map(str, example))} for an image; or {LET_IT_EXPORT}",
     )
