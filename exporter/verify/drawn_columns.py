@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from converters.compiler.passes.normalise import normalise
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.graph.shapes import Types, infer_types
@@ -24,6 +25,9 @@ def drawn_columns(graph: Graph, outputs: Collection[str]) -> dict[str, np.ndarra
     asked = [name for name in outputs if name in drawn]
     if not asked:
         return {}
+    # A bundle's own .bytes leaves out the attributes that TF 1.4 does not know (a draw's output_dtype).
+    graph = normalise(graph.pruned(asked), asked)
+    drawn = graph.descendants(n.name for n in graph.nodes if n.op in SAMPLERS)
     types = infer_types(graph)
     columns = {name: _columns(graph, types, drawn, name) for name in asked}
     return {name: mask for name, mask in columns.items() if mask is not None and not mask.all()}
