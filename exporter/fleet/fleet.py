@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -100,6 +101,22 @@ def _no_modules_of_this_folder() -> Iterator[None]:
             os.environ[_SAFE_PATH] = before
 
 
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """A process that is started inside is not interrupted before it says what an interrupt is to it (``worker.work``).
+
+    Ctrl-C goes to every process of a terminal; one that still imports its modules would end in a traceback.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @dataclass
 class _Worker:
     process: BaseProcess
@@ -180,7 +197,7 @@ class _Crew(AbstractContextManager["_Crew"]):
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, self.options, self.wanted), daemon=False)
-        with _no_modules_of_this_folder():
+        with _no_modules_of_this_folder(), _interrupts_wait():
             process.start()
         theirs.close()
         worker = _Worker(process, ours, index)

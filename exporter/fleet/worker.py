@@ -130,6 +130,8 @@ def work(pipe: Connection, options: ExportOptions, wanted: Wanted) -> None:
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as a terminal does that is closed
     signal.signal(signal.SIGTERM, _stop)
+    if hasattr(signal, "pthread_sigmask"):  # it waited while this process was started
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     exporter = Exporter(options)
     try:
         with RuntimePool() as pool:

@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 from converters.files.fetch import shown
 from converters.files.folders import scratch_folder
-from exporter.remote.filesystem import MAX_FILES, asking, filesystem, is_http, remote
+from exporter.remote.filesystem import MAX_FILES, Pace, asking, filesystem, is_http, remote
 from signatures.digest import sha256_hex
 from signatures.errors import ExportModelError, SourceError
 
@@ -106,8 +106,10 @@ def _files(system: Any, place: str) -> Mapping[str, Mapping[str, Any]]:
 def _download(system: Any, name: str, target: Path, left: int, address: str) -> int:
     """Copy a file; returns what is left of the bytes that one source may have, whatever was said of its size."""
     how = {"block_size": 0} if is_http(name) else {}
+    pace = Pace(address)
     with system.open(name, "rb", **how) as source, target.open("xb") as file:
         while chunk := source.read(_CHUNK):
+            pace.count(chunk)
             left -= len(chunk)
             _within(left, address)
             file.write(chunk)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import fnmatch
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,13 +61,43 @@ def is_http(address: str) -> bool:
 def _manner() -> dict[str, Any]:
     """How long a web server may be silent; aiohttp's own five minutes are for all of a file, however large.
 
-    Files come as they are: packed on the way, a small answer would fill the disk.
+    Files come as they are: packed on the way, a small answer would fill the disk. Where a server sends on to, is looked
+    at (``redirects``).
     """
     import aiohttp
 
+    from exporter.remote.redirects import guarded_client
+
     timeout = aiohttp.ClientTimeout(total=6 * 3600, sock_connect=30, sock_read=60)
     headers = {"Accept-Encoding": "identity"}
-    return {"client_kwargs": {"timeout": timeout, "headers": headers, "auto_decompress": False}}
+    return {
+        "get_client": guarded_client,
+        "client_kwargs": {"timeout": timeout, "headers": headers, "auto_decompress": False},
+    }
+
+
+class Pace:
+    """How fast a server sends. One that sends a byte now and then would be waited for, for hours."""
+
+    #: Seconds that are not looked at; bytes a second, on average, from then on.
+    FREE, LEAST = 60.0, 4096
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._start = time.monotonic()
+        self._bytes = 0
+
+    def count(self, chunk: bytes) -> None:
+        """Note what came. Raises SourceError where it is too little for the time."""
+        self._bytes += len(chunk)
+        seconds = time.monotonic() - self._start
+        if seconds > self.FREE and self._bytes < self.LEAST * (seconds - self.FREE):
+            raise SourceError(
+                "comes too slowly",
+                where=shown(self._address),
+                why=f"{self._bytes} bytes came in {seconds:.0f} s, and {self.LEAST} a second are waited for",
+                fix="download it first, and give the file",
+            )
 
 
 @contextlib.contextmanager
@@ -134,10 +165,12 @@ def _linked(address: str) -> list[Path]:
         pattern = re.compile(fnmatch.translate(part.replace("?", "[?]")))  # which begins a query
         end = "/" if number < len(parts) - 1 else ""  # as a folder's link has it
         found = set[str]()
+        pace = Pace(address)
         for top in tops:
             text = bytearray()
             with asking(address), system.open(f"{top}/", "rb", block_size=0) as page:
                 while size <= MAX_LISTING and (chunk := page.read(_CHUNK)):
+                    pace.count(chunk)
                     text += chunk
                     size += len(chunk)
             for link in _LINK.findall(text.decode(errors="replace")):

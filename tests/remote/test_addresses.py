@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-import gzip
 import importlib.util
-import os
 import shutil
-import socket
-import threading
 from collections.abc import Iterator
-from functools import partial
-from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from converters.files import fetch
-from converters.files.fetch import address_of
 from exporter import compare_artefacts, export_model, inspect_model, verify_bundle
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
 from exporter.fleet.worker import Outcome
-from exporter.remote import fetching, filesystem, sending
+from exporter.remote import fetching, sending
 from exporter.remote.fetching import nearby
-from exporter.remote.filesystem import asking, matching, remote
+from exporter.remote.filesystem import remote
 from fixtures import path as fixture
 from signatures.contract import POLICY
 from signatures.errors import BundleError, SourceError, UsageError
-from tests.commands import export_model as command
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -194,196 +186,9 @@ def test_nothing_is_written_by_http() -> None:
         sending.check_sendable(Path("https://example.com/out"))
 
 
-# ------------------------------------------------------------------ a web server
-
-
-class _Redirecting(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        self.send_response(302)
-        self.send_header("Location", f"file://{fixture('discrete')}")
-        self.end_headers()
-
-    do_HEAD = do_GET  # noqa: N815
-
-    def log_message(self, *args: Any) -> None:
-        pass
-
-
-def test_a_server_that_does_not_answer_is_not_a_missing_file() -> None:
-    with socket.socket() as taken:  # bound, and nobody listens
-        taken.bind(("127.0.0.1", 0))
-        address = f"http://127.0.0.1:{taken.getsockname()[1]}/x.onnx"
-        with pytest.raises(SourceError, match=r"cannot be fetched\n  why: Client.*connect"):
-            export_model(address, "out", verify="none")
-
-
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *args: Any) -> None:
-        pass
-
-
-@pytest.fixture
-def serving() -> Iterator[Any]:
-    servers = []
-
-    def serve(handler: Any) -> str:
-        server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        servers.append(server)
-        return f"http://127.0.0.1:{server.server_port}"
-
-    yield serve
-    for server in servers:
-        server.shutdown()
-        server.server_close()
-
-
-def test_a_web_server(serving: Any, tmp_path: Path) -> None:
-    shutil.copy(fixture("discrete"), tmp_path / "discrete.bytes")
-    place = serving(partial(_Quiet, directory=str(tmp_path)))
-    run([f"{place}/discrete.bytes?raw=true"], tmp_path / "one")
-    export_model(fixture("discrete"), tmp_path / "two", verify="none")
-    assert files(tmp_path / "one" / "discrete") == files(tmp_path / "two" / "discrete")
-    ran = command("inspect", f"{place}/discrete.bytes")
-    assert (ran.status, "discrete" in ran.out) == (0, True)
-    ran = command(f"{place}/gone.bytes", "-o", tmp_path / "out", "--verify", "none")
-    assert ran.status == 2
-    assert f"{place}/gone.bytes" in ran.err
-
-
-def test_passwords_and_signatures_are_told_and_written_nowhere(serving: Any, tmp_path: Path) -> None:
-    for name in "ab":
-        (tmp_path / "there" / name).mkdir(parents=True)
-        shutil.copy(fixture("discrete"), tmp_path / "there" / name / "discrete.bytes")
-    place = serving(partial(_Quiet, directory=str(tmp_path / "there")))
-    signed = f"{place}/b/discrete.bytes?sig=secret"
-    given = [f"{place.replace('://', '://user:secret@')}/a/discrete.bytes", signed]
-    (tmp_path / "here").mkdir()
-    report = ("--html", tmp_path / "here" / "report.html")
-    out = ("-o", tmp_path / "here" / "out", "--verify", "none")
-    gone = [address.replace("discrete", "gone") for address in given]
-    ran = [
-        command(*given, *gone, *out, "-v"),
-        command(*given, *out, "--json"),
-        command("inspect", given[0]),
-        command("inspect", signed),
-        command("inspect", *gone, "--json"),
-        command("compare", given[0], signed, "--runtimes", "none", "--allow-unverified", *report),
-        command(f"{place}/?sig=secret*", *out),
-    ]
-    assert [r.status for r in ran] == [2, 0, 0, 0, 2, 0, 2]
-    assert '"unchanged": 2' in ran[1].out
-    written = files(tmp_path / "here")
-    assert {"out/discrete/policy.json", "out/b-discrete/policy.json", "report.html"} < written.keys()
-    assert [name for name, data in written.items() if b"secret" in data or "secret" in name] == []
-    assert [r for r in ran if "secret" in r.out + r.err] == []
-    assert f"called b-discrete: discrete is the policy of {place}/a/discrete.bytes" in ran[0].out
-
-
-@pytest.mark.parametrize(
-    ("address", "told"),
-    [
-        ("https://u:p@h:8/a//b.onnx?X-Amz-Signature=1#x", "https://h:8/a/b.onnx"),
-        ("s3://key:hidden@bucket/run#1/p.onnx", "s3://bucket/run#1/p.onnx"),
-        ("hf://gpt2@main/p.onnx", "hf://gpt2@main/p.onnx"),
-        ("memory://out/discrete", "memory://out/discrete"),
-        ("runs/a@b/p.onnx", "runs/a@b/p.onnx"),
-    ],
-)
-def test_an_address_is_told_in_its_own_spelling(address: str, told: str) -> None:
-    assert fetch.shown(Path(address)) == told
-    text = f"403, message='Forbidden', url='{address}'"
-    with pytest.raises(SourceError) as raised, asking(address):
-        raise ValueError(text)
-    assert raised.value.why == f"ValueError: {text.replace(address, told)}"
-    assert raised.value.where == told
-
-
-def test_unchanged_files_of_a_web_server_are_left_out(serving: Any, tmp_path: Path) -> None:
-    shutil.copy(fixture("discrete"), tmp_path / "discrete.bytes")
-    given = [f"{serving(partial(_Quiet, directory=str(tmp_path)))}/discrete.bytes"]  # which tells Last-Modified alone
-    assert [run(given, tmp_path / "out")[0].unchanged for _ in range(2)] == [False, True]
-    os.utime(tmp_path / "discrete.bytes", (1, 1))
-    assert not run(given, tmp_path / "out")[0].unchanged
-
-
-def test_a_pattern_follows_the_links_of_each_level(
-    serving: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("a/p 1.onnx", "a/q.txt", "b/p.onnx", "b/inside/p.onnx", "notes.txt"):
-        (tmp_path / "runs" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "runs" / name).write_bytes(b"-")
-    place = serving(partial(_Quiet, directory=str(tmp_path)))
-    found = [address_of(p) for p in matching(f"{place}/runs/*/*.onnx")]
-    assert found == [f"{place}/runs/a/p%201.onnx", f"{place}/runs/b/p.onnx"]
-    assert [address_of(p) for p in matching(f"{place}/runs/[b]/p.onnx")] == [f"{place}/runs/b/p.onnx"]
-    with pytest.raises(UsageError, match=r"\*\* is not for a web server"):
-        matching(f"{place}/runs/**/*.onnx")
-    with monkeypatch.context() as patched, pytest.raises(SourceError, match="lists more than is read"):
-        patched.setattr(filesystem, "MAX_FILES", 1)
-        matching(f"{place}/runs/*/*.onnx")
-    monkeypatch.setattr(filesystem, "MAX_LISTING", 100)
-    with pytest.raises(SourceError, match="lists more than is read"):
-        matching(f"{place}/runs/*/*.onnx")
-
-
-class _Pages(_Redirecting):
-    """Pages that link out of their folder."""
-
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.end_headers()
-        for link in ("../p.onnx", "//elsewhere.example/p.onnx", "/runs/p.onnx", "/else/p.onnx", "?C=N", "p.onnx?x=1"):
-            self.wfile.write(f"<a href='{link}'>p</a>".encode())
-
-
-def test_links_lead_nowhere_else(serving: Any) -> None:
-    place = serving(_Pages)
-    assert [address_of(p) for p in matching(f"{place}/runs/*.onnx")] == [f"{place}/runs/p.onnx"]
-
-
-def test_a_file_may_take_longer_than_five_minutes() -> None:
-    system, _ = filesystem.filesystem("https://example.com/p.onnx")
-    timeout = system.client_kwargs["timeout"]
-    assert (timeout.total >= 3600, timeout.sock_connect, timeout.sock_read) == (True, 30, 60)
-
-
-@pytest.mark.parametrize("address", ["http://[/x.onnx", "http://*", "http://*/x.onnx", "http://a b/x"])
-def test_a_host_is_no_pattern(address: str, tmp_path: Path) -> None:
-    """Patterns are of paths: a bracket in a host ended in StopIteration."""
-    (tmp_path / "list.txt").write_text(address)
-    ran = command(tmp_path / "list.txt", "-o", tmp_path / "out", "--verify", "none")
-    assert (ran.status, "Traceback" in ran.err) == (2, False)
-    assert address in ran.err
-
-
-class _Packed(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.send_header("Content-Encoding", "gzip")
-        self.end_headers()
-        self.wfile.write(gzip.compress(bytes(1 << 26)))
-
-    do_HEAD = do_GET  # noqa: N815
-
-    def log_message(self, *args: Any) -> None:
-        pass
-
-
-def test_what_comes_is_not_unpacked_on_the_way(serving: Any) -> None:
-    with nearby(Path(f"{serving(_Packed)}/policy.onnx")) as place:
-        assert place.stat().st_size < 1 << 20
-
-
 @pytest.mark.parametrize("listed", [["/odd/a", "/odd/a/b"], ["/elsewhere/x"]])
 def test_a_listing_that_no_folder_can_have(listed: list[str], memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     memory.pipe("/odd/a", b"-")
     monkeypatch.setattr(type(memory), "find", lambda *a, **k: {name: {"size": 1} for name in listed})
     with pytest.raises(SourceError, match=r"^memory://odd: cannot be fetched"), nearby(Path("memory://odd")):
-        pass
-
-
-def test_a_redirect_leads_to_no_file(serving: Any) -> None:
-    place = serving(_Redirecting)
-    with pytest.raises(SourceError, match=r"cannot be fetched|no such file"), nearby(Path(f"{place}/policy.bytes")):
         pass

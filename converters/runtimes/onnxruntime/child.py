@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import secrets
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 
 from converters.files.children.child import Model, claim_stdout, serve
 from converters.files.children.frames import Tensors
+from converters.files.folders import scratch_folder
 
 
 def main() -> None:
@@ -76,7 +76,7 @@ def main() -> None:
             key = tuple(dict.fromkeys(fetch))
             if key not in self.sessions:
                 files = files_of(self.cut(self.model, key), self.detached, "source.onnx")
-                with tempfile.TemporaryDirectory() as folder:
+                with scratch_folder() as folder:
                     for name, data in files.items():
                         data.write(Path(folder, name))
                     self.sessions[key] = session(str(Path(folder, "source.onnx")))
