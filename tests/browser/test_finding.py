@@ -92,14 +92,16 @@ def test_webgl_does_not_ask_for_the_wasm_backend(monkeypatch: pytest.MonkeyPatch
     assert not WASM.find().installed
 
 
-def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node, "node_executable", lambda: "node")
+def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "node"
+    program.write_bytes(b"\x7fELF")  # no shim, which would be looked through
+    monkeypatch.setattr(node, "node_executable", lambda: str(program))
     monkeypatch.setattr(browser, "chromium_executable", lambda: None)
     with pytest.raises(RuntimeUnavailableError, match="Chromium is not installed"):
         WEBGL.command()
     monkeypatch.setattr(browser, "chromium_executable", lambda: "chrome")
     command = WEBGL.command()
-    assert command[0] == "node"
+    assert command[0] == str(program)
     assert command[2:4] == ["--runtime", "tfjs-webgl"]
     assert command[-3:] == ["--chromium", "chrome", "--known"]
     monkeypatch.setattr(node, "node_executable", lambda: None)

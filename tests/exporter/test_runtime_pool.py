@@ -222,10 +222,12 @@ def test_without_node_tensorflow_js_is_unavailable(monkeypatch: pytest.MonkeyPat
         pool.process("tfjs-cpu")
 
 
-def test_tensorflow_js_runs_in_node_with_its_backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(javascript, "node_executable", lambda: "node")
+def test_tensorflow_js_runs_in_node_with_its_backend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "node"
+    program.write_bytes(b"\x7fELF")  # no shim, which would be looked through
+    monkeypatch.setattr(javascript, "node_executable", lambda: str(program))
     monkeypatch.setenv("EXPORT_MODEL_JS", "/packages")
     command = NODE["tfjs-wasm"].command()
-    assert command[0] == "node"
+    assert command[0] == str(program)
     assert command[1].endswith("runner.mjs")
     assert command[2:] == ["--runtime", "tfjs-wasm", "--modules", "/packages"]
