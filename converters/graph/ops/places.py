@@ -59,17 +59,33 @@ def _infer_sparse_to_dense(node: Node, args: Sequence[TensorType], symbols: Symb
 
 
 def _lower_sparse_to_dense(node: Node, builder: OnnxBuilder) -> Any:
+    """ScatterElements along one axis, since Barracuda 2.3.1 and 3.0.0 misread ScatterND (ScatterND_01)."""
     kinds = [builder.type_of(r) for r in node.inputs]
     if kinds[0].rank is None or kinds[2].rank is None or kinds[1].shape is None:
         raise not_constant(node, "the rank of its places")
     places = as_int64(node, builder, 0) if kinds[0].rank < 2 else _matrix(node, builder, kinds[0])
-    if kinds[0].rank < 2:
-        places = builder.emit("Reshape", [places, builder.const(np.array([-1, 1], np.int64), "shape")])
-    count = builder.emit("Shape", [places])
-    first = [builder.const(np.array([n], np.int64), "slice") for n in (0, 1, 0)]
-    values = builder.emit("Expand", [builder.value(node.inputs[2]), builder.emit("Slice", [count, *first])])
-    base = builder.emit("Expand", [builder.value(node.inputs[3]), as_int64(node, builder, 1)])
-    return builder.emit("ScatterND", [base, places, values])
+    line = builder.const(np.array([-1], np.int64), "shape")
+    shape = as_int64(node, builder, 1)
+    one_axis = kinds[0].rank < 2 or kinds[1].shape == (1,)
+    if not one_axis:  # a place has a number for each axis
+        places = builder.emit("GatherND", [_numbered(node, builder, kinds[1], shape), places])
+    flat = builder.emit("Reshape", [places, line])
+    values = builder.emit("Expand", [builder.value(node.inputs[2]), builder.emit("Shape", [flat])])
+    base = builder.emit("Expand", [builder.value(node.inputs[3]), shape])
+    if one_axis:
+        return builder.emit("ScatterElements", [base, flat, values])
+    base = builder.emit("Reshape", [base, line])
+    return builder.emit("Reshape", [builder.emit("ScatterElements", [base, flat, values]), shape])
+
+
+def _numbered(node: Node, builder: OnnxBuilder, kind: TensorType, shape: str) -> str:
+    """A tensor of the result's shape that says of each element which it is, row by row."""
+    if kind.constant is not None:
+        sizes = [int(n) for n in kind.constant.reshape(-1)]
+        return builder.const(np.arange(np.prod(sizes), dtype=np.int64).reshape(sizes), "numbers")
+    ends = [builder.const(np.array(n, np.int64), "range") for n in (0, 1)]
+    count = builder.emit("ReduceProd", [shape], keepdims=0)
+    return builder.emit("Reshape", [builder.emit("Range", [ends[0], count, ends[1]]), shape])
 
 
 def _matrix(node: Node, builder: OnnxBuilder, kind: TensorType) -> str:
