@@ -72,7 +72,7 @@ def _dueling(given: Candidate) -> bool:
     added = {ref for ref, sign in terms if sign > 0}
     for reference, sign in terms:
         node = given.graph.producer(reference)
-        mean = traits(node).name in ("Mean", "Max") and sign < 0
+        mean = not traits(node).elementwise and traits(node).takes in ("mean", "largest") and sign < 0
         if mean and _through(given.graph, node.inputs[0]) in added and len(added) > 1:
             return True
     return False
@@ -133,7 +133,7 @@ def _is_bounded(graph: Graph, tensor: str) -> bool:
     """Whether a tensor is squashed or clipped, perhaps scaled and moved after that."""
     for _ in range(_MOST_STEPS):
         node = graph.producer(tensor)
-        if traits(node).activation in _BOUNDED or traits(node).name in ("Minimum", "Maximum"):
+        if traits(node).activation in _BOUNDED or (traits(node).elementwise and traits(node).takes):
             return True
         constants = [graph.constant(r) is not None for r in node.inputs]
         if passes_on(node):

@@ -9,10 +9,8 @@ import numpy as np
 from converters.compiler.passes.normalise import normalise
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
+from converters.graph.ops.table import passes_on, traits
 from converters.graph.shapes import Types, infer_types
-
-#: Ops that give the columns of their first operand, where the last axis stays as long.
-_KEEPING = frozenset(("Identity", "Cast", "Reshape", "ExpandDims"))
 
 
 def drawn_columns(graph: Graph, outputs: Collection[str]) -> dict[str, np.ndarray]:
@@ -48,7 +46,7 @@ def _columns(graph: Graph, types: Types, drawn: Collection[str], name: str) -> n
     if node.name not in drawn:
         return np.zeros(width, bool)
     parts: list[np.ndarray | None] = [None]
-    if node.op in _KEEPING:
+    if passes_on(node) or (traits(node).elementwise and len(node.inputs) == 1):
         parts = [_columns(graph, types, drawn, node.inputs[0])]
     elif node.op == "ConcatV2" and _last_axis(types, node.inputs[-1], len(shape)):
         parts = [_columns(graph, types, drawn, part) for part in node.inputs[:-1]]

@@ -195,6 +195,8 @@ class OpDef:
     table_size: TableSize | None = None
     #: The result is where the largest or the smallest number is along an axis.
     chooses: Literal["", "largest", "smallest"] = ""
+    #: What the result is of two operands' elements, or of those along an axis.
+    takes: Literal["", "largest", "smallest", "mean"] = ""
     #: The result says which elements of two operands are equal.
     compares_equal: bool = False
     #: The op that computes this one, a bias and an activation in one.

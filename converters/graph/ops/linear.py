@@ -228,13 +228,15 @@ def _litert_reduction(op: str) -> Callable[[Node, LitertBuilder], Any]:
     return lower
 
 
-def _reduce(name: str, function: Callable[..., Any], onnx_op: str, precision: Precision, litert_op: str) -> OpDef:
+def _reduce(
+    name: str, function: Callable[..., Any], onnx_op: str, precision: Precision, litert_op: str, **traits: Any
+) -> OpDef:
     attrs: tuple[Attr, ...] = (Attr("keep_dims", "bool", False), type_attr("Tidx", "in:1"))
     if name not in ("All", "Any"):
         attrs = (T, *attrs)
     kernel = _reduction(function, wide=precision != "exact")
     lower, litert = _lower_reduction(onnx_op), _litert_reduction(litert_op)
-    return OpDef(name, _infer_reduction, kernel, lower, attrs, litert=litert, precision=precision)
+    return OpDef(name, _infer_reduction, kernel, lower, attrs, litert=litert, precision=precision, **traits)
 
 
 def _arg(function: Callable[..., Any]) -> Callable[..., np.ndarray]:
@@ -329,9 +331,9 @@ OPS = (
         litert=builtin("ADD"),
     ),
     _reduce("Sum", np.sum, "ReduceSum", "summed", "SUM"),
-    _reduce("Mean", _mean, "ReduceMean", "rounded", "MEAN"),
+    _reduce("Mean", _mean, "ReduceMean", "rounded", "MEAN", takes="mean"),
     _reduce("Prod", np.prod, "ReduceProd", "rounded", "REDUCE_PROD"),
-    _reduce("Max", np.max, "ReduceMax", "exact", "REDUCE_MAX"),
+    _reduce("Max", np.max, "ReduceMax", "exact", "REDUCE_MAX", takes="largest"),
     _reduce("Min", np.min, "ReduceMin", "exact", "REDUCE_MIN"),
     _reduce("All", np.all, "ReduceMin", "exact", "REDUCE_ALL"),
     _reduce("Any", np.any, "ReduceMax", "exact", "REDUCE_ANY"),
