@@ -76,9 +76,9 @@ def _rows(size: int) -> tuple[int | None, ...]:
 
 def _take_observations(dressing: Dressing, generation: Generation) -> None:
     signature = dressing.policy.signature
-    if any(s.role is Role.ENTITIES for s in signature.observations):
+    if any(s.is_sequence for s in signature.observations):
         dressing.refuse(
-            "one of its observations is a list of entities",
+            "one of its observations is a list of entities or a history",
             why="ML-Agents 0.1 to 0.6 has vectors and cameras alone",
             fix="use a project of release 17 or later (--for barracuda-1.4, barracuda-3, unity6)",
         )
