@@ -15,7 +15,7 @@ from converters.compiler.passes.constant_chains import merge_constants, share, s
 from converters.compiler.passes.fuse import fuse
 from converters.compiler.passes.int8_products import multiply_products
 from converters.compiler.passes.layout_views import transpose_layout_views
-from converters.compiler.passes.lowering import lower_for_tfjs
+from converters.compiler.passes.lowering import lower_for_importers, lower_for_nn, lower_for_tfjs
 from converters.compiler.passes.slice_of_concat import parts_for_slices
 from converters.graph.nodes import Graph
 from converters.policy.policy import Policy
@@ -58,7 +58,13 @@ ONNX = (*FEWER_OPS, _FUSE)
 LITERT = (*FEWER_OPS, _FUSE)
 #: Models for one consumer stay as they were tried in it.
 CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)
-BARRACUDA = (_FUSE,)
+BARRACUDA = (_FUSE, _on_roots(lower_for_nn))
+
+
+def consumer_onnx(misread: Collection[str]) -> tuple[Step, ...]:
+    """Return the steps for importers that lack or misread some ONNX ops."""
+    return (*CONSUMER_ONNX, lambda graph, outputs: lower_for_importers(graph, misread))
+
 
 _OF_BRANCHES = (Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS, Role.PROBS)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NoReturn
 
+from converters.formats.format import WriteOptions
 from converters.policy.policy import Policy
 from signatures.errors import ProfileError
 from signatures.records import dataclass
@@ -32,6 +33,15 @@ class Profile:
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()
     players: tuple[str, ...] = ()
+
+    def write_options(self, contract: str) -> WriteOptions:
+        """Return how a writer makes the files of this consumer."""
+        misread = frozenset[str]()
+        if self.importers:
+            from converters.consumers.unity.readings import misread_ops
+
+            misread = misread_ops(self.importers)
+        return WriteOptions(contract, self.opset, self.name, misread=misread)
 
 
 def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:

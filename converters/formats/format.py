@@ -49,7 +49,8 @@ def deferred(room: str, *modules: str) -> list[Any]:
 class WriteOptions:
     """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
     file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), how
-    weights that were rounded are kept, and for how many agents the file is (None: for any number).
+    weights that were rounded are kept, for how many agents the file is (None: for any number), and the ONNX ops that
+    the consumer lacks or misreads in some form.
     """
 
     contract: str
@@ -58,6 +59,7 @@ class WriteOptions:
     checked: bool = True
     weights: Storage = "float32"
     batch: int | None = None
+    misread: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)

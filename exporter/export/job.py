@@ -78,7 +78,7 @@ def artefacts_of(
                         raise
                     notes.append(f"{form.key} was left out: {error.what}: {error.why}")
             return contract, artifacts, tuple(notes)
-        how = WriteOptions(contract.compact(), job.profile.opset, job.profile.name)
+        how = job.profile.write_options(contract.compact())
         artifacts = [f.artifact(job.policy, how) for f in formats]
         if job.profile.importers:
             from converters.consumers.importable import importable

@@ -86,7 +86,7 @@ class Pair:
         """
         dressed = profile.dress(policy)
         form = form or profile.formats[0]
-        artifact = written(form).artifact(dressed, WriteOptions(CONTRACT, profile.opset, profile.name))
+        artifact = written(form).artifact(dressed, profile.write_options(CONTRACT))
         if profile.importers:
             importable(profile, artifact.files, policy.name)
             playable(profile, artifact.files, policy.name)

@@ -46,7 +46,6 @@ CANNOT_IN = {
     ("entity_attention__legacy.onnx", "barracuda-1.4"): "Reshape",
     ("autoregressive__legacy.onnx", "barracuda-1.0"): "ArgMax",
     ("autoregressive__dynamo.onnx", "barracuda-1.0"): "ArgMax",
-    ("sb3_ppo_mlp_bin__legacy_dyn.onnx", "barracuda-1.0"): "Round",
     # an action [B, n, 1], whose elements Barracuda 1.1 gives in another order
     ("Balint-H+marathon-envs__ControllerMarathonMan-v1-no-collisions.onnx", "barracuda-1.0"): "Reshape",
     ("Balint-H+marathon-envs__Hopper-v0.onnx", "barracuda-1.0"): "Reshape",

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph
+from converters.graph.ops.base import OpDef, Tfjs
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
 
 
 def lower_for_tfjs(graph: Graph, roots: Collection[str] = ()) -> Graph:
     """Return the graph in ops that TensorFlow.js has and computes rightly; names of the nodes that stay are kept."""
-    if not any(op_of(n).tfjs for n in graph.nodes):
+    return _lower(graph, lambda entry: entry.tfjs)
+
+
+def lower_for_nn(graph: Graph, roots: Collection[str] = ()) -> Graph:
+    """Return the graph in ops that a ``.nn`` of Barracuda 1.0 has, where an op's entry says how."""
+    return _lower(graph, lambda e: e.barracuda.write if e.barracuda is not None and e.barracuda.nn else None)
+
+
+def lower_for_importers(graph: Graph, misread: Collection[str]) -> Graph:
+    """Return the graph without what becomes one of the ONNX ops ``misread``, where an op's entry says how."""
+    return _lower(
+        graph, lambda e: e.barracuda.write if e.barracuda is not None and e.barracuda.onnx in misread else None
+    )
+
+
+def _lower(graph: Graph, rewrite_of: Callable[[OpDef], Tfjs | None]) -> Graph:
+    if not any(rewrite_of(op_of(n)) for n in graph.nodes):
         return graph
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
-        rewrite = op_of(node).tfjs
+        rewrite = rewrite_of(op_of(node))
         editor.keep(node if rewrite is None else rewrite(editor, node, types))
     return editor.graph()

@@ -70,6 +70,11 @@ def misreadings(model: Model, importers: Sequence[str] = _NAMES) -> Iterator[Mis
                 yield from (Misreading(importer, construct, rule) for importer in concerned)
 
 
+def misread_ops(importers: Sequence[str]) -> frozenset[str]:
+    """Return the operators that any of ``importers`` lacks or misreads in some form."""
+    return frozenset(op for rule in RULES if set(rule.importers).intersection(importers) for op in rule.ops)
+
+
 # ------------------------------------------------------------------ forms
 
 

@@ -1,9 +1,9 @@
 """Ops that compute number by number: arithmetic, activations, comparisons, choices, casts.
 
-What a real Barracuda gets wrong or does not have is written in what all of them run (1.0 to 3.0): the first operand of
-a subtraction, division or minimum always has the result's lengths (the folds over several operands, and over a first
-operand that is repeated, are wrong in early versions), and an activation that is younger than 1.0 is spelled out (an
-old worker copies what it does not know).
+What a real Barracuda gets wrong is written in what all of them run (1.0 to 3.0): the first operand of a subtraction,
+division or minimum always has the result's lengths (the folds over several operands, and over a first operand that is
+repeated, are wrong in early versions). An activation that is younger than 1.0 does not get here: an old worker copies
+what it does not know, so the op's entry decomposes it (``graph/ops/barracuda``).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from converters.graph.types import Dim
 _STEEP = 1e30
 _LARGEST = float(np.finfo(np.float32).max)
 
-#: Those that a Barracuda of 1.0 has not, or rounds another way, are spelled out.
+#: Those that a Barracuda of 1.0 lacks, or rounds another way.
 _YOUNG = ("Softplus", "Softsign", "Round", "Cos", "Sin", "Tan", "Erf")
 _ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if op not in _YOUNG} | {"Elu": Activation.ELU}
 _TWO: Mapping[str, LayerType] = {
@@ -63,50 +63,11 @@ def _mapped(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Value:
     return b.made(make(b.stored(value)), value.shape, value.axes)
 
 
-def _step(b: NnBuilder, x: str) -> str:
-    """1 where ``x`` is above 0, else 0."""
-    return b.at_least(b.at_most(b.scaled(x, _STEEP, "steep"), 1), 0)
-
-
-def _sign(b: NnBuilder, x: str) -> str:
-    return b.at_least(b.at_most(b.scaled(x, _STEEP, "steep"), 1), -1)
-
-
 def _truncated(b: NnBuilder, x: str) -> str:
     """Towards 0: the parts above and below, one of which is 0."""
     above = b.at_least(b.activation(Activation.FLOOR, x, label="floor"), 0)
     below = b.at_most(b.activation(Activation.CEIL, x, label="ceil"), 0)
     return b.two(LayerType.ADD, above, below, "truncated")
-
-
-def _round(b: NnBuilder, x: str) -> str:
-    """To the nearest whole number, halves to the even one: floor, plus 1 above a half, plus 1 at a half if odd."""
-    low = b.activation(Activation.FLOOR, x, label="floor")
-    over = b.shifted(b.two(LayerType.SUB, x, low, "rest"), -0.5)
-    halved = b.activation(Activation.FLOOR, b.scaled(low, 0.5), label="half")
-    odd = b.two(LayerType.SUB, low, b.scaled(halved, 2), "odd")
-    far = b.at_most(b.scaled(b.activation(Activation.ABS, over, label="far"), _STEEP, "steep"), 1)
-    tie = b.shifted(b.scaled(far, -1), 1)
-    up = b.two(LayerType.ADD, _step(b, over), b.two(LayerType.MUL, tie, odd, "tie"), "up")
-    return b.two(LayerType.ADD, low, up, "rounded")
-
-
-def _softplus(b: NnBuilder, x: str) -> str:
-    """max(x, 0) + log(1 + e^−|x|); Barracuda has it from 1.4 on."""
-    small = b.activation(Activation.EXP, b.scaled(b.activation(Activation.ABS, x, label="abs"), -1), label="exp")
-    return b.two(LayerType.ADD, b.at_least(x, 0), b.activation(Activation.LOG, b.shifted(small, 1), label="log"))
-
-
-def _erf(b: NnBuilder, x: str) -> str:
-    """Abramowitz and Stegun 7.1.26, right to 1.5e-7; Barracuda has it from 2.3 on."""
-    size = b.activation(Activation.ABS, x, label="abs")
-    t = b.activation(Activation.RECIPROCAL, b.shifted(b.scaled(size, 0.3275911), 1), label="t")
-    series = b.scaled(t, 1.061405429, "series")
-    for factor in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
-        series = b.two(LayerType.MUL, b.shifted(series, factor), t, "series")
-    bell = b.activation(Activation.EXP, b.scaled(b.two(LayerType.MUL, size, size, "square"), -1), label="bell")
-    upper = b.shifted(b.scaled(b.two(LayerType.MUL, series, bell, "tail"), -1), 1)
-    return b.two(LayerType.MUL, upper, _sign(b, x))
 
 
 def _leaky_relu(b: NnBuilder, x: str) -> str:
@@ -119,14 +80,6 @@ def _leaky_relu(b: NnBuilder, x: str) -> str:
 
 _FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
     "Square": lambda b, x: b.two(LayerType.MUL, x, x),
-    "Rsqrt": lambda b, x: b.activation(Activation.RECIPROCAL, b.activation(Activation.SQRT, x, label="sqrt")),
-    "Expm1": lambda b, x: b.shifted(b.activation(Activation.EXP, x, label="exp"), -1),
-    "Log1p": lambda b, x: b.activation(Activation.LOG, b.shifted(x, 1)),
-    "Softplus": _softplus,
-    "Softsign": lambda b, x: b.two(LayerType.DIV, x, b.shifted(b.activation(Activation.ABS, x, label="abs"), 1)),
-    "Sign": _sign,
-    "Round": _round,
-    "Erf": _erf,
     "LogicalNot": lambda b, x: b.shifted(b.scaled(x, -1), 1),
     "LeakyRelu": _leaky_relu,
     "Selu": lambda b, x: b.activation(Activation.SELU, x, alpha=1.6732632423543772, beta=1.0507009873554805),

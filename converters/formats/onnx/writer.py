@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from converters.compiler.passes.weights import Storage, compact
-from converters.compiler.targets import CONSUMER_ONNX, ONNX, prepare
+from converters.compiler.targets import ONNX, consumer_onnx, prepare
 from converters.files.chunks import Pieces, equal
 from converters.files.external_data import LARGE, Detached
 from converters.formats.format import WriteOptions
@@ -36,10 +36,8 @@ from signatures.spec import TensorSpec
 IR_VERSIONS = {11: 6, 12: 7, 13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
 #: What people may ask for; profiles of old importers ask for less.
 ASKED_FOR = range(13, 22)
-#: Profiles whose importer swaps the operands of a Sub or Div of which the first is constant, and has no Where.
-FIRST_IMPORTERS = ("barracuda-1.0",)
-#: Those of which an importer does not know Erf.
-_WITHOUT_ERF = (*FIRST_IMPORTERS, "barracuda-1.4")
+#: What a model for one consumer does without, whether that reads it or not: it stays as it was tried in it.
+_SLICED = frozenset({"Split"})
 #: What works element by element, so that a Transpose may as well come behind it.
 _ELEMENTWISE = frozenset(
     (
@@ -53,11 +51,9 @@ PRODUCER = "export-model"
 class _Builder:
     """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
 
-    def __init__(self, graph: Graph, opset: int, outputs: Collection[str], profile: str | None = None) -> None:
+    def __init__(self, graph: Graph, opset: int, outputs: Collection[str], misread: Collection[str] = ()) -> None:
         self.opset = opset
-        self.constant_first = self.chooses = profile not in FIRST_IMPORTERS
-        self.has_erf = profile not in _WITHOUT_ERF
-        self.splits = profile is None
+        self._misread = misread
         self._transposed: dict[str, tuple[str, tuple[int, ...]]] = {}
         self._scalars: set[str] = set()
         self.types: Types = infer_types(graph)
@@ -71,6 +67,9 @@ class _Builder:
         self.detached = Detached.of(graph.values())
         self._names = NameScope(())
         self._prefix = ""
+
+    def reads(self, onnx_op: str) -> bool:
+        return onnx_op not in self._misread
 
     def value(self, reference: str) -> str:
         return self._values[reference]
@@ -271,8 +270,9 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
             why=f"the lowerings are made for opsets {min(ASKED_FOR)} to {max(ASKED_FOR)}",
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
-    graph = prepare(policy, CONSUMER_ONNX if options.profile else ONNX)
-    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], options.profile)
+    graph = prepare(policy, consumer_onnx(options.misread) if options.profile else ONNX)
+    misread = options.misread | _SLICED if options.profile else ()
+    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], misread)
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)
     for node in graph.nodes:

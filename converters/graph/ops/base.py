@@ -33,14 +33,9 @@ class OnnxBuilder(Protocol):
     """What a lowering may use. Values are ONNX names; ``value`` gives the one that stands for a tensor of the graph."""
 
     opset: int
-    #: False: the importer that is written for swaps the operands of Sub and Div where the first is a constant
-    constant_first: bool
-    #: whether there are Where, Shape and Expand
-    chooses: bool
-    #: whether there is Erf
-    has_erf: bool
-    #: whether there is Split, its sizes an input
-    splits: bool
+
+    def reads(self, onnx_op: str) -> bool:
+        """Return whether every importer that is written for reads an ONNX op rightly, in all its forms."""
 
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""
@@ -109,6 +104,20 @@ Older = Callable[[GraphBuilder, Node], str]
 #: A node as TensorFlow.js computes it rightly: further nodes are added, the one that takes its place is returned.
 Tfjs = Callable[[GraphBuilder, Node, Mapping[str, TensorType]], Node]
 
+
+@dataclass(frozen=True, slots=True)
+class Decomposition:
+    """A node in ops that every Barracuda computes rightly: ``write`` adds nodes and returns the one in its place.
+
+    ``onnx`` is the ONNX op that the node becomes otherwise: decomposed for importers that lack or misread it (``""``:
+    in ONNX the op has a formula anyway). ``nn``: decomposed in every ``.nn``, which Barracuda 1.0 shall run.
+    """
+
+    onnx: str
+    write: Tfjs
+    nn: bool = True
+
+
 #: How a result is rounded: not at all; once, as IEEE says; by an approximation of each runtime's own (Eigen's tanh is 3
 #: to 4 units in the last place off); or a sum of many products, added in an order of each runtime's own.
 Precision = Literal["exact", "rounded", "approximate", "summed"]
@@ -160,6 +169,8 @@ class OpDef:
     foldable: bool = True
     #: Where TensorFlow.js computes it otherwise, or not at all.
     tfjs: Tfjs | None = None
+    #: Where a Barracuda lacks it, or computes it otherwise.
+    barracuda: Decomposition | None = None
     #: How it is written in LiteRT's operators; None: LiteRT has none that compute it.
     litert: Litert | None = None
     #: Names under which the same op stands in graphs of other TensorFlow versions.

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
+from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
@@ -90,7 +91,6 @@ def _pair(name: str) -> Lower:
     """
 
     def lower(node: Node, builder: OnnxBuilder) -> str:
-        onnx_op = name
         kinds = [builder.type_of(r) for r in node.inputs]
         values = []
         for kind, other, reference in zip(kinds, reversed(kinds), node.inputs, strict=True):
@@ -99,11 +99,7 @@ def _pair(name: str) -> Lower:
                 leading = next((i for i, n in enumerate(constant.shape) if n != 1), constant.ndim - 1)
                 value = builder.const(constant.reshape(constant.shape[leading:]), "row")
             values.append(value)
-        inverse = {"Sub": ("Neg", "Add"), "Div": ("Reciprocal", "Mul")}.get(onnx_op)
-        if inverse is not None and not builder.constant_first and kinds[0].constant is not None:
-            values[1], onnx_op = builder.emit(inverse[0], values[1:]), inverse[1]
-            values.reverse()
-        return builder.emit(onnx_op, values)
+        return builder.emit(name, values)
 
     return lower
 
@@ -113,26 +109,6 @@ def _lower_square(node: Node, builder: OnnxBuilder) -> Any:
     values = [builder.value(r) for r in node.inputs]
     value = values[0] if len(values) == 1 else builder.emit("Sub", values)
     return builder.emit("Mul", [value, value])
-
-
-def _lower_erf(node: Node, builder: OnnxBuilder) -> Any:
-    """As it is, or Abramowitz and Stegun 7.1.26, right to 1.5e-7: Barracuda has the op from 2.3 on."""
-    x = builder.value(node.inputs[0])
-    if builder.has_erf:
-        return builder.emit("Erf", [x])
-
-    def with_number(op: str, value: str, number: float) -> str:
-        return builder.emit(op, [value, builder.const(np.asarray(number, FLOAT32))])
-
-    size = builder.emit("Abs", [x])
-    t = builder.emit("Reciprocal", [with_number("Add", with_number("Mul", size, 0.3275911), 1)])
-    series = with_number("Mul", t, 1.061405429)
-    for factor in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
-        series = builder.emit("Mul", [with_number("Add", series, factor), t])
-    bell = builder.emit("Exp", [with_number("Mul", builder.emit("Mul", [x, x]), -1)])
-    upper = with_number("Add", with_number("Mul", builder.emit("Mul", [series, bell]), -1), 1)
-    sign = builder.emit("Mul", [x, builder.emit("Reciprocal", [with_number("Add", size, 1e-30)])])
-    return builder.emit("Mul", [upper, sign])
 
 
 def _real_div(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -220,7 +196,7 @@ def _lower_add_n(node: Node, builder: OnnxBuilder) -> Any:
 def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
     kind = builder.type_of(node.inputs[0])
     zero = builder.const(np.zeros((), kind.dtype), "zero")
-    if not builder.chooses and kind.dtype == FLOAT32:
+    if not builder.reads("Expand") and kind.dtype == FLOAT32:
         return builder.emit("Mul", [bounded(builder, builder.value(node.inputs[0]), kind), zero])
     shape = builder.emit("Shape", [builder.value(node.inputs[0])])
     return builder.emit("Expand", [zero, shape])
@@ -252,27 +228,34 @@ def _tfjs_cast(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType
 UNARY = (
     _unary("Neg", plain(np.negative), "Neg", litert=builtin("NEG"), precision="exact"),
     _unary("Abs", plain(np.abs), "Abs", litert=builtin("ABS"), precision="exact"),
-    _unary("Sign", plain(np.sign), "Sign", litert=builtin("SIGN"), precision="exact"),
+    _unary("Sign", plain(np.sign), "Sign", barracuda=barracuda.SIGN, litert=builtin("SIGN"), precision="exact"),
     _unary("Square", plain(np.square), _lower_square, litert=litert.square),
     _unary("Reciprocal", plain(np.reciprocal), "Reciprocal", spellings=("Inv",), litert=litert.reciprocal),
     _unary("Floor", plain(np.floor), "Floor", litert=builtin("FLOOR"), precision="exact"),
     _unary("Ceil", plain(np.ceil), "Ceil", litert=builtin("CEIL"), precision="exact"),
-    _unary("Round", plain(np.rint), "Round", litert=builtin("ROUND"), precision="exact"),
+    _unary("Round", plain(np.rint), "Round", barracuda=barracuda.ROUND, litert=builtin("ROUND"), precision="exact"),
     _smooth("Exp", np.exp, litert=builtin("EXP")),
-    _smooth("Expm1", np.expm1, chain(("Exp", None), ("Sub", 1.0)), litert=litert.expm1),
+    _smooth("Expm1", np.expm1, chain(("Exp", None), ("Sub", 1.0)), barracuda=barracuda.EXPM1, litert=litert.expm1),
     _smooth("Log", np.log, litert=builtin("LOG")),
-    _smooth("Log1p", np.log1p, chain(("Add", 1.0), ("Log", None)), litert=steps(("ADD", 1.0), ("LOG", None))),
+    _smooth(
+        "Log1p",
+        np.log1p,
+        chain(("Add", 1.0), ("Log", None)),
+        barracuda=barracuda.LOG1P,
+        litert=steps(("ADD", 1.0), ("LOG", None)),
+    ),
     _unary("Sqrt", _wide(np.sqrt), "Sqrt", litert=builtin("SQRT")),
     _smooth(
         "Rsqrt",
         lambda x: np.asarray(1 / np.sqrt(x)),
         chain(("Sqrt", None), ("Reciprocal", None)),
+        barracuda=barracuda.RSQRT,
         litert=builtin("RSQRT"),
     ),
     _smooth("Sin", np.sin, litert=builtin("SIN")),
     _smooth("Cos", np.cos, litert=builtin("COS")),
     _smooth("Tan", np.tan, litert=litert.tan),
-    _smooth("Erf", _erf, _lower_erf, litert=litert.erf),
+    _smooth("Erf", _erf, barracuda=barracuda.ERF, litert=litert.erf),
     _smooth("Sigmoid", _sigmoid, activation="sigmoid", finite="always", tfjs_fuses=True, litert=builtin("LOGISTIC")),
     _smooth("Tanh", np.tanh, activation="tanh", finite="always", litert=builtin("TANH")),
     _clamp(
@@ -291,6 +274,7 @@ UNARY = (
         "Softplus",
         lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x))),
         activation="softplus",
+        barracuda=barracuda.SOFTPLUS,
         litert=litert.softplus,
     ),
     _unary(
@@ -299,6 +283,7 @@ UNARY = (
         "Softsign",
         tfjs=_tfjs_softsign,
         activation="softsign",
+        barracuda=barracuda.SOFTSIGN,
         litert=litert.softsign,
     ),
     OpDef(
@@ -347,9 +332,25 @@ BINARY = (
     _binary(
         "Add", np.add, "Add", spellings=("AddV2",), operand="summand", finite="as its operands", litert=builtin("ADD")
     ),
-    _binary("Sub", np.subtract, "Sub", operand="subtrahend", finite="as its operands", litert=builtin("SUB")),
+    _binary(
+        "Sub",
+        np.subtract,
+        "Sub",
+        barracuda=barracuda.SUB,
+        operand="subtrahend",
+        finite="as its operands",
+        litert=builtin("SUB"),
+    ),
     _binary("Mul", np.multiply, "Mul", operand="factor", finite="as its operands", litert=builtin("MUL")),
-    _binary("RealDiv", _real_div, "Div", spellings=("Div",), operand="divisor", litert=builtin("DIV")),
+    _binary(
+        "RealDiv",
+        _real_div,
+        "Div",
+        barracuda=barracuda.DIV,
+        spellings=("Div",),
+        operand="divisor",
+        litert=builtin("DIV"),
+    ),
     _binary("FloorDiv", _floor_div, _lower_floor_div, litert=litert.floor_div),
     _binary("FloorMod", np.mod, _lower_floor_mod, litert=builtin("FLOOR_MOD")),
     _binary(

@@ -168,7 +168,7 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     value = builder.value(node.inputs[data_at])
     if len(sizes) == 1:
         return (value,)
-    if builder.splits:
+    if builder.reads("Split"):
         lengths = builder.const(np.array(sizes, np.int64), "sizes")
         return builder.emit_several("Split", [value, lengths], len(sizes), axis=axis)
     bounds = [0, *itertools.accumulate(int(s) for s in sizes)]

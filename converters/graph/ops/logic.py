@@ -63,7 +63,7 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
         condition = unsqueezed(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
     choices = [builder.type_of(r) for r in node.inputs[1:]]
     infinite = any(k.constant is not None and not np.isfinite(k.constant).all() for k in choices)
-    if builder.chooses or infinite or choices[0].dtype != FLOAT32:
+    if builder.reads("Where") or infinite or choices[0].dtype != FLOAT32:
         return builder.emit("Where", [condition, a, b])
     holds = builder.emit("Cast", [condition], to=FLOAT32)
     negative = builder.emit("Mul", [holds, builder.const(np.array(-1, np.float32), "minus")])
