@@ -27,8 +27,25 @@ IMPORTERS: Mapping[str, str] = {
     "Inference Engine 2.2.2": "release 23",
     "Inference Engine 2.4.0": "release 23",
 }
-_NAMES = tuple(IMPORTERS)
-_BARRACUDA, _FIRST, _LATER = _NAMES[:5], _NAMES[:1], _NAMES[1:5]
+
+
+def span(since: str | None = None, until: str | None = None) -> tuple[str, ...]:
+    """Return the importers from one to another, both included; None: from the oldest, up to the newest there will be."""
+    names = tuple(IMPORTERS)
+    return names[names.index(since) if since else 0 : names.index(until) + 1 if until else None]
+
+
+_NAMES = span()
+_FIRST = span(until="Barracuda 1.1.2")
+_BARRACUDA = span(until="Barracuda 3.0.0")
+_LATER = span("Barracuda 1.4.0", "Barracuda 3.0.0")
+_BEFORE_2_3 = span(until="Barracuda 2.0.0")
+_1_4_TO_2_0 = span("Barracuda 1.4.0", "Barracuda 2.0.0")
+_1_4_TO_2_3 = span("Barracuda 1.4.0", "Barracuda 2.3.1")
+_FROM_2_3 = span("Barracuda 2.3.1", "Barracuda 3.0.0")
+_SENTIS = span("Sentis 2.1.3")
+_BEFORE_2_4 = span(until="Inference Engine 2.2.2")
+_FROM_2_4 = span("Inference Engine 2.4.0")
 
 
 class Reading(StrEnum):
@@ -313,7 +330,7 @@ def _slopes(c: Construct) -> bool:
 
 def _rules() -> Iterator[Rule]:
     wrong, refused, fails = Reading.WRONG, Reading.REFUSED, Reading.FAILS
-    old = _NAMES[1:4]  # Barracuda 1.4.0 to 2.3.1
+    old = _1_4_TO_2_3
     sums = ("ReduceSum", "ReduceMean")
     reductions = (*sums, "ReduceMax", "ReduceMin", "ReduceProd")
     yield Rule(
@@ -332,31 +349,31 @@ def _rules() -> Iterator[Rule]:
     yield Rule(tuple(never.split()), refused, _BARRACUDA, "Barracuda has no such operator", "Einsum_01")
     since_14 = "Split ArgMax ArgMin Where LessOrEqual Tile Shape ConstantOfShape Sign Softplus"
     yield Rule(tuple(since_14.split()), refused, _FIRST, "Barracuda has it from 1.4 on", "ArgMax_01")
-    yield Rule(("Erf", "HardSigmoid", "ScatterND"), refused, _NAMES[:3], "Barracuda has it from 2.3.1 on", "Erf_01")
-    yield Rule(("GRU",), refused, _NAMES[5:], "Sentis has no such operator", "GRU_01")
-    yield Rule(("If", "Loop", "Scan"), Reading.LOST, _NAMES[5:], "Sentis leaves it out", "If_01")
+    yield Rule(("Erf", "HardSigmoid", "ScatterND"), refused, _BEFORE_2_3, "Barracuda has it from 2.3.1 on", "Erf_01")
+    yield Rule(("GRU",), refused, _SENTIS, "Sentis has no such operator", "GRU_01")
+    yield Rule(("If", "Loop", "Scan"), Reading.LOST, _SENTIS, "Sentis leaves it out", "If_01")
 
     sizes = "the sizes are read from the attribute alone"
     yield Rule(("Split",), refused, _LATER, sizes, "Split_04", lambda c: c.attribute("split") is None)
     axes = "axes as an operand are read from 2.3.1 on"
-    yield Rule(("Squeeze", "Unsqueeze"), refused, _NAMES[:3], axes, "Squeeze_04", _given(1))
+    yield Rule(("Squeeze", "Unsqueeze"), refused, _BEFORE_2_3, axes, "Squeeze_04", _given(1))
     yield Rule(("Squeeze",), wrong, _LATER, "two leading axes at once, batch above 1", "LSTM_01", _dropped_batch)
     yield Rule(("Reshape",), fails, _LATER, "a computed shape, batch above 1", "Reshape_08", _computed(1))
     flat = "the elements come in another order"
     yield Rule(("Reshape", "Flatten"), wrong, _FIRST, flat, "Reshape_01", _flat_in_first)
     yield Rule(("Concat",), refused, _FIRST, "a flattened image cannot be joined", "Conv_21", _joined_after_flattening)
-    yield Rule(("Flatten",), wrong, _NAMES[1:3], f"of a convolution: {flat}", "Conv_18", _flattened_conv)
+    yield Rule(("Flatten",), wrong, _1_4_TO_2_0, f"of a convolution: {flat}", "Conv_18", _flattened_conv)
 
     yield Rule(("Gemm",), wrong, _BARRACUDA, "alpha and beta are not read", "Gemm_04", _scaled)
-    yield Rule(("Gemm",), refused, _NAMES[3:5], "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).fixed))
+    yield Rule(("Gemm",), refused, _FROM_2_3, "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).fixed))
     yield Rule(("Gemm",), fails, _BARRACUDA, "C of one element is not spread", "Gemm_07", _bias_of_one)
     yield Rule(("Gemm",), wrong, _BARRACUDA, "C of shape [1, n] is dropped", "Gemm_08", _bias_is_row)
     yield Rule(("Gemm",), wrong, _BARRACUDA, "a computed C is dropped", "Gemm_12", _computed(2))
-    yield Rule(("Gemm",), refused, _NAMES[1:3], "B is no constant", "Gemm_10", _computed(1))
+    yield Rule(("Gemm",), refused, _1_4_TO_2_0, "B is no constant", "Gemm_10", _computed(1))
     matrix = _all(_computed(1), lambda c: c.operand(1).source is not Source.COPIED)
     yield Rule(("Gemm",), refused, _FIRST, "B is no constant", "Gemm_10", matrix)
     dropped = _all(_computed(1), _given(2))
-    yield Rule(("Gemm",), wrong, _NAMES[3:5], "C is dropped where B is no constant", "Gemm_10", dropped)
+    yield Rule(("Gemm",), wrong, _FROM_2_3, "C is dropped where B is no constant", "Gemm_10", dropped)
     constant = _all(_many_dims, lambda c: c.operand(1).fixed)
     yield Rule(("MatMul",), refused, _FIRST, "of rank 3 by a constant", "MatMul_05", constant)
     computed = _all(_many_dims, lambda c: not c.operand(1).fixed)
@@ -395,7 +412,7 @@ def _rules() -> Iterator[Rule]:
     yield Rule(("Expand",), fails, _FIRST, says, "Expand_01", lambda c: c.operand(1).fixed)
     yield Rule(("Shape",), wrong, _LATER, "as an output: the batch is that of the import", "Shape_01", _seen)
     yield Rule(("TopK",), fails, _FIRST, f"{unknown} run it", "TopK_01")
-    yield Rule(("ScatterND",), wrong, _NAMES[3:5], "other values", "ScatterND_01")
+    yield Rule(("ScatterND",), wrong, _FROM_2_3, "other values", "ScatterND_01")
 
     yield Rule(("Conv",), fails, _BARRACUDA, "groups of several channels", "Conv_11", _groups)
     yield Rule(("Conv",), refused, _BARRACUDA, "computed weights", "Conv_14", _computed(1))
@@ -427,11 +444,11 @@ def _rules() -> Iterator[Rule]:
     yield Rule(four, fails, _FIRST, "a vector over the last axis of rank 3", "Add_06", _last_of_three)
     yield Rule(("Round",), wrong, _FIRST, "halves are not rounded to even", "Round_01")
     unheld = "value_float and value_floats"
-    yield Rule(("Constant",), refused, _NAMES[:7], unheld, "Constant_02", lambda c: "value" not in c.attributes)
+    yield Rule(("Constant",), refused, _BEFORE_2_4, unheld, "Constant_02", lambda c: "value" not in c.attributes)
     through = "an input that is an output"
-    yield Rule((OUTPUT,), refused, _NAMES[5:], through, "output_02", lambda c: c.operand(0).source is Source.INPUT)
+    yield Rule((OUTPUT,), refused, _SENTIS, through, "output_02", lambda c: c.operand(0).source is Source.INPUT)
     again = "an Identity of an output that a Reshape makes"
-    yield Rule((OUTPUT,), refused, _NAMES[7:], again, "beside the 352", _identity_of_reshaped)
+    yield Rule((OUTPUT,), refused, _FROM_2_4, again, "beside the 352", _identity_of_reshaped)
 
 
 RULES = tuple(_rules())
