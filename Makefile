@@ -17,7 +17,7 @@ help:
 	@echo "make check     lint, types and the tests that start no runtime: two minutes, for the daily loop"
 	@echo "make test      lint, types and all tests (installs Chromium where apt-get can, for those in a browser)"
 	@echo "make docs      the documentation as a site in build/docs"
-	@echo "make figures   docs/figures.md anew, from ../shared (minutes)"
+	@echo "make figures   docs/figures.md anew, from ../shared (minutes), and docs/consumers.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
 	@echo "make fuzz      damaged files of every kind, N=20000 of each (hours); what came of them, counted"
@@ -76,6 +76,7 @@ docs: install
 
 figures: install
 	$(BIN)/python -m tests.figures
+	$(BIN)/python -m tests.consumers
 
 pictures: install browser
 	$(BIN)/python -m tests.pictures

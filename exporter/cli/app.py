@@ -6,7 +6,18 @@ import click
 
 from exporter.cli.group import Rooms, SourceGroup, show_version
 
-_COMMANDS = ("compare", "completion", "demo", "export", "inspect", "runtimes", "serve", "snippets", "verify")
+_COMMANDS = (
+    "compare",
+    "completion",
+    "consumers",
+    "demo",
+    "export",
+    "inspect",
+    "runtimes",
+    "serve",
+    "snippets",
+    "verify",
+)
 
 
 @click.group(

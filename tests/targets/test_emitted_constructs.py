@@ -13,7 +13,8 @@ import onnx
 import pytest
 
 from converters.consumers.unity.constructs import Model, constructs
-from converters.consumers.unity.readings import IMPORTERS, MEASURED, Reading, misreadings
+from converters.consumers.unity.importers import IMPORTERS
+from converters.consumers.unity.readings import MEASURED, Reading, misreadings
 from converters.formats.format import WriteOptions
 from converters.formats.onnx.writer import write
 from converters.policy.policy import Policy

@@ -11,7 +11,9 @@ import onnx
 import pytest
 
 from converters.consumers.unity.constructs import constructs
-from converters.consumers.unity.readings import IMPORTERS, MEASURED, RULES, Reading, misreadings
+from converters.consumers.unity.exceptions import exception_of
+from converters.consumers.unity.importers import IMPORTERS
+from converters.consumers.unity.readings import MEASURED, RULES, Reading, misreadings
 
 RULES_FOLDER = Path(__file__).resolve().parents[3] / "shared" / "unity" / "onnx_rules"
 
@@ -41,7 +43,8 @@ def _rows() -> list[dict[str, Any]]:
         return []
     rows = [json.loads(line) for line in (RULES_FOLDER / "onnx_rules.jsonl").read_text().splitlines()]
     later = {r["id"]: r for r in map(json.loads, (RULES_FOLDER / "inference_engine.jsonl").read_text().splitlines())}
-    return [{**row, "verdict": {**row["verdict"], **later[row["id"]]["verdict"]}} for row in rows]
+    both = ("verdict", "results")
+    return [{**row, **{key: {**row[key], **later[row["id"]][key]} for key in both}} for row in rows]
 
 
 ROWS = _rows()
@@ -83,3 +86,23 @@ def test_every_rule_comes_from_a_construct_that_was_measured() -> None:
 @needs_rows
 def test_the_operators_called_measured_are_the_recorded_ones() -> None:
     assert {c.op for row in ROWS for c in constructs(onnx.load(RULES_FOLDER / row["file"]))} == MEASURED
+
+
+def _thrown(result: Mapping[str, Any]) -> str | None:
+    """What a construct threw at import or, of one row or of three, when it ran."""
+    for part in (result.get("import"), result.get("b1"), result.get("b3")):
+        for held in (part, part.get("run")) if isinstance(part, dict) else ():
+            if isinstance(held, dict) and "exception" in held:
+                return f"{held['exception']}: {held['message']}"
+    return None
+
+
+@needs_rows
+def test_the_exceptions_are_those_that_were_thrown() -> None:
+    rows = {row["id"]: row for row in ROWS}
+    for rule in RULES:
+        for importer in rule.importers if rule.evidence in rows else ():
+            said = exception_of(rule.evidence, importer) if rule.reading in (Reading.REFUSED, Reading.FAILS) else None
+            if said is not None:
+                thrown = _thrown(rows[rule.evidence]["results"][importer])
+                assert thrown is not None and thrown.split("\n\nJson:")[0].strip() == said, (rule.evidence, importer)

@@ -8,44 +8,26 @@ forms of later ones too, and some of them wrongly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 
 import numpy as np
 
 from converters.consumers.unity.constructs import INPUT, OUTPUT, Construct, Model, Operand, Source
+from converters.consumers.unity.importers import (
+    BARRACUDA,
+    BEFORE_2_3,
+    BEFORE_2_4,
+    EVERY,
+    FIRST,
+    FROM_1_4_TO_2_0,
+    FROM_1_4_TO_2_3,
+    FROM_2_3,
+    FROM_2_4,
+    LATER,
+    SENTIS,
+)
 from signatures.records import dataclass
-
-#: The importers that were measured, the oldest first, and what of ML-Agents uses them.
-IMPORTERS: Mapping[str, str] = {
-    "Barracuda 1.1.2": "release 10",
-    "Barracuda 1.4.0": "release 17",
-    "Barracuda 2.0.0": "release 18",
-    "Barracuda 2.3.1": "release 19",
-    "Barracuda 3.0.0": "release 20",
-    "Sentis 2.1.3": "release 22",
-    "Inference Engine 2.2.2": "release 23",
-    "Inference Engine 2.4.0": "release 23",
-}
-
-
-def span(since: str | None = None, until: str | None = None) -> tuple[str, ...]:
-    """Return the importers from one to another, both included; None: from the oldest, up to the newest there will be."""
-    names = tuple(IMPORTERS)
-    return names[names.index(since) if since else 0 : names.index(until) + 1 if until else None]
-
-
-_NAMES = span()
-_FIRST = span(until="Barracuda 1.1.2")
-_BARRACUDA = span(until="Barracuda 3.0.0")
-_LATER = span("Barracuda 1.4.0", "Barracuda 3.0.0")
-_BEFORE_2_3 = span(until="Barracuda 2.0.0")
-_1_4_TO_2_0 = span("Barracuda 1.4.0", "Barracuda 2.0.0")
-_1_4_TO_2_3 = span("Barracuda 1.4.0", "Barracuda 2.3.1")
-_FROM_2_3 = span("Barracuda 2.3.1", "Barracuda 3.0.0")
-_SENTIS = span("Sentis 2.1.3")
-_BEFORE_2_4 = span(until="Inference Engine 2.2.2")
-_FROM_2_4 = span("Inference Engine 2.4.0")
 
 
 class Reading(StrEnum):
@@ -78,7 +60,7 @@ class Misreading:
     rule: Rule
 
 
-def misreadings(model: Model, importers: Sequence[str] = _NAMES) -> Iterator[Misreading]:
+def misreadings(model: Model, importers: Sequence[str] = EVERY) -> Iterator[Misreading]:
     """All that ``importers`` do not read rightly, in the order of the model's nodes."""
     for construct in model:
         for rule in _BY_OP.get(construct.op, ()):
@@ -330,125 +312,125 @@ def _slopes(c: Construct) -> bool:
 
 def _rules() -> Iterator[Rule]:
     wrong, refused, fails = Reading.WRONG, Reading.REFUSED, Reading.FAILS
-    old = _1_4_TO_2_3
+    old = FROM_1_4_TO_2_3
     sums = ("ReduceSum", "ReduceMean")
     reductions = (*sums, "ReduceMax", "ReduceMin", "ReduceProd")
     yield Rule(
         reductions, wrong, old, "axes as an operand are not read: it reduces the batch", "ReduceSum_10", _given(1)
     )
-    yield Rule(reductions, refused, _FIRST, "axes as an operand are not read", "ReduceSum_10", _given(1))
-    yield Rule(reductions, wrong, _LATER, "without axes it reduces the batch alone", "ReduceSum_05", _without_axes)
-    yield Rule(reductions, refused, _FIRST, "without axes", "ReduceSum_05", _without_axes)
-    yield Rule(reductions, fails, _FIRST, "over the last axis of rank 3 or 4", "ReduceSum_06", _deep_last_axis)
-    yield Rule(reductions, refused, _FIRST, "over height and width of an NHWC input", "input_12", _over_image)
+    yield Rule(reductions, refused, FIRST, "axes as an operand are not read", "ReduceSum_10", _given(1))
+    yield Rule(reductions, wrong, LATER, "without axes it reduces the batch alone", "ReduceSum_05", _without_axes)
+    yield Rule(reductions, refused, FIRST, "without axes", "ReduceSum_05", _without_axes)
+    yield Rule(reductions, fails, FIRST, "over the last axis of rank 3 or 4", "ReduceSum_06", _deep_last_axis)
+    yield Rule(reductions, refused, FIRST, "over height and width of an NHWC input", "input_12", _over_image)
 
     never = (
         "ReduceL2 ReduceSumSquare ReduceLogSumExp GreaterOrEqual GatherElements LayerNormalization GRU Range Softsign "
         "ThresholdedRelu Mod HardSwish Gelu Einsum CumSum If Loop Scan"
     )
-    yield Rule(tuple(never.split()), refused, _BARRACUDA, "Barracuda has no such operator", "Einsum_01")
+    yield Rule(tuple(never.split()), refused, BARRACUDA, "Barracuda has no such operator", "Einsum_01")
     since_14 = "Split ArgMax ArgMin Where LessOrEqual Tile Shape ConstantOfShape Sign Softplus"
-    yield Rule(tuple(since_14.split()), refused, _FIRST, "Barracuda has it from 1.4 on", "ArgMax_01")
-    yield Rule(("Erf", "HardSigmoid", "ScatterND"), refused, _BEFORE_2_3, "Barracuda has it from 2.3.1 on", "Erf_01")
-    yield Rule(("GRU",), refused, _SENTIS, "Sentis has no such operator", "GRU_01")
-    yield Rule(("If", "Loop", "Scan"), Reading.LOST, _SENTIS, "Sentis leaves it out", "If_01")
+    yield Rule(tuple(since_14.split()), refused, FIRST, "Barracuda has it from 1.4 on", "ArgMax_01")
+    yield Rule(("Erf", "HardSigmoid", "ScatterND"), refused, BEFORE_2_3, "Barracuda has it from 2.3.1 on", "Erf_01")
+    yield Rule(("GRU",), refused, SENTIS, "Sentis has no such operator", "GRU_01")
+    yield Rule(("If", "Loop", "Scan"), Reading.LOST, SENTIS, "Sentis leaves it out", "If_01")
 
     sizes = "the sizes are read from the attribute alone"
-    yield Rule(("Split",), refused, _LATER, sizes, "Split_04", lambda c: c.attribute("split") is None)
+    yield Rule(("Split",), refused, LATER, sizes, "Split_04", lambda c: c.attribute("split") is None)
     axes = "axes as an operand are read from 2.3.1 on"
-    yield Rule(("Squeeze", "Unsqueeze"), refused, _BEFORE_2_3, axes, "Squeeze_04", _given(1))
-    yield Rule(("Squeeze",), wrong, _LATER, "two leading axes at once, batch above 1", "LSTM_01", _dropped_batch)
-    yield Rule(("Reshape",), fails, _LATER, "a computed shape, batch above 1", "Reshape_08", _computed(1))
+    yield Rule(("Squeeze", "Unsqueeze"), refused, BEFORE_2_3, axes, "Squeeze_04", _given(1))
+    yield Rule(("Squeeze",), wrong, LATER, "two leading axes at once, batch above 1", "LSTM_01", _dropped_batch)
+    yield Rule(("Reshape",), fails, LATER, "a computed shape, batch above 1", "Reshape_08", _computed(1))
     flat = "the elements come in another order"
-    yield Rule(("Reshape", "Flatten"), wrong, _FIRST, flat, "Reshape_01", _flat_in_first)
-    yield Rule(("Concat",), refused, _FIRST, "a flattened image cannot be joined", "Conv_21", _joined_after_flattening)
-    yield Rule(("Flatten",), wrong, _1_4_TO_2_0, f"of a convolution: {flat}", "Conv_18", _flattened_conv)
+    yield Rule(("Reshape", "Flatten"), wrong, FIRST, flat, "Reshape_01", _flat_in_first)
+    yield Rule(("Concat",), refused, FIRST, "a flattened image cannot be joined", "Conv_21", _joined_after_flattening)
+    yield Rule(("Flatten",), wrong, FROM_1_4_TO_2_0, f"of a convolution: {flat}", "Conv_18", _flattened_conv)
 
-    yield Rule(("Gemm",), wrong, _BARRACUDA, "alpha and beta are not read", "Gemm_04", _scaled)
-    yield Rule(("Gemm",), refused, _FROM_2_3, "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).fixed))
-    yield Rule(("Gemm",), fails, _BARRACUDA, "C of one element is not spread", "Gemm_07", _bias_of_one)
-    yield Rule(("Gemm",), wrong, _BARRACUDA, "C of shape [1, n] is dropped", "Gemm_08", _bias_is_row)
-    yield Rule(("Gemm",), wrong, _BARRACUDA, "a computed C is dropped", "Gemm_12", _computed(2))
-    yield Rule(("Gemm",), refused, _1_4_TO_2_0, "B is no constant", "Gemm_10", _computed(1))
+    yield Rule(("Gemm",), wrong, BARRACUDA, "alpha and beta are not read", "Gemm_04", _scaled)
+    yield Rule(("Gemm",), refused, FROM_2_3, "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).fixed))
+    yield Rule(("Gemm",), fails, BARRACUDA, "C of one element is not spread", "Gemm_07", _bias_of_one)
+    yield Rule(("Gemm",), wrong, BARRACUDA, "C of shape [1, n] is dropped", "Gemm_08", _bias_is_row)
+    yield Rule(("Gemm",), wrong, BARRACUDA, "a computed C is dropped", "Gemm_12", _computed(2))
+    yield Rule(("Gemm",), refused, FROM_1_4_TO_2_0, "B is no constant", "Gemm_10", _computed(1))
     matrix = _all(_computed(1), lambda c: c.operand(1).source is not Source.COPIED)
-    yield Rule(("Gemm",), refused, _FIRST, "B is no constant", "Gemm_10", matrix)
+    yield Rule(("Gemm",), refused, FIRST, "B is no constant", "Gemm_10", matrix)
     dropped = _all(_computed(1), _given(2))
-    yield Rule(("Gemm",), wrong, _FROM_2_3, "C is dropped where B is no constant", "Gemm_10", dropped)
+    yield Rule(("Gemm",), wrong, FROM_2_3, "C is dropped where B is no constant", "Gemm_10", dropped)
     constant = _all(_many_dims, lambda c: c.operand(1).fixed)
-    yield Rule(("MatMul",), refused, _FIRST, "of rank 3 by a constant", "MatMul_05", constant)
+    yield Rule(("MatMul",), refused, FIRST, "of rank 3 by a constant", "MatMul_05", constant)
     computed = _all(_many_dims, lambda c: not c.operand(1).fixed)
-    yield Rule(("MatMul",), fails, _FIRST, "of rank 3 and above", "MatMul_06", computed)
+    yield Rule(("MatMul",), fails, FIRST, "of rank 3 and above", "MatMul_06", computed)
 
     last = _all(lambda c: bool(c.attribute("select_last_index", 0)))
-    yield Rule(("ArgMax", "ArgMin"), wrong, _LATER, "select_last_index is not read", "ArgMax_06", last)
+    yield Rule(("ArgMax", "ArgMin"), wrong, LATER, "select_last_index is not read", "ArgMax_06", last)
     truncated = _all(_cast_to("i"), lambda c: _fraction(c.operand(0), c))
-    yield Rule(("Cast",), wrong, _BARRACUDA, "to an integer: fractions are kept", "Cast_01", truncated)
-    yield Rule(("Cast",), wrong, _NAMES, "to bool: the value is kept", "Cast_03", _not_zero_or_one)
+    yield Rule(("Cast",), wrong, BARRACUDA, "to an integer: fractions are kept", "Cast_01", truncated)
+    yield Rule(("Cast",), wrong, EVERY, "to bool: the value is kept", "Cast_03", _not_zero_or_one)
     bounds = _all(lambda c: _computed(1)(c) or _computed(2)(c))
-    yield Rule(("Clip",), wrong, _LATER, "a computed bound is not read", "Clip_07", bounds)
-    yield Rule(("Clip",), refused, _FIRST, "a computed bound is not read", "Clip_07", bounds)
+    yield Rule(("Clip",), wrong, LATER, "a computed bound is not read", "Clip_07", bounds)
+    yield Rule(("Clip",), refused, FIRST, "a computed bound is not read", "Clip_07", bounds)
 
-    yield Rule(("Slice",), wrong, _BARRACUDA, "it does not go backwards", "Slice_13", _negative(4))
-    yield Rule(("Slice",), wrong, _FIRST, "an end beyond every index is misread", "Slice_10", _endless)
+    yield Rule(("Slice",), wrong, BARRACUDA, "it does not go backwards", "Slice_13", _negative(4))
+    yield Rule(("Slice",), wrong, FIRST, "an end beyond every index is misread", "Slice_10", _endless)
     two = _all(lambda c: _rank(c.operand(0)) == 3 and len(_axes(c)) > 1)
-    yield Rule(("Slice",), wrong, _FIRST, "two axes of rank 3", "Slice_15", two)
+    yield Rule(("Slice",), wrong, FIRST, "two axes of rank 3", "Slice_15", two)
     deep = _all(_deep_last_axis, lambda c: _rank(c.operand(0)) == 3 and len(_axes(c)) == 1)
-    yield Rule(("Slice",), fails, _FIRST, "the last axis of rank 3", "Slice_16", deep)
-    yield Rule(("Gather",), fails, _BARRACUDA, "a negative index", "Gather_04", _negative(1))
+    yield Rule(("Slice",), fails, FIRST, "the last axis of rank 3", "Slice_16", deep)
+    yield Rule(("Gather",), fails, BARRACUDA, "a negative index", "Gather_04", _negative(1))
     table = _all(lambda c: c.operand(0).source is Source.CONSTANT)
-    yield Rule(("Gather",), refused, _FIRST, "rows of a constant table", "Gather_05", table)
+    yield Rule(("Gather",), refused, FIRST, "rows of a constant table", "Gather_05", table)
     unnamed = _all(
         lambda c: c.attribute("perm") is None and _rank(c.operand(0)) == 2 and not c.operand(0).value is not None
     )
-    yield Rule(("Transpose",), wrong, _LATER, "of rank 2 without perm, batch above 1", "Transpose_02", unnamed)
+    yield Rule(("Transpose",), wrong, LATER, "of rank 2 without perm, batch above 1", "Transpose_02", unnamed)
     swapped = _all(lambda c: c.attribute("perm") == [1, 0, 2])
-    yield Rule(("Transpose",), wrong, _FIRST, "of rank 3, batch above 1", "Transpose_04", swapped)
+    yield Rule(("Transpose",), wrong, FIRST, "of rank 3, batch above 1", "Transpose_04", swapped)
     shown = _all(_of_image_input, lambda c: c.given_out)
-    yield Rule(("Transpose",), wrong, _FIRST, "of an NHWC input", "Transpose_06", shown)
+    yield Rule(("Transpose",), wrong, FIRST, "of an NHWC input", "Transpose_06", shown)
     hidden = _all(_of_image_input, lambda c: not c.given_out)
-    yield Rule(("Transpose",), fails, _FIRST, "of an NHWC input", "Conv_15", hidden)
+    yield Rule(("Transpose",), fails, FIRST, "of an NHWC input", "Conv_15", hidden)
     unknown = "Barracuda 1.4 and later"
     says = f"to a constant shape, batch above 1; {unknown} do"
-    yield Rule(("Expand",), fails, _FIRST, says, "Expand_01", lambda c: c.operand(1).fixed)
-    yield Rule(("Shape",), wrong, _LATER, "as an output: the batch is that of the import", "Shape_01", _seen)
-    yield Rule(("TopK",), fails, _FIRST, f"{unknown} run it", "TopK_01")
-    yield Rule(("ScatterND",), wrong, _FROM_2_3, "other values", "ScatterND_01")
+    yield Rule(("Expand",), fails, FIRST, says, "Expand_01", lambda c: c.operand(1).fixed)
+    yield Rule(("Shape",), wrong, LATER, "as an output: the batch is that of the import", "Shape_01", _seen)
+    yield Rule(("TopK",), fails, FIRST, f"{unknown} run it", "TopK_01")
+    yield Rule(("ScatterND",), wrong, FROM_2_3, "other values", "ScatterND_01")
 
-    yield Rule(("Conv",), fails, _BARRACUDA, "groups of several channels", "Conv_11", _groups)
-    yield Rule(("Conv",), refused, _BARRACUDA, "computed weights", "Conv_14", _computed(1))
+    yield Rule(("Conv",), fails, BARRACUDA, "groups of several channels", "Conv_11", _groups)
+    yield Rule(("Conv",), refused, BARRACUDA, "computed weights", "Conv_14", _computed(1))
     uneven_by = "lengths that differ by axis: heights are taken for widths"
     played = "cases/rank2_barracuda-3"
-    yield Rule(("Conv",), fails, _BARRACUDA, f"strides of {uneven_by}", played, _uneven("strides"))
+    yield Rule(("Conv",), fails, BARRACUDA, f"strides of {uneven_by}", played, _uneven("strides"))
     uneven = _uneven("strides", "kernel_shape")
-    yield Rule(("MaxPool", "AveragePool"), fails, _BARRACUDA, f"{uneven_by} (read, a Conv was run)", played, uneven)
+    yield Rule(("MaxPool", "AveragePool"), fails, BARRACUDA, f"{uneven_by} (read, a Conv was run)", played, uneven)
     ceiling = _all(lambda c: bool(c.attribute("ceil_mode", 0)))
-    yield Rule(("MaxPool", "AveragePool"), wrong, _NAMES, "ceil_mode is not read", "MaxPool_04", ceiling)
+    yield Rule(("MaxPool", "AveragePool"), wrong, EVERY, "ceil_mode is not read", "MaxPool_04", ceiling)
     padded = _all(lambda c: bool(c.attribute("count_include_pad", 0)))
-    yield Rule(("AveragePool",), wrong, _NAMES, "count_include_pad is not read", "AveragePool_03", padded)
-    yield Rule(("Pad",), wrong, _FIRST, "pads as an operand are not read", "Pad_02", _given(1))
-    yield Rule(("Softmax", "LogSoftmax"), wrong, _NAMES, "read as of opset 13", "Softmax_08", _old_softmax)
+    yield Rule(("AveragePool",), wrong, EVERY, "count_include_pad is not read", "AveragePool_03", padded)
+    yield Rule(("Pad",), wrong, FIRST, "pads as an operand are not read", "Pad_02", _given(1))
+    yield Rule(("Softmax", "LogSoftmax"), wrong, EVERY, "read as of opset 13", "Softmax_08", _old_softmax)
     soft = _all(lambda c: _rank(c.operand(0)) > 2, lambda c: not _old_softmax(c))
-    yield Rule(("Softmax", "LogSoftmax"), wrong, _FIRST, "of rank 3", "Softmax_06", soft)
-    yield Rule(("PRelu",), wrong, _LATER, "a slope for each channel of rank 4", "PRelu_02", _slopes)
-    yield Rule(("PRelu",), fails, _FIRST, "a slope for each channel of rank 4", "PRelu_02", _slopes)
-    yield Rule(("LSTM",), refused, _BARRACUDA, "without B", "LSTM_03", _missing(3))
+    yield Rule(("Softmax", "LogSoftmax"), wrong, FIRST, "of rank 3", "Softmax_06", soft)
+    yield Rule(("PRelu",), wrong, LATER, "a slope for each channel of rank 4", "PRelu_02", _slopes)
+    yield Rule(("PRelu",), fails, FIRST, "a slope for each channel of rank 4", "PRelu_02", _slopes)
+    yield Rule(("LSTM",), refused, BARRACUDA, "without B", "LSTM_03", _missing(3))
     both = _all(lambda c: c.attribute("direction", b"forward") != b"forward")
-    yield Rule(("LSTM",), refused, _BARRACUDA, "only forward", "LSTM_06", both)
-    yield Rule(("LSTM",), fails, _FIRST, "its memory is not found", "LSTM_01", _all(_given(3), _given(5)))
-    yield Rule(("LSTM",), refused, _FIRST, "without a first state", "LSTM_02", _missing(5))
+    yield Rule(("LSTM",), refused, BARRACUDA, "only forward", "LSTM_06", both)
+    yield Rule(("LSTM",), fails, FIRST, "its memory is not found", "LSTM_01", _all(_given(3), _given(5)))
+    yield Rule(("LSTM",), refused, FIRST, "without a first state", "LSTM_02", _missing(5))
 
-    yield Rule(("Sub", "Div"), wrong, _FIRST, "a constant first operand: they are swapped", "Sub_01", _constant_first)
+    yield Rule(("Sub", "Div"), wrong, FIRST, "a constant first operand: they are swapped", "Sub_01", _constant_first)
     four = ("Add", "Sub", "Mul", "Div")
-    yield Rule(four, wrong, _FIRST, "a constant of shape [1, n]: another shape", "Add_02", _row_first)
-    yield Rule(four, wrong, _FIRST, "operands of different rank: another shape", "Add_10", _grows)
-    yield Rule(four, fails, _FIRST, "a vector over the last axis of rank 3", "Add_06", _last_of_three)
-    yield Rule(("Round",), wrong, _FIRST, "halves are not rounded to even", "Round_01")
+    yield Rule(four, wrong, FIRST, "a constant of shape [1, n]: another shape", "Add_02", _row_first)
+    yield Rule(four, wrong, FIRST, "operands of different rank: another shape", "Add_10", _grows)
+    yield Rule(four, fails, FIRST, "a vector over the last axis of rank 3", "Add_06", _last_of_three)
+    yield Rule(("Round",), wrong, FIRST, "halves are not rounded to even", "Round_01")
     unheld = "value_float and value_floats"
-    yield Rule(("Constant",), refused, _BEFORE_2_4, unheld, "Constant_02", lambda c: "value" not in c.attributes)
+    yield Rule(("Constant",), refused, BEFORE_2_4, unheld, "Constant_02", lambda c: "value" not in c.attributes)
     through = "an input that is an output"
-    yield Rule((OUTPUT,), refused, _SENTIS, through, "output_02", lambda c: c.operand(0).source is Source.INPUT)
+    yield Rule((OUTPUT,), refused, SENTIS, through, "output_02", lambda c: c.operand(0).source is Source.INPUT)
     again = "an Identity of an output that a Reshape makes"
-    yield Rule((OUTPUT,), refused, _FROM_2_4, again, "beside the 352", _identity_of_reshaped)
+    yield Rule((OUTPUT,), refused, FROM_2_4, again, "beside the 352", _identity_of_reshaped)
 
 
 RULES = tuple(_rules())
