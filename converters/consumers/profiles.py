@@ -7,6 +7,7 @@ from functools import partial
 from converters.consumers.mlagents import version2, version3
 from converters.consumers.mlagents.tensorflowsharp import Generation, dress
 from converters.consumers.profile import Profile
+from converters.consumers.unity.consumers import releases_for
 from signatures.errors import UsageError, meant
 
 #: What CoreBrainInternal.cs gave as pictures until 0.4.0b.
@@ -27,6 +28,7 @@ TFSHARP = tuple(
     Profile(name=g.name, purpose=purpose, formats=("bytes",), dress=partial(dress, generation=g))
     for g, purpose in _GENERATIONS
 )
+_UNITY6 = releases_for("unity6")
 #: The newest first; ``--for help`` shows them in this order.
 PROFILES: tuple[Profile, ...] = (
     Profile(
@@ -36,9 +38,9 @@ PROFILES: tuple[Profile, ...] = (
         formats=("onnx",),
         # PreviousActionInputGenerator of 3.0.0 throws at the first decision (../shared/unity/r3/player.json)
         dress=partial(version3.dress, profile="unity6", feeds_previous=False),
-        importers=("Sentis 2.1.3", "Inference Engine 2.2.2", "Inference Engine 2.4.0"),
-        checkers=("R22", "R23", "R23-2.4"),
-        players=("R22", "R23", "R23-2.4"),
+        importers=tuple(c.runtime for c in _UNITY6),
+        checkers=tuple(c.name for c in _UNITY6),
+        players=tuple(c.name for c in _UNITY6),
     ),
     Profile(
         name="barracuda-3",

@@ -60,6 +60,10 @@ class Consumer:
     fetches_action_alone: bool = False
     refusals: bool = True
     formats: tuple[str, ...] = ("onnx", "nn")
+    #: ML-Agents' release by number, where the runtime's importer was measured; empty: it was not.
+    importer: str = ""
+    #: Whether its player was run, or its code read, or that of another release run in its place.
+    played: str = "run"
 
     @property
     def title(self) -> str:
@@ -70,9 +74,33 @@ class Consumer:
 CONSUMERS = {
     consumer.name: consumer
     for consumer in (
-        Consumer("R20", "ML-Agents 2.3.0-exp.3", "Barracuda 3.0.0", Engine.BARRACUDA, "barracuda-3"),
-        Consumer("R22", "ML-Agents 3.0.0", "Sentis 2.1.3", Engine.SENTIS, "unity6", "Unity.Sentis"),
-        Consumer("R23", "ML-Agents 4.0.0", "Inference Engine 2.2.2", Engine.SENTIS, "unity6", "Unity.InferenceEngine"),
+        Consumer(
+            "R20",
+            "ML-Agents 2.3.0-exp.3",
+            "Barracuda 3.0.0",
+            Engine.BARRACUDA,
+            "barracuda-3",
+            importer="release 20",
+        ),
+        Consumer(
+            "R22",
+            "ML-Agents 3.0.0",
+            "Sentis 2.1.3",
+            Engine.SENTIS,
+            "unity6",
+            "Unity.Sentis",
+            importer="release 22",
+        ),
+        Consumer(
+            "R23",
+            "ML-Agents 4.0.0",
+            "Inference Engine 2.2.2",
+            Engine.SENTIS,
+            "unity6",
+            "Unity.InferenceEngine",
+            importer="release 23",
+            played="the code of ML-Agents 3.0.0 run in its place",
+        ),
         Consumer(
             "R23-2.4",
             "ML-Agents 4.0.0",
@@ -83,7 +111,10 @@ CONSUMERS = {
             strips_zero=False,
             reads_value_float=True,
             trips_on_reshape=True,
+            importer="release 23",
+            played="that of R23; Inference Engine 2.4.0 was not played",
         ),
+        # the next release comes here: importers, readings, players and profiles take it from its row
     )
 }
 #: Releases before those, whose players are known, and of whose checks less.
@@ -127,6 +158,11 @@ EARLIER = {
         ),
     )
 }
+
+
+def releases_for(profile: str) -> tuple[Consumer, ...]:
+    """Return the releases whose checks are known that a profile writes for, the oldest first."""
+    return tuple(c for c in CONSUMERS.values() if c.profile == profile)
 
 
 def consumer(name: str) -> Consumer:

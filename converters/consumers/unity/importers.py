@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from converters.consumers.unity.consumers import CONSUMERS
+
 #: The importers that were measured, the oldest first, and what of ML-Agents uses them.
 IMPORTERS: Mapping[str, str] = {
     "Barracuda 1.1.2": "release 10",
     "Barracuda 1.4.0": "release 17",
     "Barracuda 2.0.0": "release 18",
     "Barracuda 2.3.1": "release 19",
-    "Barracuda 3.0.0": "release 20",
-    "Sentis 2.1.3": "release 22",
-    "Inference Engine 2.2.2": "release 23",
-    "Inference Engine 2.4.0": "release 23",
+    **{c.runtime: c.importer for c in CONSUMERS.values() if c.importer},
 }
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 
 from converters.consumers.unity import forms
+from converters.consumers.unity.consumers import CONSUMERS, Engine
 from converters.consumers.unity.model import (
     ACTION,
     CONTINUOUS,
@@ -427,17 +428,14 @@ PLAYERS: Mapping[str, Player] = {
     for player in (
         *(
             Player(
-                name,
+                release.name,
                 _SENTIS_INPUTS,
                 _SENTIS_OUTPUTS,
                 f"{_ASSERT} Cannot peek output tensor {{name}} as model does not contain an output with that name",
-                played,
+                release.played,
             )
-            for name, played in (
-                ("R22", "run"),
-                ("R23", "the code of ML-Agents 3.0.0 run in its place"),
-                ("R23-2.4", "that of R23; Inference Engine 2.4.0 was not played"),
-            )
+            for release in CONSUMERS.values()
+            if release.engine is Engine.SENTIS
         ),
         Player("R20", _BARRACUDA_INPUTS, _BARRACUDA_OUTPUTS, _ABSENT, "run"),
         Player("2.0.1", _BARRACUDA_INPUTS, _BARRACUDA_OUTPUTS, _ABSENT, "run"),
