@@ -33,6 +33,7 @@ from converters.formats.barracuda.lower_table import lower_graph
 from converters.formats.barracuda.lower_values import FREE, Axes, Dims, Piece, Value
 from converters.formats.barracuda.vocabulary import Activation, C, H, LayerType, N, W
 from converters.graph.nodes import Graph, Node, node_of
+from converters.graph.ops.table import passes_on, traits
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH, Dim
 from converters.policy.policy import Policy
@@ -307,20 +308,16 @@ class _Lowering:
         return assembled(self.b, self.inputs, self.outputs, constants, memories)
 
 
-_PASSED = ("Reshape", "Cast", "Identity", "ExpandDims", "Squeeze")
-
-
 def _scores_behind(graph: Graph, reference: str, b: NnBuilder) -> list[str]:
     """The scores that an action is the ArgMax of, branch by branch.
 
     Raises UnsupportedOpError where it is computed some other way.
     """
     node = graph.producer(reference)
-    if node.op in _PASSED:
+    if passes_on(node) or node.op == "Cast":
         return _scores_behind(graph, node.inputs[0], b)
-    if node.op in ("ConcatV2", "Pack"):
-        branches = node.inputs[:-1] if node.op == "ConcatV2" else node.inputs
-        return [scores for branch in branches for scores in _scores_behind(graph, branch, b)]
+    if traits(node).moves == "join":
+        return [scores for branch in traits(node).moved(node.inputs) for scores in _scores_behind(graph, branch, b)]
     if node.op == "ArgMax" and len(b.type_of(node.inputs[0]).shape or ()) == 2:
         return [node.inputs[0]]
     b.node = node

@@ -24,8 +24,13 @@ _STEEP = 1e30
 _LARGEST = float(np.finfo(np.float32).max)
 
 #: Those that a Barracuda of 1.0 lacks, or rounds another way.
-_YOUNG = ("Softplus", "Softsign", "Round", "Cos", "Sin", "Tan", "Erf")
-_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if op not in _YOUNG} | {"Elu": Activation.ELU}
+_YOUNG = frozenset(
+    (
+        *(Activation.SOFTPLUS, Activation.SOFTSIGN, Activation.ROUND),
+        *(Activation.COS, Activation.SIN, Activation.TAN, Activation.ERF),
+    )
+)
+_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if kind not in _YOUNG} | {"Elu": Activation.ELU}
 _TWO: Mapping[str, LayerType] = {
     "Add": LayerType.ADD,
     "BiasAdd": LayerType.ADD,

@@ -164,7 +164,9 @@ _REDUCED = {
     "All": LayerType.REDUCE_MIN,
     "Prod": LayerType.REDUCE_PROD,
 }
-REDUCTIONS = ("Sum", "Mean", *_REDUCED)
+#: Whether a sum is divided by the number of its terms.
+_DIVIDED = {"Sum": False, "Mean": True}
+REDUCTIONS = (*_DIVIDED, *_REDUCED)
 
 
 def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -189,19 +191,20 @@ def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None]
     op, width = b.node.op, h * w * c
     # All pixels of each channel: what is left of the image is one.
     pixels = C not in places and all(length == 1 or place in places for place, length in ((1, h), (2, w)))
-    if op in ("Sum", "Mean") and whole:
+    if op in _DIVIDED and whole:
         b.made_up(width)
         share = 1.0 if op == "Sum" else 1 / width
         return b.dense(name, np.full((width, 1), share), np.zeros(1))
-    if op in ("Sum", "Mean") and pixels:
+    if op in _DIVIDED and pixels:
         mean = b.layer(LayerType.GLOBAL_AVG_POOL2D, [name], (n, 1, 1, c), label="" if op == "Mean" else "mean")
         return mean if op == "Mean" else b.scaled(mean, h * w)
-    if op in ("Sum", "Mean") and places == [C]:
+    if op in _DIVIDED and places == [C]:
         kernel = np.full((1, 1, c, 1), 1.0 if op == "Sum" else 1 / c)
         data = [("kernel", kernel), ("bias", np.zeros((1, 1, 1, 1)))]
         return b.layer(LayerType.CONV2D, [name], (n, h, w, 1), stride=(1, 1), data=data)
-    if op in ("Sum", "Mean", "Max", "Any") and C not in places:
-        kind = LayerType.MAX_POOL2D if op in ("Max", "Any") else LayerType.AVG_POOL2D
+    largest = _REDUCED.get(op) is LayerType.REDUCE_MAX
+    if (op in _DIVIDED or largest) and C not in places:
+        kind = LayerType.MAX_POOL2D if largest else LayerType.AVG_POOL2D
         down, across = (h if 1 in places else 1), (w if 2 in places else 1)
         pooled = b.layer(
             kind, [name], (n, h // down, w // across, c), pool=(across, down), stride=(across, down), label="pooled"

@@ -23,8 +23,6 @@ from signatures.errors import UnsupportedOpError
 #: Takes (builder, the op's data inputs) and gives its output, or all of them.
 Lower = Callable[[NnBuilder, Sequence[Value]], "Value | tuple[Value, ...]"]
 
-#: Ops that repeat a constant as often as there are agents, a number that is only known when the graph runs.
-_REPEAT = ("Tile", "BroadcastTo")
 _FIRST = slice(0, 1)
 _ALL = slice(None)
 
@@ -152,9 +150,11 @@ def _value(b: NnBuilder, values: dict[str, Value], reference: str) -> Value:
 def _lowered(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value, ...]:
     function, data = _OPS[node.op]
     args = [_value(b, values, r) for r in node.inputs[data]]
-    if args and node.op not in _REPEAT and all(a.array is not None for a in args):
+    # An op that repeats a constant as often as there are agents gives what is only known when the graph runs.
+    entry = op_of(node)
+    if args and entry.moves != "repeat" and all(a.array is not None for a in args):
         return _computed(b, node, values)
-    flattens = node.op in ("MatMul", "_FusedMatMul")
+    flattens = entry.layer == "dense" and node.op != "BatchMatMul"
     try:
         result = function(b, [a if flattens else b.settled(a) for a in args])
     except MISFIT as error:

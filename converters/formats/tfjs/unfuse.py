@@ -16,7 +16,12 @@ _PLAIN = {
     "_FusedConv2D": "Conv2D",
     "FusedDepthwiseConv2dNative": "DepthwiseConv2dNative",
 }
-_ACTIVATIONS = frozenset(("Relu", "Relu6", "Elu", "Sigmoid", "Tanh", "LeakyRelu", "Prelu"))
+#: Activation as ``fused_ops`` names it → the op that computes it ("": a function of ``graph/nn``).
+_ACTIVATIONS = {
+    **{name: name for name in ("Relu", "Relu6", "Elu", "Sigmoid", "Tanh")},
+    "LeakyRelu": "",
+    "Prelu": "",
+}
 _OWN = frozenset(("fused_ops", "num_args", "epsilon", "leakyrelu_alpha"))
 
 
