@@ -161,6 +161,7 @@ class Format:
       source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
       ``answers`` are the outputs of a policy that an artefact answers (None: all). ``narrow``: it can hold weights in
       float16 or int8. ``fixed``: it can be written for a fixed number of agents.
+      ``library`` is a Python package that runs such a file by itself; verification does not ask it.
     """
 
     key: str
@@ -189,6 +190,7 @@ class Format:
     answers: Callable[[PolicySignature], list[str]] | None = None
     narrow: bool = False
     fixed: bool = False
+    library: str = ""
 
     @property
     def readable(self) -> bool:

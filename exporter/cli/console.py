@@ -20,7 +20,12 @@ if TYPE_CHECKING:
     from exporter.verify.report import ParityReport
     from exporter.verify.tolerances import ToleranceRule
 
-_COLOURS = {True: "green", False: "red", None: "yellow"}
+
+def _colour(reports: Sequence[ParityReport]) -> str:
+    """Green only where every original ran and agrees."""
+    if any(r.passed is False for r in reports):
+        return "red"
+    return "green" if all(r.proven for r in reports) else "yellow"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +145,7 @@ class Console:
             say_paragraph(note, "  note: ", "    ")
 
     def _report(self, report: ParityReport) -> None:
-        from exporter.reports.summary import comparison_table, failure_lines, not_run_line, parity_table, verdict
+        from exporter.reports.summary import comparison_table, failure_lines, not_run_line, parity_table
 
         if not self.quiet and report.comparisons:
             for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
@@ -152,7 +157,7 @@ class Console:
         missing = not_run_line(report)
         if not self.quiet and report.passed is not None and missing is not None:
             say_paragraph(missing)
-        say_paragraph(verdict(report), colour=_COLOURS[report.passed])
+        say_paragraph(report.sentence, colour=_colour([report]))
 
     def whole(self, reports: Sequence[ParityReport], refused: int = 0) -> None:
         """What came of several policies, in one line; ``refused`` sources or bundles were."""
@@ -160,9 +165,7 @@ class Console:
             return
         from exporter.reports.summary import whole_summary
 
-        verdicts = {*(r.passed for r in reports), *([False] if refused else [])}
-        colour = _COLOURS[False if False in verdicts else None if None in verdicts else True]
-        say_paragraph(whole_summary(reports, refused), colour=colour)
+        say_paragraph(whole_summary(reports, refused), colour="red" if refused else _colour(reports))
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""
@@ -201,7 +204,8 @@ class Console:
             say(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
             say(f"next: {typed('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
-        if names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
+        ours = results[-1].policy.signature.family.startswith("ML-Agents")
+        if ours and names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
             say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
         say(f"next: {_next(results)}")
 

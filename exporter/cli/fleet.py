@@ -35,7 +35,9 @@ def run_fleet(
     fail_fast: bool,
     console: Console,
 ) -> None:
-    """Export what the paths stand for. Ends with status 2 where a source was refused, 1 where formats disagree."""
+    """Export what the paths stand for. Ends with status 2 where a source was refused, 1 where formats disagree,
+    3 where nothing was decided.
+    """
     if cluster is not None and jobs is not None:
         raise UsageError("--jobs and --cluster contradict each other", fix="a cluster's workers are as many as it has")
     passed_over: list[Path] = []
@@ -79,13 +81,15 @@ def run_fleet(
         sys.exit(2)
     if tally.disagree:
         sys.exit(1)
+    if tally.undecided:
+        sys.exit(3)
 
 
 class _Tally:
     def __init__(self, sources: int) -> None:
         self.sources, self.done, self.unchanged = sources, 0, 0
         self.policies, self.verified, self.disagree, self.refused = 0, 0, 0, 0
-        self.failed = 0
+        self.failed, self.undecided = 0, 0
         self._told: list[str] = []
         self._start = time.monotonic()
 
@@ -101,8 +105,9 @@ class _Tally:
         self.policies += len(outcome.policies)
         self.verified += sum(p.passed is True for p in outcome.policies)
         self.disagree += sum(p.passed is False for p in outcome.policies)
+        self.undecided += sum(bool(p.undecided) for p in outcome.policies)
         self.refused += outcome.error is not None
-        if outcome.failed:
+        if outcome.failed or any(p.undecided for p in outcome.policies):
             self.failed += 1
             if self.failed <= _MOST_SHOWN:
                 self._told.extend(_lines(outcome, failed=True))
@@ -120,6 +125,7 @@ class _Tally:
         parts = [f"{self.policies} policies exported ({self.verified} verified)"]
         parts += [f"{self.unchanged} sources unchanged"] if self.unchanged else []
         parts += [f"{self.disagree} DISAGREE"] if self.disagree else []
+        parts += [f"{self.undecided} NOT DECIDED"] if self.undecided else []
         parts += [f"{self.refused} sources REFUSED"] if self.refused else []
         parts += [f"{self.sources - self.done} sources not reached"] if self.done < self.sources else []
         return f"{self.done} of {self.sources} sources in {seconds:.1f} s ({self.rate:.1f}/s): {', '.join(parts)}"
@@ -130,9 +136,10 @@ def _lines(outcome: Outcome, *, failed: bool = False) -> list[str]:
     source = shown(outcome.path)
     lines = [f"{source}: unchanged"] if outcome.unchanged else []
     for policy in outcome.policies:
-        if failed and policy.passed is not False:
+        if failed and policy.passed is not False and not policy.undecided:
             continue
         verdict = {True: "passed", False: f"FAILED: {policy.failure}", None: "not verified"}[policy.passed]
+        verdict += f": {policy.undecided}" if policy.undecided else ""
         note = "" if policy.renamed is None else f" ({policy.renamed})"
         lines.append(f"{source}: {policy.what} -> {shown(policy.folder)}: {verdict}{note}")
     if outcome.error is not None:

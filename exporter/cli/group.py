@@ -37,6 +37,7 @@ GROUPS = {
     "What Unity would say": ("releases", "actions", "brain_parameters"),
     "How to verify": (
         *("runtimes", "allow_unverified", "samples", "seed", "steps", "atol", "rtol", "tolerances", "golden", "sizes"),
+        "required",
     ),
     "Many sources": ("jobs", "cluster", "again", "fail_fast"),
     "The server": ("host", "port", "opens", "no_open"),

@@ -69,11 +69,11 @@ def as_given(names: Container[str]) -> list[str]:
 JUDGING = frozenset(
     (
         *("mapped", "brain", "inputs", "outputs", "values", "trust_source", "source", "step"),
-        *("golden", "sizes", "tolerances", "atol", "rtol"),
+        *("golden", "sizes", "tolerances", "atol", "rtol", "required"),
     )
 )
 #: What of it a bundle is verified with that an export was judged by.
-RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol"))
+RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol", "required"))
 
 
 def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
@@ -152,6 +152,23 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     return collected
 
 
+def _required(given: str | None, *, unverified: bool) -> tuple[str, ...]:
+    """Return the formats of ``--require``. Raises UsageError."""
+    if given is None:
+        return ()
+    from converters.formats.registry import WRITTEN
+
+    wanted = tuple(dict.fromkeys(word.strip() for word in given.split(",") if word.strip()))
+    wrong = next((word for word in wanted if word != "all" and word not in WRITTEN), None)
+    if wrong is not None or not wanted:
+        raise UsageError(
+            f"--require {given}: {wrong or 'nothing'} is not a format", fix=f"all, or {', '.join(WRITTEN)}"
+        )
+    if unverified:
+        raise UsageError(f"--require {given} needs a verification", fix="leave --allow-unverified or --verify none out")
+    return wanted
+
+
 def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
     """How to compare; the command gets it as ``options``, a VerifyOptions with the rules of ``console``."""
 
@@ -166,6 +183,7 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         rtol: float,
         golden: Path | None,
         sizes: Sequence[str],
+        required: str | None,
         **rest: Any,
     ) -> Any:
         from exporter.verify.checks.size import parse_budget
@@ -173,7 +191,8 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         from exporter.verify.tolerances import Tolerance
 
         tolerance = Tolerance(atol, rtol)
-        options = VerifyOptions(seed, samples, steps, tolerance, console.rules(), golden, parse_budget(sizes))
+        require = _required(required, unverified=bool(rest.get("allow_unverified")) or rest.get("runtimes") == "none")
+        options = VerifyOptions(seed, samples, steps, tolerance, console.rules(), golden, parse_budget(sizes), require)
         return command(*args, console=console, options=options, **rest)
 
     for option in (
@@ -187,6 +206,9 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--seed", type=int, metavar="N", default=0, help="Seed of the inputs."),
         click.option("--steps", type=click.IntRange(1), metavar="N", default=4, help="Steps with the memory fed back."),
         click.option("--max-size", "sizes", multiple=True, metavar="[FORMAT=]SIZE", help="Fail above this size: 1MB."),
+        click.option(
+            "--require", "required", metavar="FORMATS", help="all, or formats that must be checked; else status 3."
+        ),
         click.option("--golden", type=FILE, metavar="FILE", help="Recorded inputs (and outputs), an .npz."),
         click.option("--atol", type=float, metavar="X", default=1e-5, help="Absolute tolerance."),
         click.option("--rtol", type=float, metavar="X", default=1e-5, help="Relative tolerance."),

@@ -50,8 +50,9 @@ def compare_rounded(
     frozen(replace(policy, graph=graph)).write(reference)
     report = run(small)
     found = decisions(tested, small, storage, runtimes, pool, options or VerifyOptions())
+    ran = tested.source.runtime if found and tested.source and tested.source.runtime in runtimes else None
     note = f"weights in {storage}: numbers were compared with the reference's weights rounded alike, decisions with it"
-    return replace(report.with_findings(found), notes=(*report.notes, note), self_consistent=False)
+    return replace(report.with_findings(found), notes=(*report.notes, note), self_consistent=False, original=ran)
 
 
 def merge_reports(reports: Iterable[ParityReport]) -> ParityReport:
@@ -70,5 +71,6 @@ def merge_reports(reports: Iterable[ParityReport]) -> ParityReport:
         passed=verdict,
         comparisons=comparisons,
         sizes={key: size for r in every for key, size in r.sizes.items()},
+        original=next((r.original for r in every if r.original), None),
         notes=tuple(dict.fromkeys(note for r in every for note in r.notes)),
     )

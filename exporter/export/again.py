@@ -19,7 +19,7 @@ from converters.formats.source import OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from exporter.export.job import Job, own_in
+from exporter.export.job import Job, own_in, runs_elsewhere
 from exporter.export.options import storage_of
 from exporter.export.pipeline import Progress, consumer, joined
 from exporter.export.sources import Source, read_source
@@ -109,7 +109,7 @@ def verify_folder(
             frozen(again.policy).write(reference)
         tested = PolicyUnderTest(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
-            made_for, artefacts, contract.tool.get("batch"),
+            made_for, artefacts, contract.tool.get("batch"), read is not None and runs_elsewhere(read),
         )  # fmt: skip
         weights = contract.tool.get("weights")
         # What was rounded is held against itself; the source is asked what it decides.
@@ -118,7 +118,8 @@ def verify_folder(
         if weights and original is not None:
             kept = storage_of(weights)
             decided = decisions(tested, held, kept, used or ("numpy",), pool, options or VerifyOptions())
-            report = replace(report.with_findings(decided), self_consistent=False)
+            ran = original.runtime if decided and original.runtime in used else None
+            report = replace(report.with_findings(decided), self_consistent=False, original=ran)
         if again is not None and again.own is not None:
             under = own_in(again, formats, scratch / "own")
             report = joined(report, verify(under, used or ("numpy",), known, pool, None, progress))

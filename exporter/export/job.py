@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,7 +151,14 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
         None if job.profile is None else job.profile.name,
         paths,
         job.batch,
+        runs_elsewhere(job.source),
     )
+
+
+def runs_elsewhere(source: Source) -> bool:
+    """Return whether a library that is installed runs a source by itself, though verification does not ask it."""
+    library = source.format.library
+    return bool(library) and find_spec(library) is not None
 
 
 def own_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest:
@@ -159,7 +167,7 @@ def own_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest
     It is written in those of the formats that hold every policy; one of a consumer alone holds its names and no others.
     """
     assert job.own is not None
-    job = replace(job, policy=job.own, profile=None)
+    job = replace(job, policy=job.own, own=None, profile=None)
     contract = contract_of(job.policy, job.source, job.model, ReadOptions())
     artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats if f.default]
     for artifact in artifacts:

@@ -211,7 +211,7 @@ class Exporter:
 
                 assert pool is not None, "runtimes run in processes"
                 tested = under_test(job, stage, artifacts, folder)
-                rules = replace(options.parity, rules=(), golden=None, budget={})
+                rules = replace(options.parity, rules=(), golden=None, budget={}, require=())
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     under = own_in(job, self._formats, folder / "own")
@@ -354,4 +354,11 @@ def joined(
     note = f"{what}: {said}, against {own.reference}"
     passed = False if own.passed is False else report.passed
     comparisons, notes = (*report.comparisons, *own.failures), (*report.notes, note)
-    return replace(report, passed=passed, comparisons=comparisons, notes=notes, self_consistent=own.self_consistent)
+    return replace(
+        report,
+        passed=passed,
+        comparisons=comparisons,
+        notes=notes,
+        self_consistent=own.self_consistent,
+        original=own.original,
+    )

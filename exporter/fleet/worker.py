@@ -25,7 +25,9 @@ from signatures.records import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A policy of many, written; ``entry`` where reports were asked for, ``failure`` where formats disagree."""
+    """A policy of many, written; ``entry`` where reports were asked for, ``failure`` where formats disagree,
+    ``undecided`` why nothing was decided.
+    """
 
     name: str
     folder: Path
@@ -33,6 +35,7 @@ class Written:
     what: str
     renamed: str | None = None
     failure: str | None = None
+    undecided: str = ""
     answer: Mapping[str, Any] | None = None
     entry: Entry | None = None
 
@@ -102,6 +105,7 @@ def _written(result: ExportResult, wanted: Wanted, steps: int) -> Written:
         f"{signature.family}, {signature.action_space} actions",
         result.renamed,
         failures[0].sentence() if failures else None,
+        "" if report is None else report.undecided,
         result.to_dict() if wanted.answers else None,
         of_result(result, steps) if wanted.entries else None,
     )

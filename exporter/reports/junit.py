@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 
 from converters.formats.registry import FORMATS
 from exporter.reports.entry import Entry
-from exporter.reports.summary import verdict
 from exporter.verify.findings import Failure, Finding
 from signatures.fields import printable
 
@@ -57,7 +56,12 @@ def _suites(entry: Entry) -> Iterable[ET.Element]:
 
 def _properties(entry: Entry, kind: str) -> Iterable[tuple[str, str]]:
     report = entry.report
-    yield from (("verdict", verdict(report)), ("reference", report.reference), ("seed", str(report.seed)))
+    yield from (
+        ("verdict", report.sentence),
+        ("partial", str(report.partial).lower()),
+        ("reference", report.reference),
+        ("seed", str(report.seed)),
+    )
     if kind in report.sizes:
         yield "bytes", str(report.sizes[kind])
     for name in dict.fromkeys(c.runtime for c in report.comparisons if c.format.partition(":")[0] == kind):

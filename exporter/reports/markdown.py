@@ -6,13 +6,15 @@ import re
 from collections.abc import Iterable, Sequence
 
 from exporter.reports.entry import Entry
-from exporter.reports.summary import verdict
 from exporter.tables import sized
+from exporter.verify.report import ParityReport
 from signatures.fields import printable
 
+#: What the numbers of the table are.
+_CELLS = "Numbers are the largest difference as a share of what is allowed."
 #: Behind an @, so that no user is called by it.
 UNSEEN = "\u200b"
-_MARKS = {"passed": "✅", "self-consistent": "✅", "failed": "❌", "not verified": "⚠️"}
+_MARKS = {True: "✅", False: "❌", None: "⚠️"}
 
 
 def markdown_text(entries: Sequence[Entry]) -> str:
@@ -20,18 +22,21 @@ def markdown_text(entries: Sequence[Entry]) -> str:
     ordered = sorted(entries, key=lambda e: (e.report.passed is not False, e.report.passed is not None))
     lines = ["## export-model", ""]
     if len(entries) > 1:
-        rows = [
-            [_MARKS[e.report.verdict], code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered
-        ]
+        rows = [[_mark(e.report), code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered]
         lines += [*_table(("", "policy", "verdict", "disagreements"), rows), ""]
     for entry in ordered:
         lines += _policy(entry)
     return "\n".join(lines).rstrip() + "\n"
 
 
+def _mark(report: ParityReport) -> str:
+    """Green only where the original ran."""
+    return _MARKS[False if report.passed is False else report.proven or None]
+
+
 def _policy(entry: Entry) -> list[str]:
     report = entry.report
-    lines = [f"### {_MARKS[report.verdict]} {code(report.policy)}", "", text(verdict(report)), ""]
+    lines = [f"### {_mark(report)} {code(report.policy)}", "", text(report.sentence), ""]
     for c in report.failures:
         first, *rest = c.explanation()
         lines += [f"- ❌ {text(first)}", *(f"  - {text(line)}" for line in rest)]
@@ -43,8 +48,10 @@ def _policy(entry: Entry) -> list[str]:
         cells = [pair.worst.get(o) for o in report.outputs]
         shown = ["–" if c is None else c.short() if c.passed else f"**{c.short()}**" for c in cells]
         size = sized(pair.format, report.sizes, report.whole_sizes)
-        rows.append([code(pair.format), code(pair.runtime), size, *shown, "ok" if pair.passed else "**FAIL**"])
-    lines += [*_table(head, rows), ""]
+        rows.append(
+            [code(pair.format), code(pair.runtime), size, *shown, pair.word if pair.passed else f"**{pair.word}**"]
+        )
+    lines += [*_table(head, rows), "", _CELLS, ""]
     tolerances = [
         f"- {code(c.output)} in {code(f'{c.format}/{c.runtime}')}: atol {c.tolerance.atol:g}, "
         f"rtol {c.tolerance.rtol:g}: {text(c.tolerance.reason)}"

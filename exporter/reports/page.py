@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,23 +9,21 @@ from exporter import __version__
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.markup import Markup, el
-from exporter.reports.summary import verdict
-from exporter.verify.findings import Finding
 from exporter.verify.report import Pair
 
 _PARTS = Path(__file__).parent
 _CHIPS = {
     "passed": ("passed", "Passed"),
-    "self-consistent": ("passed", "Self-consistent"),
+    "self-consistent": ("unverified", "Self-consistent"),
     "failed": ("failed", "Failed"),
     "not verified": ("unverified", "Not verified"),
 }
-#: How much of the absolute tolerance a difference takes, as a colour of the overview.
+#: How much of what is allowed a difference takes, as a colour of the overview.
 _HEAT = {
     "equal": "equal",
     "low": "a tenth of what is allowed, or less",
     "near": "within what is allowed",
-    "rounding": "within the relative tolerance, or what rounding explains",
+    "rounding": "within what float32 rounding explains",
     "over": "disagrees",
 }
 #: In the order of the page; each gives nothing where it has nothing to say.
@@ -91,7 +88,9 @@ def _overview(entries: Sequence[Entry]) -> Markup:
     head = ("policy", "verdict", "disagreements", *(f"{kind} · {runtime}" for kind, runtime in pairs))
     return el(
         "div",
-        sections.table("Policies in this report: the worst |Δ| of each format in each runtime", head, table),
+        sections.table(
+            "Policies in this report: the largest share of the tolerance, by format and runtime", head, table
+        ),
         el("p", [el("span", words, class_=f"heat {kind}") for kind, words in _HEAT.items()], class_="legend"),
         class_="overview",
     )
@@ -103,23 +102,18 @@ def _heat(pair: Pair | None) -> Markup:
         return el("td", "–", class_="number soft")
     if not pair.passed:
         return el("td", el("span", "✗"), class_="heat over")
-    worst = max((c for c in pair.worst.values() if c.measured), key=_share, default=None)
+    measured = [c for c in pair.worst.values() if c.measured]
+    worst = max(measured, key=lambda c: c.share, default=None)
     if worst is None:
         return el("td", "✓", class_="heat equal")
-    share = _share(worst)
-    kind = "equal" if share == 0 else "low" if share <= 0.1 else "near" if share <= 1 else "rounding"
+    kind = "equal" if worst.share == 0 else "low" if worst.share <= 0.1 else "near"
+    if any(c.rounding for c in measured):
+        kind = "rounding"
     return el("td", worst.cell(), class_=f"heat {kind}")
 
 
-def _share(found: Finding) -> float:
-    """Of the absolute tolerance, how much a difference takes."""
-    if found.max_abs_diff == 0:
-        return 0.0
-    return found.max_abs_diff / found.tolerance.atol if found.tolerance.atol else math.inf
-
-
 def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
-    says = verdict(entry.report).partition(": ")[2]
+    says = entry.report.sentence.partition(": ")[2]
     return el(
         "section",
         el("div", el("h2", entry.name, id=f"title-{number}"), _chip(entry), class_="title"),
@@ -135,4 +129,7 @@ def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
 
 def _chip(entry: Entry) -> Markup:
     kind, text = _CHIPS[entry.report.verdict]
+    if kind == "passed" and not entry.report.proven:  # green only where the original ran
+        kind = "unverified"
+    text = f"{text} in part" if entry.report.partial else text
     return el("span", text, class_=f"chip {kind}")

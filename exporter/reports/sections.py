@@ -105,12 +105,12 @@ def agreement(entry: Entry) -> Markup:
     """Format × runtime × output, the worst difference of each."""
     report, rows = entry.report, []
     for pair in report.pairs:
-        verdict = el("td", "✓ ok" if pair.passed else "✗ fails", class_="ok" if pair.passed else "fail")
+        verdict = el("td", f"{'✓' if pair.passed else '✗'} {pair.word}", class_="ok" if pair.passed else "fail")
         size = el("td", sized(pair.format, report.sizes, report.whole_sizes), class_="number")
         worst = [_cell(pair.worst.get(output)) for output in report.outputs]
         rows.append([_breakable(pair.format), pair.runtime, verdict, size, *worst])
     head = ("format", "runtime", "verdict", "size", *report.outputs)
-    caption = "Worst absolute difference from the reference over all inputs, per output"
+    caption = "Largest difference from the reference over all inputs, as a share of what is allowed, per output"
     return section("Agreement", table(caption, head, rows, range(3, len(head))))
 
 
@@ -122,7 +122,8 @@ def _breakable(name: str) -> Child:
 def _cell(worst: Finding | None) -> Markup:
     if worst is None:
         return el("td", "–", class_="number soft")
-    return el("td", el("span", worst.short()), class_="number" if worst.passed else "number fail")
+    title = f"|Δ| {worst.max_abs_diff:.1e}" if worst.measured else None
+    return el("td", el("span", worst.short(), title=title), class_="number" if worst.passed else "number fail")
 
 
 def spread(entry: Entry) -> Markup | None:
@@ -263,7 +264,8 @@ def tolerances(entry: Entry) -> Markup:
     plain = list(dict.fromkeys(c.bound for c in comparisons if not c.tolerance.reason and not isinstance(c, Failure)))
     content: list[Child] = []
     if plain:
-        content.append(el("p", "|Δ| ≤ ", el("code", " or ".join(plain)), " for every element."))
+        rounding = ", or what float32 rounding was measured to explain there, where that is more"
+        content.append(el("p", "|Δ| ≤ ", el("code", " or ".join(plain)), f" for every element{rounding}."))
     special = [
         (el("code", c.output), c.where, el("code", c.bound), _wide(c.tolerance.reason))
         for c in comparisons

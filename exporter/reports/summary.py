@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+from converters.formats.registry import WRITTEN
 from exporter.tables import sized, table
-from exporter.verify.findings import Accepted, Decisions, Draws, Size
+from exporter.verify.findings import Finding, Undecided
 from exporter.verify.report import ParityReport
-
-UNVERIFIED = "NOT VERIFIED: no independent runtime ran"
+from exporter.verify.verdict import key_of, missing_runtimes
 
 
 def parity_table(report: ParityReport) -> str:
-    """Verdict, format, runtime, size, and the worst difference with its output."""
+    """Verdict, format, runtime, size, and the largest share of what is allowed with its output."""
     rows = []
     for pair in report.pairs:
         shown = sized(pair.format, report.sizes, report.whole_sizes)
-        rows.append([_word(pair.passed), pair.format, pair.runtime, shown, pair.worst_text])
-    return table(("verdict", "format", "runtime", "size", "worst |Δ|"), rows)
+        rows.append([pair.word, pair.format, pair.runtime, shown, pair.worst_text])
+    return table(("verdict", "format", "runtime", "size", "of tolerance"), rows)
 
 
 def comparison_table(report: ParityReport) -> str:
     """Every comparison on a line of its own, by format and runtime."""
-    head = ("verdict", "output", "kind", "|Δ|", "|Δ| / |b|", "allowed", "worst input")
+    head = ("verdict", "output", "kind", "of tolerance", "|Δ|", "|Δ| / |b|", "allowed", "worst input")
     parts = []
     for pair in report.pairs:
-        rows = [[_word(c.passed), c.output, c.kind, *c.columns(), c.worst_input or ""] for c in pair.findings]
+        rows = [[_word(c.passed), _output(c), c.kind, *c.columns(), c.worst_input or ""] for c in pair.findings]
         parts.append(f"{pair.format} in {pair.runtime}\n{table(head, rows)}")
     return "\n\n".join(parts)
 
@@ -35,48 +35,20 @@ def _word(passed: bool) -> str:
     return "ok" if passed else "FAIL"
 
 
+def _output(found: Finding) -> str:
+    """What a finding is of; one that is of a whole file names no output."""
+    return "" if found.output == "*" else found.output
+
+
 def failure_lines(report: ParityReport) -> list[str]:
     """What to read about every comparison that failed: where, by how much, what would pass."""
     lines = []
-    for c in report.failures:
+    told = [c for c in report.failures if not isinstance(c, Undecided)]  # the verdict says why nothing was decided
+    for c in told:
         first, *rest = c.explanation()
         lines.append(f"  {first}")
         lines += [f"    {line}" for line in rest]
     return lines
-
-
-def verdict(report: ParityReport) -> str:
-    """One line."""
-    if report.passed is None:
-        said = [c.runtime for c in report.comparisons if isinstance(c, Accepted)]
-        if said:
-            return f"ACCEPTED by the checks of {', '.join(said)}; no numbers were compared"
-        return f"NOT VERIFIED: {report.undecided}" if report.undecided else UNVERIFIED
-    pairs = {
-        (c.format, c.runtime)
-        for c in report.comparisons
-        if c.format not in ("reference", "golden") and not isinstance(c, (Decisions, Size))
-    }
-    count, seen = len(pairs), {kind.partition(":")[0] for kind, _ in pairs}
-    unseen = [kind for kind in report.sizes if kind.partition(":")[0] not in seen]
-    rest = f"; not verified: {', '.join(unseen)}" if unseen else ""
-    if report.verdict == "self-consistent":
-        rest = f"; nothing runs the source{rest}"
-        return f"SELF-CONSISTENT: {count} format/runtime pairs agree with {report.reference}{rest}"
-    if report.passed:
-        return f"PASSED: {count} format/runtime pairs agree with {report.reference}{rest}{_apart(report)}"
-    failed = f"{len(report.failures)} of {len(report.comparisons)} comparisons disagree with {report.reference}"
-    return f"FAILED: {failed}{_apart(report)}"
-
-
-def _apart(report: ParityReport) -> str:
-    """A clause on what was drawn, and what follows from it, where the source has nothing to hold it against."""
-    apart = [c for c in report.comparisons if c.against]
-    drawn = list(dict.fromkeys(c.output for c in apart if isinstance(c, Draws)))
-    if not drawn:
-        return ""
-    told = [*dict.fromkeys(c.output for c in apart if c.output not in drawn), f"the draws of {', '.join(drawn)}"]
-    return f"; compared between the formats, not with the source: {', '.join(told)}"
 
 
 def not_run_line(report: ParityReport) -> str | None:
@@ -90,14 +62,20 @@ def not_run_line(report: ParityReport) -> str | None:
 
 
 def _missing(report: ParityReport) -> dict[str, str]:
-    """Runtime that is not installed → how to install it."""
-    found = {n: e["reason"] or "" for n, e in report.runtimes.items() if e["status"] == "not run"}
+    """Runtime that is not installed and runs what was written → how to install it."""
+    kinds = [WRITTEN[key] for key in map(key_of, report.sizes) if key in WRITTEN]
+    useful = {name for kind in kinds for name in kind.runtimes}
+    states = {n: e for n, e in report.runtimes.items() if not kinds or n in useful}
+    found = {n: e["reason"] or "" for n, e in states.items() if e["status"] == "not run"}
     return {n: r.removeprefix("not installed; ") for n, r in found.items() if r.startswith("not installed; ")}
 
 
 def to_verify(report: ParityReport) -> str | None:
     """The one command that gets a runtime to compare in, the lightest there is; None where all are here."""
     missing = _missing(report)
+    install, _ = missing_runtimes(report, report.unchecked) if report.undecided else ([], [])
+    if install:
+        return missing.get(install[0])
     return missing.get("onnxruntime") or next(iter(missing.values()), None)
 
 
@@ -108,9 +86,12 @@ def whole_summary(reports: Sequence[ParityReport], refused: int = 0) -> str:
     failed = [r.policy for r in reports if r.passed is False]
     named = f" ({', '.join(failed[:5])}{', …' if len(failed) > 5 else ''})" if failed else ""
     measured = [(c, r.policy) for r in reports for c in r.comparisons if c.measured and c.passed]
-    worst = max(measured, key=lambda found: found[0].max_abs_diff, default=None)
+    worst = max(measured, key=lambda found: found[0].share, default=None)
     most = ""
     if worst is not None and not failed:
-        most = f"; worst |Δ| {worst[0].cell()}: {worst[0].output} of {worst[1]}, {worst[0].where}"
-    told = [f"{len(reports)} {'policy' if len(reports) == 1 else 'policies'}: {said}{named}{most}"] if reports else []
+        most = f"; at most {worst[0].cell()} of the tolerance: {worst[0].output} of {worst[1]}, {worst[0].where}"
+    partial = sum(r.partial for r in reports)
+    some = f"; {partial} in part: not every format was checked" if partial else ""
+    what = "policy" if len(reports) == 1 else "policies"
+    told = [f"{len(reports)} {what}: {said}{named}{some}{most}"] if reports else []
     return "; ".join([*told, *([f"{refused} REFUSED"] if refused else [])])

@@ -41,6 +41,8 @@ class Difference:
     smallest_tolerance: float | None = None
     #: Where the element is that needs it, in C order; None where there is none.
     worst: int | None = None
+    #: The largest |a − b| as a share of what was allowed there, rounding included: it passes up to 1.
+    share: float = 0.0
 
 
 def compare(
@@ -94,8 +96,16 @@ def compare(
     worst = int(needed.argmax())
     # A little more than the quotient: it was rounded, and a user who gives it must pass.
     smallest = float(needed.reshape(-1)[worst]) * (1 + 1e-12) if reference.dtype.kind == "f" else None
-    histogram = decades(difference)
-    return Difference(float(difference.max()), worst_relative, passed, "", explained, histogram, smallest, worst)
+    histogram, share = decades(difference), float(shares(difference, bound).max())
+    return Difference(float(difference.max()), worst_relative, passed, "", explained, histogram, smallest, worst, share)
+
+
+def shares(difference: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    """Return each difference as a share of its bound: 0 where there is none, infinite where none is allowed."""
+    found = np.zeros_like(difference)
+    with np.errstate(divide="ignore", over="ignore"):
+        np.divide(difference, bound, out=found, where=difference > 0)
+    return found
 
 
 def compare_all(
@@ -131,6 +141,7 @@ def compare_all(
     starts = np.concatenate(([0], np.cumsum(sizes[:-1]))).astype(int)
     passed = np.logical_and.reduceat(difference <= bound, starts)
     absolute, relative = np.maximum.reduceat(difference, starts), np.maximum.reduceat(relative, starts)
+    share = np.maximum.reduceat(shares(difference, bound), starts)
     needed = np.maximum.reduceat(difference / (1 + size), starts) * (1 + 1e-12)
     counts = decades_by_group(difference, np.repeat(np.arange(len(sizes)), sizes), len(sizes)).tolist()
     return [
@@ -140,6 +151,7 @@ def compare_all(
             True,
             histogram=tuple(counts[i]),
             smallest_tolerance=float(needed[i]) if wanted.kind == "f" else None,
+            share=float(share[i]),
         )
         if passed[i]
         else None
@@ -149,7 +161,7 @@ def compare_all(
 
 def wrong(reason: str) -> Difference:
     """One that no number tells, only ``reason``."""
-    return Difference(float("inf"), float("inf"), False, reason)
+    return Difference(float("inf"), float("inf"), False, reason, share=float("inf"))
 
 
 def row_steps(exact: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -105,6 +105,8 @@ class Finding:
     bisection: Bisection | None = None
     #: What it was held against where that is not the report's reference: the source has no odds of what is drawn.
     against: str = ""
+    #: The largest difference as a share of what was allowed there, rounding included; it passes up to 1.
+    share: float = 0.0
 
     def __repr__(self) -> str:
         return f"<{self.where}: {self.output} {self.cell()}, {'ok' if self.passed else 'FAIL'} [{self.kind}]>"
@@ -128,7 +130,7 @@ class Finding:
         """What is said of the output in a table."""
         if self.words is not None:
             return self.words[not self.passed]
-        return f"{self.max_abs_diff:.1e}" if self.max_abs_diff else "0"
+        return share_text(self.share)
 
     def short(self) -> str:
         """The same in a few characters, marked where it did not pass."""
@@ -138,9 +140,11 @@ class Finding:
             return f"✗ {self.cell()}"
         return f"✗ {self.reason.split(' instead of')[0]}" if len(self.reason) < 40 else "✗"
 
-    def columns(self) -> tuple[str, str, str]:
-        """The difference, the relative one and what is allowed, for a table; empty where there is no such number."""
-        return "", "", ""
+    def columns(self) -> tuple[str, str, str, str]:
+        """The share, the difference, the relative one and what is allowed, for a table; empty where there is no such
+        number.
+        """
+        return "", "", "", ""
 
     def sentence(self) -> str:
         """What went wrong, where this one did not pass."""
@@ -172,6 +176,7 @@ class Finding:
             "kind": self.kind,
             "max_abs_diff": _number(self.max_abs_diff),
             "max_rel_diff": _number(self.max_rel_diff),
+            **({"share": _number(self.share)} if self.measured else {}),
             "atol": self.tolerance.atol,
             "rtol": self.tolerance.rtol,
             "passed": self.passed,
@@ -196,10 +201,11 @@ class Numbers(Finding):
     kind = "numbers"
     measured = True
 
-    def columns(self) -> tuple[str, str, str]:
-        """As they are."""
+    def columns(self) -> tuple[str, str, str, str]:
+        """As they are; where rounding explains more than the tolerance, it is what is allowed."""
         bound = f"{self.tolerance.atol:g} + {self.tolerance.rtol:g}·|b|"
-        return f"{self.max_abs_diff:.2e}", f"{self.max_rel_diff:.2e}", bound
+        bound += f", rounding {self.rounding:.2g}" if self.rounding else ""
+        return share_text(self.share), f"{self.max_abs_diff:.2e}", f"{self.max_rel_diff:.2e}", bound
 
 
 class Rollout(Numbers):
@@ -223,9 +229,9 @@ class Draws(Shape):
     __slots__ = ()
     kind = "draws"
 
-    def columns(self) -> tuple[str, str, str]:
+    def columns(self) -> tuple[str, str, str, str]:
         """The p-value, and what it must reach."""
-        return "", "", f"p >= {FALSE_ALARM:g}: p = {1 - self.max_abs_diff:.2g}"
+        return "", "", "", f"p >= {FALSE_ALARM:g}: p = {1 - self.max_abs_diff:.2g}"
 
 
 class Decisions(Finding):
@@ -241,9 +247,9 @@ class Decisions(Finding):
         """The share."""
         return f"{self.max_abs_diff:.2%} off"
 
-    def columns(self) -> tuple[str, str, str]:
-        """The share, and what it may be."""
-        return f"{self.max_abs_diff:.2%}", "", f"{self.tolerance.atol:.0%}"
+    def columns(self) -> tuple[str, str, str, str]:
+        """The share of choices, and what it may be."""
+        return "", f"{self.max_abs_diff:.2%}", "", f"{self.tolerance.atol:.0%}"
 
 
 class Failure(Finding):
@@ -273,6 +279,15 @@ class Accepted(Finding):
     wrong = "{0.format} is not accepted by {0.runtime}: {0.reason}"
 
 
+class Played(Accepted):
+    """What our model of a release's player does with a file; ``runtime`` is the release."""
+
+    __slots__ = ()
+    kind = "played"
+    words = ("played", "not played")
+    wrong = "{0.format} is not played by our model of the player of {0.runtime}: {0.reason}"
+
+
 class Size(Finding):
     """The bytes of a format beside its budget; ``max_abs_diff`` is what there is too many."""
 
@@ -299,6 +314,13 @@ def undecided(kind: str, runtime: str, output: str, reason: str, where: str | No
     """What could not be compared, and why."""
     infinite = float("inf")
     return Undecided(kind, runtime, output, infinite, infinite, Tolerance(), False, where, reason)
+
+
+def share_text(share: float) -> str:
+    """Return a share of what is allowed for a table's cell: 0 where nothing differs."""
+    if not math.isfinite(share):
+        return "∞"
+    return "0" if share == 0 else "<0.01" if share < 0.01 else f"{share:.2f}" if share < 100 else f"{share:.1e}"
 
 
 def _number(value: float) -> float | str:

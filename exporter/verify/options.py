@@ -26,6 +26,8 @@ class VerifyOptions:
     golden: Path | str | None = None
     #: The most bytes of a format, or of ``total`` (``--max-size``).
     budget: Mapping[str, int] = field(default_factory=dict)
+    #: Formats that an independent runtime must have checked, or ``all`` (``--require``); else nothing is decided.
+    require: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):

@@ -57,6 +57,8 @@ class PolicyUnderTest:
     files: Mapping[str, Path] = field(default_factory=dict)
     #: for how many agents its artefacts are (None: for any number)
     batch: int | None = None
+    #: whether a library that is here runs the source by itself, though verification does not ask it
+    runs_elsewhere: bool = False
 
 
 @dataclass
@@ -99,12 +101,13 @@ def participants_of(
     reference: Reference,
     failure: Failure,
 ) -> Iterator[Participant]:
-    """The numpy reference, then every format in every runtime, loaded one at a time.
+    """The numpy kernels beside an original that ran, then every format in every runtime, loaded one at a time.
 
     What does not load goes to ``failure`` (format, runtime, error) and takes no part.
     """
     outputs = [s.name for s in tested.signature.outputs]
-    yield Participant("reference", "numpy", reference.run, reference.asked, reference.model, path=tested.reference)
+    if reference.original is not None:  # else it would be held against itself
+        yield Participant("reference", "numpy", reference.run, reference.asked, reference.model, path=tested.reference)
     pairs = [(kind, runtime) for kind in tested.artefacts for runtime in WRITTEN[kind].runtimes]
     # A .bytes in numpy is the reference; what runs nowhere else does so there.
     alone = [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]

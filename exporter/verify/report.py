@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Any
 
-from exporter.verify.findings import Failure, Finding, Shape, Undecided
+from exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
+from exporter.verify.verdict import unchecked_formats, verdict
 from signatures.records import dataclass
 
 
 def _badness(c: Finding) -> tuple[bool, bool, float]:
-    return not c.passed, c.measured, c.max_abs_diff
+    return not c.passed, c.measured, c.share if c.measured else c.max_abs_diff
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +33,31 @@ class Pair:
         """Output → the worst that was found of it; an output that has no answer is not in it."""
         worst: dict[str, Finding] = {}
         for c in self.findings:
-            if not isinstance(c, Failure | Undecided):
+            if not isinstance(c, Accepted | Failure | Undecided):
                 worst[c.output] = max(worst.get(c.output, c), c, key=_badness)
         return worst
 
     @property
+    def word(self) -> str:
+        """What became of it, in a word: a checker accepts, and does not agree."""
+        if any(c.disagrees for c in self.findings):
+            return "FAIL"
+        if not self.passed:
+            return "not run"
+        return "accepted" if all(isinstance(c, Accepted) for c in self.findings) else "ok"
+
+    @property
     def worst_text(self) -> str:
-        """The largest difference with its output, of what failed where anything did; else what there is to say."""
-        told = [c for c in self.findings if not isinstance(c, Failure | Undecided)]
+        """The largest share of what is allowed with its output, of what failed where anything did; else a word."""
+        if all(isinstance(c, Accepted) for c in self.findings):
+            checked = [c for c in self.findings if not isinstance(c, Played)]
+            played = [c for c in self.findings if isinstance(c, Played)]
+            words = [f"{'' if all(c.passed for c in checked) else 'not '}checked"] if checked else []
+            words += [f"{'' if all(c.passed for c in played) else 'not '}played by our model of it"] if played else []
+            return ", ".join(words)
+        if all(isinstance(c, Undecided) for c in self.findings):
+            return "not decided"
+        told = [c for c in self.findings if not isinstance(c, Accepted | Failure | Undecided)]
         worst = max(told, key=_badness, default=None)
         if worst is None:
             return "no answer"
@@ -64,6 +82,8 @@ class ParityReport:
     whole_sizes: Mapping[str, int] = field(default_factory=dict)
     #: No runtime reads the source by itself (a .nn): the formats were compared with this project's own reading of it.
     self_consistent: bool = False
+    #: The runtime that the original ran in; None where it did not run.
+    original: str | None = None
 
     def __repr__(self) -> str:
         return f"<ParityReport {self.policy!r} {self.verdict}: {len(self.comparisons)} comparisons{self._worst}>"
@@ -71,16 +91,16 @@ class ParityReport:
     def _repr_html_(self) -> str:
         from exporter.reports.markup import notebook
 
-        rows = [(p.format, p.runtime, "✓ ok" if p.passed else "✗ FAIL", p.worst_text) for p in self.pairs]
-        return notebook(f"{self.policy}: {self.verdict}", (("format", "runtime", "verdict", "worst |Δ|"), rows))
+        rows = [(p.format, p.runtime, f"{'✓' if p.passed else '✗'} {p.word}", p.worst_text) for p in self.pairs]
+        return notebook(f"{self.policy}: {self.sentence}", (("format", "runtime", "verdict", "of tolerance"), rows))
 
     @property
     def _worst(self) -> str:
         """The largest difference and where, or how many disagree."""
         if self.failures:
             return f", {len(self.failures)} disagree"
-        worst = max((c for c in self.comparisons if c.measured), key=lambda c: c.max_abs_diff, default=None)
-        return "" if worst is None else f", worst |Δ| {worst.cell()} ({worst.output} of {worst.where})"
+        worst = max((c for c in self.comparisons if c.measured), key=lambda c: c.share, default=None)
+        return "" if worst is None else f", at most {worst.cell()} of the tolerance ({worst.output} of {worst.where})"
 
     @property
     def pairs(self) -> tuple[Pair, ...]:
@@ -93,7 +113,8 @@ class ParityReport:
     @property
     def outputs(self) -> tuple[str, ...]:
         """The outputs that any runtime answered for."""
-        return tuple(dict.fromkeys(c.output for c in self.comparisons if not isinstance(c, Failure | Undecided)))
+        silent = Accepted | Failure | Undecided
+        return tuple(dict.fromkeys(c.output for c in self.comparisons if not isinstance(c, silent)))
 
     @property
     def verdict(self) -> str:
@@ -103,6 +124,26 @@ class ParityReport:
         if not self.passed:
             return "failed"
         return "self-consistent" if self.self_consistent else "passed"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict as every report words it."""
+        return verdict(self)
+
+    @property
+    def partial(self) -> bool:
+        """Whether it passed and some formats were not checked by an independent runtime."""
+        return self.passed is True and bool(self.unchecked)
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """The formats that no independent runtime ran."""
+        return tuple(unchecked_formats(self))
+
+    @property
+    def proven(self) -> bool:
+        """Whether what was compared agrees with the original itself, which ran: only this is shown in green."""
+        return self.passed is True and self.original is not None
 
     @property
     def undecided(self) -> str:
@@ -128,6 +169,10 @@ class ParityReport:
             "policy": self.policy,
             "passed": self.passed,
             "verdict": self.verdict,
+            "sentence": self.sentence,
+            "partial": self.partial,
+            "unchecked": list(self.unchecked),
+            "original": self.original,
             "seed": self.seed,
             "samples": self.samples,
             "reference": self.reference,

@@ -238,6 +238,7 @@ class Trial:
             None if difference.passed else difference.smallest_tolerance,
             bisection,
             "numpy" if output in self._apart and kind is not Shape else "",
+            difference.share,
         )
 
     def _judged_by(self, output: str, participant: Participant, difference: Difference) -> Tolerance:

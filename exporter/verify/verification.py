@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.runtimes.pool import INDEPENDENT, RuntimePool
@@ -14,7 +15,7 @@ from exporter.verify.checks.finite import undefined
 from exporter.verify.checks.numbers import numbers, recorded
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.checks.size import check_budget, sizes
-from exporter.verify.findings import Finding, died, failure
+from exporter.verify.findings import Finding, died, failure, undecided
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import (
     Failure,
@@ -27,6 +28,7 @@ from exporter.verify.participants import (
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
 from exporter.verify.trial import Trial
+from exporter.verify.verdict import key_of, required_reason
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.
 Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
@@ -123,7 +125,7 @@ def _report(
     findings = [*findings, *sizes(options.budget, tested.sizes)]
     open_ = any(not f.passed and not f.disagrees for f in findings)
     passed = False if any(f.disagrees for f in findings) else True if independent and not open_ else None
-    return ParityReport(
+    report = ParityReport(
         tested.name,
         passed,
         options.seed,
@@ -133,5 +135,19 @@ def _report(
         tuple(findings),
         tested.sizes,
         (*tested.signature.notes, *notes),
-        self_consistent=tested.source is None,
+        self_consistent=tested.source is None and not tested.runs_elsewhere,
+        original=reference.removeprefix("source/") if reference.startswith("source/") else None,
     )
+    return _required(report, options.require)
+
+
+def _required(report: ParityReport, wanted: Collection[str]) -> ParityReport:
+    """Return the report with a finding for each format that was required (``--require``) and that nothing checked."""
+    missing = [k for k in report.unchecked if "all" in wanted or key_of(k) in wanted]
+    missing += [k for k in wanted if k != "all" and k not in map(key_of, report.sizes)]
+    if not missing:
+        return report
+    reason = required_reason(report, missing)
+    found = tuple(undecided(kind, "none", "*", reason) for kind in missing)
+    passed = report.passed if report.passed is False else None
+    return replace(report, passed=passed, comparisons=(*report.comparisons, *found))

@@ -261,12 +261,13 @@ def test_roles_and_values_can_be_given(tmp_path: Path) -> None:
 
 
 def test_a_console_without_greek_letters_shows_the_rest(tmp_path: Path) -> None:
-    """The table's head has a Δ; a pipe on Windows is often cp1252."""
+    """The head of the long table has a Δ; a pipe on Windows is often cp1252."""
     ran = python(
-        *("-m", "exporter", BALL, "-o", tmp_path, "--verify", "numpy"), environment={"PYTHONIOENCODING": "cp1252"}
+        *("-m", "exporter", BALL, "-o", tmp_path, "--verify", "onnxruntime", "-v"),
+        environment={"PYTHONIOENCODING": "cp1252"},
     )
-    assert (ran.status, ran.err) == (0, "")
-    assert "worst |?|" in ran.out
+    assert ran.status == 0
+    assert "|?|" in ran.out
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="names are text there")

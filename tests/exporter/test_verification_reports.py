@@ -14,12 +14,12 @@ from exporter.reports.summary import (
     not_run_line,
     parity_table,
     to_verify,
-    verdict,
     whole_summary,
 )
 from exporter.verify.findings import Failure, Finding, Numbers
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
+from exporter.verify.verdict import verdict
 from tests.exporter.rehearsal import (
     Array,
     Exporting,
@@ -41,6 +41,7 @@ def comparison(kind: type[Finding] = Numbers, **fields: object) -> Finding:
         "tolerance": Tolerance(),
         "passed": False,
         "worst_input": "zeros",
+        "share": 0.5,
         **fields,
     }
     return kind(**values)  # type: ignore[arg-type]
@@ -66,7 +67,8 @@ def test_a_failure_says_by_how_much_and_what_would_be_allowed() -> None:
         "onnx in onnxruntime: action differs by 0.5 (relative 0.25), allowed 1e-05 + 1e-05·|reference| [numbers, zeros]"
     )
     assert second.strip() == "onnx in onnxruntime: died"
-    assert "5.0e-01 action" in parity_table(report)
+    assert "0.50 action" in parity_table(report)
+    assert "5.00e-01" in comparison_table(report)
 
 
 def test_a_report_without_an_independent_runtime_is_not_verified() -> None:
@@ -80,9 +82,11 @@ def test_a_report_without_an_independent_runtime_is_not_verified() -> None:
 
 
 def test_many_policies_are_one_line() -> None:
-    good = ParityReport("p", True, 0, 2, "numpy", {}, (comparison(passed=True), comparison(max_abs_diff=0.1)))
+    good = ParityReport("p", True, 0, 2, "numpy", {}, (comparison(passed=True), comparison(share=0.1)))
     bad = ParityReport("q", False, 0, 2, "numpy", {}, (comparison(),))
-    assert whole_summary([good, good]) == "2 policies: 2 passed; worst |Δ| 5.0e-01: action of p, onnx in onnxruntime"
+    assert whole_summary([good, good]) == (
+        "2 policies: 2 passed; at most 0.50 of the tolerance: action of p, onnx in onnxruntime"
+    )
     assert whole_summary([good, bad]) == "2 policies: 1 passed, 1 failed (q)"
 
 

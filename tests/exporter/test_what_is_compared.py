@@ -15,9 +15,9 @@ from converters.graph.run import run_graph
 from exporter.reports.entry import Entry
 from exporter.reports.markdown import markdown_text
 from exporter.reports.page import page
-from exporter.reports.summary import verdict
 from exporter.verify.checks.numbers import plausible
 from exporter.verify.original import Original
+from exporter.verify.verdict import verdict
 from signatures.errors import SignatureError, UnsupportedOpError
 from signatures.roles import Role
 from signatures.sampling import Case
@@ -250,7 +250,7 @@ def test_draws_of_which_the_source_has_no_odds_say_what_they_were_held_against(
     assert (result.passed, report.reference) == (True, "source/tensorflow")
     agreed, _, told = verdict(report).partition(_APART)
     assert sorted(told.split(", ")) == (apart or [""])
-    assert agreed.endswith("agree with source/tensorflow")
+    assert agreed.endswith("agree with the original in TensorFlow")
     for text in (markdown_text([Entry(report)]).replace("\\", ""), page([Entry(report)])):
         assert text.count(_APART + told) == (1 if apart else 0)
     written = (result.folder / "parity.json").read_text(encoding="utf-8")
@@ -258,8 +258,8 @@ def test_draws_of_which_the_source_has_no_odds_say_what_they_were_held_against(
     held = {c["output"] for c in json.loads(written)["comparisons"] if c.get("against") == "numpy"}
     assert held == {name.removeprefix("the draws of ") for name in apart}
     assert all(c.kind in ("draws", "numbers") for c in report.comparisons if c.against)
-    failed = replace(report, passed=False)
-    assert verdict(failed).endswith(_APART + told if apart else "with source/tensorflow")
+    failed = replace(report, passed=False, comparisons=tuple(replace(c, passed=False) for c in report.comparisons))
+    assert verdict(failed).endswith(_APART + told if apart else "with the original in TensorFlow")
 
 
 def test_without_a_source_that_runs_the_verdict_says_no_more_than_it_did(exporting: Exporting, tmp_path: Path) -> None:

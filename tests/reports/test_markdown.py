@@ -32,7 +32,10 @@ def test_a_report_that_fails_comes_first_and_says_what_fails() -> None:
 
 def test_a_report_that_passes_is_short() -> None:
     text = markdown_text([entry(PASSING)])
-    assert "PASSED: 1 format/runtime pairs agree with source/tensorflow" in text
+    assert (
+        "PASSED: onnx \\(1 of 2 formats; install tfjs-cpu to check the other\\) agrees with the original in TensorFlow"
+        in text
+    )
     assert "❌" not in text
     assert r"a reason \| with a bar" in text
     assert "not installed; export-model runtimes install tfjs" in text

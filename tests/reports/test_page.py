@@ -130,12 +130,14 @@ def test_failed_policies_come_first() -> None:
 
 
 def test_many_policies_begin_with_a_coloured_table_of_formats_and_runtimes() -> None:
-    far = tuple(replace(c, max_abs_diff=2e-5) if c.output == "value_estimate" else c for c in PASSING.comparisons)
+    far = tuple(
+        replace(c, share=0.7, rounding=1e-3) if c.output == "value_estimate" else c for c in PASSING.comparisons
+    )
     policies = [PASSING, replace(PASSING, policy="far", comparisons=far), replace(FAILING, policy="broken")]
     source = page([entry(report) for report in policies])
     colours = [a["class"] for t, a in Page(source).elements if t == "td" and "heat" in str(a.get("class"))]
-    assert set(colours) == {"heat low", "heat over"}
-    source = page([entry(PASSING), entry(replace(PASSING, comparisons=(replace(far[0], max_abs_diff=2e-5),)))])
+    assert set(colours) == {"heat low", "heat rounding", "heat over"}
+    source = page([entry(PASSING), entry(replace(PASSING, comparisons=(replace(far[0], rounding=1e-3),)))])
     assert 'class="heat rounding"' in source
     assert "reference · numpy" in Page(source).text
 

@@ -19,5 +19,6 @@ FORMATS = (
         marker="policy.pth",
         read=_source.read,
         takes=frozenset({"activation"}),
+        library="stable_baselines3",
     ),
 )

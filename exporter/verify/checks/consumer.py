@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exporter.verify.findings import Accepted, Finding
+from exporter.verify.findings import Accepted, Finding, Played
 from exporter.verify.tolerances import Tolerance
 
 if TYPE_CHECKING:
@@ -33,21 +33,34 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
     wanted = profile(name)
     for release in dict.fromkeys((*wanted.checkers, *wanted.players)):
         asked = consumer(release)
-        plays = release in wanted.players
         for key in (k for k in ("onnx", "nn") if k in files and k in asked.formats):
-            if plays or not (memory and key in wanted.own_names):
-                wrong = _wrong(check_file(files[key], asked), plays)
-                yield Accepted(
-                    key, release, "*", 0.0, 0.0, Tolerance(0.0, 0.0), not wrong, None, "; ".join(wrong)[:600]
-                )
+            checks = release in wanted.checkers and not (memory and key in wanted.own_names)
+            plays = release in wanted.players
+            if not checks and not plays:
+                continue
+            verdict = check_file(files[key], asked)
+            if checks:
+                yield _finding(Accepted, key, release, _unaccepted(verdict))
+            if plays:
+                yield _finding(Played, key, release, _unplayed(verdict) + ([] if checks else _unaccepted(verdict)))
 
 
-def _wrong(verdict: UnityVerdict, plays: bool) -> list[str]:
-    """What speaks against a file: of its import, its checks, and where a release ``plays`` it, of the player."""
+def _finding(kind: type[Accepted], key: str, release: str, wrong: list[str]) -> Finding:
+    reason = "; ".join(dict.fromkeys(wrong))[:600]
+    return kind(key, release, "*", 0.0, 0.0, Tolerance(0.0, 0.0), not wrong, None, reason)
+
+
+def _unaccepted(verdict: UnityVerdict) -> list[str]:
+    """Return what speaks against a file in its import and its checks."""
     modes = [m for mode, m in verdict.modes.items() if mode == _MODE]
     thrown = [
         t.message for t in (verdict.refused, *(t for m in modes for t in (m.load, m.check_throws))) if t is not None
     ]
     listed = [f.message for m in modes for f in m.checks]
-    played = [f"{p.outcome.value}: {p.message}" for m in modes for p in m.played if plays and p.fails]
-    return list(dict.fromkeys((*thrown, *listed, *(f.message for f in verdict.misread), *played)))
+    return [*thrown, *listed, *(f.message for f in verdict.misread)]
+
+
+def _unplayed(verdict: UnityVerdict) -> list[str]:
+    """Return what our model of the player finds wrong with a file."""
+    modes = [m for mode, m in verdict.modes.items() if mode == _MODE]
+    return [f"{p.outcome.value}: {p.message}" for m in modes for p in m.played if p.fails]

@@ -48,7 +48,9 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
     for name, (difference, case) in worst.items():
         kind = Shape if trial.drawn(name, participant) else Numbers
         needed = largest([d.smallest_tolerance for d in every[name]])
-        difference = replace(difference, smallest_tolerance=needed, histogram=added(d.histogram for d in every[name]))
+        counted = added(d.histogram for d in every[name])
+        share = max(d.share for d in every[name])
+        difference = replace(difference, smallest_tolerance=needed, histogram=counted, share=share)
         begins = trial.bisected(participant, name, difference, case.feeds)
         if difference.passed and (other := _upstream(trial, name, rounded)) is not None:
             difference = replace(difference, passed=False, reason=f"the constant {other.tensor} has another value")

@@ -35,7 +35,8 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
     for name, differences in steps.items():
         worst = max(range(len(fed)), key=lambda i: rank(differences[i]))
         least = largest([d.smallest_tolerance for d in differences])
-        difference = replace(differences[worst], smallest_tolerance=least, histogram=())
+        share = max(d.share for d in differences)
+        difference = replace(differences[worst], smallest_tolerance=least, histogram=(), share=share)
         begins = None
         if not difference.passed:
             # An output that goes wrong after the memory did goes wrong because of it.
