@@ -1,0 +1,112 @@
+"""What README and the pages say of tolerances, options and limits is what the program does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import click
+import pytest
+
+from converters.formats.registry import WRITTEN
+from exporter.cli.app import app
+from exporter.verify import rounding, statistics
+from exporter.verify.checks import decisions, draws
+from exporter.verify.difference import SHARE, SIZE
+from exporter.verify.options import VerifyOptions
+from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
+from exporter.verify.work import SECONDS
+from signatures.sampling import LARGE_BATCH, MOST_IDS
+from tests.commands import ROOT
+from tests.docs.blocks import name_of, pages
+
+#: Options of other programs that the pages show.
+FOREIGN = {
+    *(
+        "--allow-tcp",
+        "--rm",
+        "--disable-gpu",
+        "--no-sandbox",
+        "--input_format",
+        "--output_format",
+        "--user",
+        "--inputs",
+        "--outputs",
+        "--first",
+    ),
+}
+NUMBER = re.compile(r"1e-5 \+ 1e-5·\|b\|")
+
+
+def prose(page: Path) -> str:
+    return " ".join(page.read_text(encoding="utf-8").split())
+
+
+def options() -> set[str]:
+    """All options of the command line, of every command, and its own ones."""
+    found = {o for p in app.params for o in p.opts}
+    for name in app.commands:
+        command = app.commands[name]
+        every = [command, *(command.commands.values() if isinstance(command, click.Group) else ())]
+        found |= {o for c in every for p in c.params for o in (*p.opts, *p.secondary_opts)}
+    return found | {"--help"}
+
+
+@pytest.mark.parametrize("page", [p for p in pages() if name_of(p) != "CHANGELOG.md"], ids=name_of)
+def test_every_option_in_the_text_is_one(page: Path) -> None:
+    """In words and code spans; the blocks of a page are run."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    named = set(re.findall(r"`(--[a-z0-9_-]+)[^`]*`", text))
+    assert named - FOREIGN <= options()
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/index.md", "docs/agreement.md", "docs/parity.md"])
+def test_the_rule_is_the_one_that_is_applied(name: str) -> None:
+    text = prose(ROOT / name)
+    assert (ATOL, RTOL) == (1e-5, 1e-5)
+    assert VerifyOptions().tolerance == Tolerance(1e-5, 1e-5)
+    assert "1e-5" in text
+    if name != "docs/parity.md":
+        assert re.search(r"rounding was measured to explain", text), "the bound that goes before the tolerance"
+    assert "never a warning" not in text
+    for found in re.finditer(r"\|a − b\| ≤ ([\w.-]+) \+ ([\w.-]+)·\|b\|", text):
+        assert found.groups() in {("1e-5", "1e-5"), ("atol", "rtol"), ("t", "t")}
+
+
+def test_the_figures_of_agreement_are_those_of_the_program() -> None:
+    text = prose(ROOT / "docs" / "agreement.md")
+    words = {1: "one", 2: "two", 4: "four", 6: "six", 18: "eighteen"}
+    for claim in (
+        f"at most {words[rounding.FACTOR]} times the largest movement",
+        f"{words[rounding.RUNS]} runs, and {words[rounding.MORE_RUNS]} more",
+        f"false alarm rate of {statistics.FALSE_ALARM:.0e}".replace("e-06", "e-6"),
+        f"drawn {draws.DRAWS} times",
+        f"and {LARGE_BATCH} (1 to 7",
+        f"no more than {MOST_IDS} ",
+        f"about {SECONDS} seconds of inputs",
+        "never less than 2⁻¹⁷",
+        "a thousandth of its variation",
+        "`action_probs` (5e-3)",
+    ):
+        assert claim in text, claim
+    assert (SHARE, SIZE) == (1e-3, 2.0**-17)
+    formats = prose(ROOT / "docs" / "formats.md")
+    assert decisions.LIMITS == {"float16": 0.01, "int8": 0.05}
+    assert "at most 1% (float16) or 5% (int8) of the choices" in formats
+
+
+def test_the_exception_is_as_the_page_says() -> None:
+    class Sac:
+        algorithm = "SAC"
+
+    held = tolerance_for(Sac(), "action_probs", Tolerance())  # type: ignore[arg-type]
+    assert (held.atol, held.rtol) == (5e-3, 5e-3)
+    assert held.reason
+    assert tolerance_for(Sac(), "action", Tolerance()) == Tolerance()  # type: ignore[arg-type]
+
+
+def test_the_verdict_that_readme_shows_is_one_that_is_said() -> None:
+    defaults = [key for key, kind in WRITTEN.items() if kind.default]
+    count = f"({len(defaults)} of {len(defaults)} formats)"
+    said = f"PASSED: {', '.join(defaults)} {count} agree with the original in TensorFlow"
+    assert said in (ROOT / "README.md").read_text(encoding="utf-8")
