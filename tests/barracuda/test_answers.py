@@ -56,6 +56,21 @@ def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str
                 np.testing.assert_allclose(value, expected[name], atol=max(bound.atol, 1e-3), rtol=1e-3, err_msg=name)
 
 
+@pytest.mark.parametrize("role", [Role.LOG_PROB, Role.STD, Role.LOG_STD, Role.OTHER, Role.Q_VALUES])
+def test_what_a_nn_has_no_name_for_is_not_answered_by_its_action(role: Role) -> None:
+    """Stable-Baselines3's log-probability was: its file was called wrong, and set aside."""
+    (policy,) = policies(next(p for p in FIXTURES if p.stem == "continuous"))
+    signature = policy.signature
+    extra = replace(signature.output("value_estimate"), name="extra", role=role)
+    signature = replace(signature, outputs=(*signature.outputs, extra))
+    more = replace(policy, signature=signature, fetches={**policy.fetches, "extra": policy.fetches["value_estimate"]})
+    (data,) = WRITTEN["nn"].artifact(more, WriteOptions(json.dumps(signature.to_dict()))).files.values()
+    names = answered(signature)
+    assert names == [s.name for s in policy.signature.outputs]
+    feeds = some(policy, 3)
+    assert NnPolicy(data.joined()).run(feeds, names).keys() == run_graph(policy.graph, feeds, names).keys()
+
+
 def test_a_file_without_a_contract_says_so() -> None:
     policy = policies(FIXTURES[0])[0]
     (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()

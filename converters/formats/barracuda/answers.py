@@ -40,13 +40,18 @@ def contract_of(model: NnModel) -> PolicySignature:
         ) from error
 
 
+#: Outputs for which a ``.nn`` of API version 2 has no name.
+_UNWRITTEN = (Role.OTHER, Role.Q_VALUES, Role.LOG_PROB, Role.STD, Role.LOG_STD)
+
+
 def answered(signature: PolicySignature) -> list[str]:
     """The outputs of a policy that its ``.nn`` answers.
 
-    A drawn class has no place in one of API version 2: ML-Agents draws it from the log-probabilities.
+    A drawn class has no place in one of API version 2: ML-Agents draws it from the log-probabilities. Nor has the
+    log-probability of the action that was drawn, nor a spread: Stable-Baselines3 and others give them.
     """
     scored = any(s.role is Role.LOG_PROBS for s in signature.outputs)
-    unanswered = {Role.OTHER, Role.Q_VALUES} | ({Role.SAMPLED} if scored else set())
+    unanswered = {*_UNWRITTEN, *((Role.SAMPLED,) if scored else ())}
     return [s.name for s in signature.outputs if s.role not in unanswered]
 
 
