@@ -56,6 +56,7 @@ TFJS = (*FEWER_OPS, *_LOWER_FOR_TFJS, _FUSE_ACTIVATIONS)
 TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_ACTIVATIONS)
 ONNX = (*FEWER_OPS, _FUSE)
 LITERT = (*FEWER_OPS, _FUSE)
+C = (*FEWER_OPS, _FUSE)
 #: Models for one consumer stay as they were tried in it.
 CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)
 BARRACUDA = (_FUSE, _on_roots(lower_for_nn))

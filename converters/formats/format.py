@@ -162,6 +162,8 @@ class Format:
       ``answers`` are the outputs of a policy that an artefact answers (None: all). ``narrow``: it can hold weights in
       float16 or int8. ``fixed``: it can be written for a fixed number of agents.
       ``library`` is a Python package that runs such a file by itself; verification does not ask it.
+      ``program``: it is source code, which is run right after it was written and never again, since anyone may have
+      changed it.
     """
 
     key: str
@@ -191,6 +193,7 @@ class Format:
     narrow: bool = False
     fixed: bool = False
     library: str = ""
+    program: bool = False
 
     @property
     def readable(self) -> bool:

@@ -17,6 +17,7 @@ ROOMS = (
     "onnx",
     "barracuda",
     "litert",
+    "c",
     "stable_baselines3",
     "torch_checkpoint",
     "keras",

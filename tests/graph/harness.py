@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from converters.graph.types import BATCH, TensorType, static_shape
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
+from signatures.contract import Contract, Origin
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -92,6 +94,23 @@ class Runtimes:
         """The outputs of a policy as a LiteRT model, with XNNPACK (``litert``) or without (``litert-plain``)."""
         self.need(runtime)
         model = self._load(runtime, policy, "litert")
+        names = [s.name for s in policy.signature.outputs]
+        results = model.run(dict(feeds), names)
+        model.unload()
+        return [results[name] for name in names]
+
+    def c(self, policy: Policy, feeds: Mapping[str, Array]) -> list[Array]:
+        """The outputs of a policy as a C header, compiled."""
+        self.need("c")
+        inputs = tuple(replace(s, role=Role.PARAMETER) for s in policy.signature.inputs)
+        signature = replace(policy.signature, inputs=inputs)
+        contract = Contract(
+            policy.name, signature, Origin("test", "0" * 64), policy.source, {"name": "export-model", "version": "test"}
+        )
+        artifact = WRITTEN["c"].artifact(replace(policy, signature=signature), WriteOptions(contract.compact()))
+        root = self._folder / str(next(self._numbers))
+        artifact.write(root)
+        model = self._pool.process("c").load(str(root / artifact.main), kind="graph", format="c")
         names = [s.name for s in policy.signature.outputs]
         results = model.run(dict(feeds), names)
         model.unload()

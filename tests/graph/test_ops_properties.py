@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from converters.graph.nodes import Graph, Node
-from converters.graph.ops.convolution import window_padding
+from converters.graph.ops.loops.layers import window_padding
 from converters.graph.ops.table import TABLE
 from converters.graph.types import INT32
 from tests import conftest

@@ -12,7 +12,7 @@ from converters.compiler.passes.normalise import as_placeholder
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape, downstream
 from converters.graph.ops.base import Layer
-from converters.graph.ops.convolution import window_padding
+from converters.graph.ops.loops.layers import window_padding
 from converters.graph.ops.table import is_fed, traits
 from converters.graph.shapes import MAX_ELEMENTS
 from converters.graph.types import INT32

@@ -112,14 +112,18 @@ def begin(scratch: str, parent: int) -> None:
     confine(scratch)
 
 
-def confine(scratch: str | None) -> None:
-    """Give up everything but reading, computing, and writing below ``scratch``; what a kernel lacks is left out."""
+def confine(scratch: str | None, *, starts: bool = False) -> None:
+    """Give up everything but reading, computing, and writing below ``scratch``; what a kernel lacks is left out.
+
+    ``starts``: a compiler, which may start processes; they give up the same.
+    """
     limit()
     if sys.platform != "linux":
         return
     _libc().prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     _landlock(scratch)
-    _seccomp()
+    if not starts:
+        _seccomp()
 
 
 def limit() -> None:

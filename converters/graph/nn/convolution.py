@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.ops.convolution import window_padding
+from converters.graph.ops.loops.layers import window_padding
 from signatures.errors import UnsupportedOpError
 from signatures.records import dataclass
 

@@ -30,6 +30,8 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.litert import arrays as litert
 from converters.graph.ops.litert.base import LitertBuilder, Value, same, without
+from converters.graph.ops.loops.arrays import transpose
+from converters.graph.ops.loops.base import view
 from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
 
 T = type_attr()
@@ -244,6 +246,7 @@ OPS = (
             lambda node, builder: builder.value(node.inputs[0]),
             (T, Attr("message", "str", "")) if name in ("PreventGradient", "CheckNumerics") else (T,),
             litert=same,
+            loops=view,
             moves="same",
         )
         for name in ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics")
@@ -271,6 +274,7 @@ OPS = (
         direct("Reshape", shape_at=1),
         (T, type_attr("Tshape", "in:1")),
         litert=litert.reshape,
+        loops=view,
         moves="view",
     ),
     OpDef(
@@ -280,6 +284,7 @@ OPS = (
         _lower_squeeze,
         (T, Attr("squeeze_dims", "int", ())),
         litert=_litert_squeeze,
+        loops=view,
         moves="view",
     ),
     OpDef(
@@ -289,6 +294,7 @@ OPS = (
         _lower_expand_dims,
         (T, type_attr("Tdim", "in:1")),
         litert=litert.expand_dims,
+        loops=view,
         moves="view",
     ),
     OpDef(
@@ -298,6 +304,7 @@ OPS = (
         _lower_transpose,
         (T, type_attr("Tperm", "in:1")),
         litert=litert.transpose,
+        loops=transpose,
         moves="turn",
     ),
 )

@@ -15,6 +15,7 @@ import numpy as np
 
 from converters.graph.nodes import Node
 from converters.graph.ops.litert.base import Litert
+from converters.graph.ops.loops.base import Loops
 from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
 from signatures.records import dataclass
@@ -173,6 +174,8 @@ class OpDef:
     barracuda: Decomposition | None = None
     #: How it is written in LiteRT's operators; None: LiteRT has none that compute it.
     litert: Litert | None = None
+    #: How each element is computed: what source code is printed from; None: it is not printed.
+    loops: Loops | None = None
     #: Names under which the same op stands in graphs of other TensorFlow versions.
     spellings: tuple[str, ...] = ()
     #: Where TensorFlow 1.4 lacks it: how it is written with what that has. The normalise pass leaves none of these.

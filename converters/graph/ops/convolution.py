@@ -26,23 +26,14 @@ from converters.graph.ops.base import (
 from converters.graph.ops.linear import FUSED, activated, lower_activated
 from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.litert.layers import conv2d, depthwise, pad, pool
+from converters.graph.ops.loops import arrays
+from converters.graph.ops.loops import layers as loops
+from converters.graph.ops.loops.layers import window_padding
 from converters.graph.types import INT32, Dim, Symbols, TensorType
 
 T = type_attr()
 _TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]
 _TO_OIHW = (3, 2, 0, 1)
-
-
-def window_padding(size: int, window: int, stride: int, padding: str) -> tuple[int, int, int]:
-    """(result length, padding before, padding after) of a sliding window: TensorFlow's SAME and VALID.
-
-    ``window`` counts its dilation in. SAME puts the odd element of padding at the end.
-    """
-    if padding == "VALID":
-        return max(-(-(size - window + 1) // stride), 0), 0, 0
-    result = -(-size // stride)
-    total = max((result - 1) * stride + window - size, 0)
-    return result, total // 2, total - total // 2
 
 
 def _spatial(node: Node, window: Sequence[int]) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
@@ -247,9 +238,28 @@ def _convolution(
 
 
 OPS = (
-    _convolution("Conv2D", _conv2d, _lower_conv2d, [_CUDNN], conv2d, tfjs=_tfjs_convolution, fused="_FusedConv2D"),
-    _convolution("_FusedConv2D", _fused_conv2d, _lower_conv2d, [_CUDNN, *FUSED], conv2d, since="1.13"),
-    _convolution("DepthwiseConv2dNative", _depthwise, _lower_depthwise, [], depthwise, tfjs=_tfjs_convolution),
+    _convolution(
+        "Conv2D",
+        _conv2d,
+        _lower_conv2d,
+        [_CUDNN],
+        conv2d,
+        loops=loops.convolution,
+        tfjs=_tfjs_convolution,
+        fused="_FusedConv2D",
+    ),
+    _convolution(
+        "_FusedConv2D", _fused_conv2d, _lower_conv2d, [_CUDNN, *FUSED], conv2d, loops=loops.convolution, since="1.13"
+    ),
+    _convolution(
+        "DepthwiseConv2dNative",
+        _depthwise,
+        _lower_depthwise,
+        [],
+        depthwise,
+        loops=loops.depthwise,
+        tfjs=_tfjs_convolution,
+    ),
     OpDef(
         "MaxPool",
         _infer_window,
@@ -257,6 +267,7 @@ OPS = (
         _lower_pool("MaxPool"),
         _POOL,
         litert=pool("MAX_POOL_2D"),
+        loops=loops.pool("max"),
         precision="exact",
         layer="pool",
     ),
@@ -267,10 +278,20 @@ OPS = (
         _lower_pool("AveragePool"),
         _POOL[:-1],
         litert=pool("AVERAGE_POOL_2D"),
+        loops=loops.pool("sum"),
         layer="pool",
     ),
     *(
-        OpDef(name, _infer_pad, _pad, _lower_pad, (T, type_attr("Tpaddings", "in:1")), litert=pad, precision="exact")
+        OpDef(
+            name,
+            _infer_pad,
+            _pad,
+            _lower_pad,
+            (T, type_attr("Tpaddings", "in:1")),
+            litert=pad,
+            loops=arrays.pad,
+            precision="exact",
+        )
         for name in ("Pad", "PadV2")
     ),
 )

@@ -27,6 +27,7 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.litert import arrays as litert
 from converters.graph.ops.litert.base import builtin
+from converters.graph.ops.loops import arrays as loops
 from converters.graph.ops.older import broadcast_to
 from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
 
@@ -150,6 +151,7 @@ OPS = (
         direct("Expand", 1, 0, shape_at=0),
         (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
         litert=litert.fill,
+        loops=loops.repeated(1),
         precision="exact",
     ),
     OpDef(
@@ -167,6 +169,7 @@ OPS = (
         direct("Tile", shape_at=1),
         (T, type_attr("Tmultiples", "in:1")),
         litert=litert.tile,
+        loops=loops.tile,
         moves="repeat",
     ),
     OpDef("Range", _infer_range, _range, direct("Range"), (type_attr("Tidx"),), litert=builtin("RANGE")),
@@ -178,6 +181,7 @@ OPS = (
         (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
         tfjs=_tfjs_one_hot,
         litert=litert.one_hot,
+        loops=loops.one_hot,
         precision="exact",
         looks_up=0,
         table_size=_depth,

@@ -26,6 +26,7 @@ from converters.graph.ops.base import (
     unsqueezed,
 )
 from converters.graph.ops.litert import arrays as litert
+from converters.graph.ops.loops import arrays as loops
 from converters.graph.types import BATCH, Dim, Symbols, TensorType
 
 T = type_attr()
@@ -185,6 +186,7 @@ OPS = (
         _lower_concat,
         (Attr("N", "int", derive="count:1"), T, type_attr("Tidx", "in:-1")),
         litert=litert.concat,
+        loops=loops.concat,
         moves="join",
         data=(0, -1),
     ),
@@ -195,6 +197,7 @@ OPS = (
         _lower_pack,
         (Attr("N", "int", derive="count"), T, Attr("axis", "int", 0)),
         litert=litert.pack,
+        loops=loops.pack,
         moves="join",
         data=(0, None),
     ),
@@ -206,6 +209,7 @@ OPS = (
         (Attr("num", "int"), T, Attr("axis", "int", 0)),
         outputs=-1,
         litert=litert.unpack,
+        loops=loops.unpack,
         spellings=("Unstack",),
         moves="pick",
     ),
@@ -216,6 +220,7 @@ OPS = (
         _lower_split,
         (Attr("num_split", "int"), type_attr("T", "in:1")),
         litert=litert.split,
+        loops=loops.split,
         outputs=-1,
         moves="pick",
         data=(1, 2),
@@ -227,6 +232,7 @@ OPS = (
         _lower_split,
         (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
         litert=litert.split_v,
+        loops=loops.split,
         outputs=-1,
         moves="pick",
     ),

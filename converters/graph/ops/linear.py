@@ -31,6 +31,8 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, refused
 from converters.graph.ops.litert.layers import matmul as litert_matmul
+from converters.graph.ops.loops import layers as loops
+from converters.graph.ops.loops.base import simple
 from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType, broadcast
 
 T = type_attr()
@@ -306,6 +308,7 @@ def _dense(name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], **tra
         lower,
         attrs,
         litert=litert_matmul,
+        loops=loops.matmul,
         foldable=False,
         precision="summed",
         layer="dense",
@@ -329,14 +332,15 @@ OPS = (
         direct("Add"),
         (T, Attr("data_format", "str", "NHWC")),
         litert=builtin("ADD"),
+        loops=simple("add"),
     ),
-    _reduce("Sum", np.sum, "ReduceSum", "summed", "SUM"),
-    _reduce("Mean", _mean, "ReduceMean", "rounded", "MEAN", takes="mean"),
-    _reduce("Prod", np.prod, "ReduceProd", "rounded", "REDUCE_PROD"),
-    _reduce("Max", np.max, "ReduceMax", "exact", "REDUCE_MAX", takes="largest"),
-    _reduce("Min", np.min, "ReduceMin", "exact", "REDUCE_MIN"),
-    _reduce("All", np.all, "ReduceMin", "exact", "REDUCE_ALL"),
-    _reduce("Any", np.any, "ReduceMax", "exact", "REDUCE_ANY"),
+    _reduce("Sum", np.sum, "ReduceSum", "summed", "SUM", loops=loops.reduction("sum")),
+    _reduce("Mean", _mean, "ReduceMean", "rounded", "MEAN", takes="mean", loops=loops.reduction("sum", mean=True)),
+    _reduce("Prod", np.prod, "ReduceProd", "rounded", "REDUCE_PROD", loops=loops.reduction("product")),
+    _reduce("Max", np.max, "ReduceMax", "exact", "REDUCE_MAX", takes="largest", loops=loops.reduction("max")),
+    _reduce("Min", np.min, "ReduceMin", "exact", "REDUCE_MIN", loops=loops.reduction("min")),
+    _reduce("All", np.all, "ReduceMin", "exact", "REDUCE_ALL", loops=loops.truth("min")),
+    _reduce("Any", np.any, "ReduceMax", "exact", "REDUCE_ANY", loops=loops.truth("max")),
     *(
         OpDef(
             name,
@@ -345,6 +349,7 @@ OPS = (
             _lower_arg(name),
             _ARG_ATTRS,
             litert=_litert_arg(operator),
+            loops=loops.arg("first largest" if chosen == "largest" else "first smallest"),
             precision="exact",
             chooses=chosen,
         )
@@ -357,6 +362,7 @@ OPS = (
         direct("Softmax", axis=-1),
         (T,),
         litert=builtin("SOFTMAX", beta=1.0),
+        loops=loops.softmax(log=False),
         precision="approximate",
         activation="softmax",
         finite="always",
@@ -368,6 +374,7 @@ OPS = (
         direct("LogSoftmax", axis=-1),
         (T,),
         litert=builtin("LOG_SOFTMAX"),
+        loops=loops.softmax(log=True),
         precision="approximate",
         activation="softmax",
     ),

@@ -25,13 +25,15 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.litert.base import Litert, builtin
 from converters.graph.ops.litert.elementwise import select
+from converters.graph.ops.loops import elementwise as loops
+from converters.graph.ops.loops.base import Loops, elementwise, simple
 from converters.graph.ops.older import select_v2
 from converters.graph.types import BOOL, FLOAT32, INT32, TensorType
 
 T = type_attr()
 
 
-def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower, litert: Litert) -> OpDef:
+def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower, litert: Litert, loops: Loops) -> OpDef:
     attrs: tuple[Attr, ...] = (T,)
     if name in ("Equal", "NotEqual"):
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
@@ -43,6 +45,7 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower,
         lowering,
         attrs,
         litert=litert,
+        loops=loops,
         precision="exact",
         elementwise=True,
         compares_equal=name == "Equal",
@@ -83,13 +86,25 @@ def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorTy
 
 
 OPS = (
-    _comparison("Less", np.less, direct("Less"), builtin("LESS")),
-    _comparison("LessEqual", np.less_equal, direct("LessOrEqual"), builtin("LESS_EQUAL")),
-    _comparison("Greater", np.greater, direct("Greater"), builtin("GREATER")),
+    _comparison("Less", np.less, direct("Less"), builtin("LESS"), loops.compared("less")),
+    _comparison("LessEqual", np.less_equal, direct("LessOrEqual"), builtin("LESS_EQUAL"), loops.compared("less_equal")),
+    _comparison("Greater", np.greater, direct("Greater"), builtin("GREATER"), elementwise(loops.greater)),
     # The other way round: Barracuda has no GreaterOrEqual.
-    _comparison("GreaterEqual", np.greater_equal, direct("LessOrEqual", 1, 0), builtin("GREATER_EQUAL")),
-    _comparison("Equal", np.equal, direct("Equal"), builtin("EQUAL")),
-    _comparison("NotEqual", np.not_equal, chain(("Equal", None), ("Not", None)), builtin("NOT_EQUAL")),
+    _comparison(
+        "GreaterEqual",
+        np.greater_equal,
+        direct("LessOrEqual", 1, 0),
+        builtin("GREATER_EQUAL"),
+        elementwise(loops.greater_equal),
+    ),
+    _comparison("Equal", np.equal, direct("Equal"), builtin("EQUAL"), loops.compared("equal")),
+    _comparison(
+        "NotEqual",
+        np.not_equal,
+        chain(("Equal", None), ("Not", None)),
+        builtin("NOT_EQUAL"),
+        elementwise(loops.not_equal),
+    ),
     *(
         OpDef(
             name,
@@ -97,6 +112,7 @@ OPS = (
             plain(function),
             direct(onnx),
             litert=builtin(f"LOGICAL_{onnx.upper()}"),
+            loops=loops.compared(onnx.lower()),
             precision="exact",
             elementwise=True,
         )
@@ -108,6 +124,7 @@ OPS = (
         plain(np.logical_not),
         direct("Not"),
         litert=builtin("LOGICAL_NOT"),
+        loops=simple("not"),
         precision="exact",
         elementwise=True,
     ),
@@ -121,6 +138,7 @@ OPS = (
         (type_attr("T", "in:1"),),
         tfjs=_tfjs_select,
         litert=select,
+        loops=loops.select,
         precision="exact",
     ),
     OpDef(  # of no policy's graph, but of a TensorFlow.js model's

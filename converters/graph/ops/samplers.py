@@ -22,6 +22,8 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.litert.arrays import multinomial, random
 from converters.graph.ops.litert.base import Litert
+from converters.graph.ops.loops import layers as loops
+from converters.graph.ops.loops.base import Loops
 from converters.graph.types import INT64, Dim, Symbols, TensorType
 
 _SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
@@ -109,18 +111,37 @@ def _lower_multinomial(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _of_shape(
-    name: str, kernel: Kernel, lowering: Lower | None, sampler: Sampler, litert: Litert | None = None
+    name: str,
+    kernel: Kernel,
+    lowering: Lower | None,
+    sampler: Sampler,
+    litert: Litert | None = None,
+    loops: Loops | None = None,
 ) -> OpDef:
     attrs = (*_SEEDS, Attr("dtype", "type"), type_attr("T"))
-    return OpDef(name, _infer_random, kernel, lowering, attrs, litert=litert, foldable=False, sampler=sampler)
+    return OpDef(
+        name, _infer_random, kernel, lowering, attrs, litert=litert, loops=loops, foldable=False, sampler=sampler
+    )
 
 
 OPS = (
     _of_shape(
-        "RandomStandardNormal", _normal, _lower_random("RandomNormalLike"), "normal", random("RANDOM_STANDARD_NORMAL")
+        "RandomStandardNormal",
+        _normal,
+        _lower_random("RandomNormalLike"),
+        "normal",
+        random("RANDOM_STANDARD_NORMAL"),
+        loops.normal,
     ),
     _of_shape("TruncatedNormal", _truncated, None, "truncated normal"),
-    _of_shape("RandomUniform", _uniform, _lower_random("RandomUniformLike"), "uniform", random("RANDOM_UNIFORM")),
+    _of_shape(
+        "RandomUniform",
+        _uniform,
+        _lower_random("RandomUniformLike"),
+        "uniform",
+        random("RANDOM_UNIFORM"),
+        loops.uniform,
+    ),
     OpDef(
         "Multinomial",
         _infer_multinomial,
@@ -128,6 +149,7 @@ OPS = (
         _lower_multinomial,
         (*_SEEDS, type_attr("T"), Attr("output_dtype", "type", INT64, since="1.7")),
         litert=multinomial,
+        loops=loops.multinomial,
         foldable=False,
         sampler="categorical",
     ),

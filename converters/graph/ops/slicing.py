@@ -27,6 +27,8 @@ from converters.graph.ops.base import (
 )
 from converters.graph.ops.litert.arrays import gather
 from converters.graph.ops.litert.base import LitertBuilder, Value, as_int32, ints, with_axis
+from converters.graph.ops.loops import arrays as loops
+from converters.graph.ops.loops.base import LoopBuilder, Tensor
 from converters.graph.types import Dim, Symbols, TensorType
 
 T = type_attr()
@@ -268,6 +270,13 @@ def _litert_strided_slice(node: Node, builder: LitertBuilder) -> Value:
     return value
 
 
+def _loops_strided_slice(node: Node, builder: LoopBuilder) -> Tensor:
+    operands, rank = _strided_operands([builder.type_of(r) for r in node.inputs]), builder.type_of(node.inputs[0]).rank
+    if operands is None or rank is None:
+        raise not_constant(node, "the bounds of a slice")
+    return loops.strided(node, builder, strided_steps(node, rank, *operands))
+
+
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:
     """An index that is outside its axis is an error, as in TensorFlow on a CPU; numpy counts some from the end."""
     if indices.size and indices.dtype.kind in "iu" and indices.min() < 0:
@@ -305,6 +314,7 @@ OPS = (
         _lower_slice,
         (T, type_attr("Index", "in:1")),
         litert=_litert_slice,
+        loops=loops.slice_,
         moves="pick",
     ),
     OpDef(
@@ -315,6 +325,7 @@ OPS = (
         (T, type_attr("Index", "in:1"), *_MASKS),
         tfjs=_tfjs_strided_slice,
         litert=_litert_strided_slice,
+        loops=_loops_strided_slice,
         moves="pick",
     ),
     OpDef(
@@ -324,6 +335,7 @@ OPS = (
         _lower_gather,
         (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
         litert=gather,
+        loops=loops.gather,
         moves="pick",
         looks_up=1,
         table_size=_rows_of_table,
@@ -340,6 +352,7 @@ OPS = (
             Attr("batch_dims", "int", 0, since="1.14", supported=False),
         ),
         litert=gather,
+        loops=loops.gather,
         moves="pick",
         looks_up=1,
         table_size=_rows_of_table,

@@ -1,0 +1,46 @@
+"""An artefact that is a C header: the contract that it holds, and why a stranger's is not run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from converters.files.fetch import read_bytes
+from converters.formats.c.contract import answers
+from converters.formats.format import Port, Ports
+from signatures.contract import EMBEDDED, parse
+from signatures.errors import DamagedFileError, UnsupportedOpError
+
+_MARK = f"   {EMBEDDED}: ".encode()
+
+
+def held(path: Path) -> str | None:
+    """The contract that a header of ours has as a comment. Raises SourceError."""
+    _, found, rest = read_bytes(path).partition(_MARK)
+    return rest.partition(b"\n*/")[0].decode("ascii", "replace") if found else None
+
+
+def ports(path: Path) -> Ports:
+    """What it takes and gives, as its contract says. Raises SourceError, DamagedFileError."""
+    text = held(path)
+    if text is None:
+        raise DamagedFileError(f"{path.name} has no contract", why="no header of export-model", fix="export it again")
+    signature = parse(json.loads(text)).signature
+    wanted = answers(signature)
+    return Ports(
+        path,
+        tuple(Port(s.name, s.dtype, s.shape) for s in signature.inputs),
+        tuple(Port(s.name, s.dtype, s.shape) for s in signature.outputs if s.name in wanted),
+        {"kind": "graph", "format": "c"},
+    )
+
+
+def vetted(path: Path, names: Sequence[str], folder: Path) -> Path:
+    """Nothing: source code is a program, and may do more than compute. Raises UnsupportedOpError."""
+    raise UnsupportedOpError(
+        f"{path.name} is not compiled",
+        issues=[],
+        why="a header that was not made just now may hold any program",
+        fix="export the policy again with --to c, which verifies it, or compile it yourself and call its self test",
+    )

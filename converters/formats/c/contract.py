@@ -1,0 +1,78 @@
+"""What a header calls a policy's inputs, outputs and memory: asked by its writer and by the judge that compiles it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from converters.formats.c.text import identifier
+from converters.graph.nodes import NameScope
+from signatures.records import dataclass
+from signatures.roles import Role
+from signatures.spec import PolicySignature, TensorSpec
+
+#: What the actor does not need.
+_REST = frozenset((Role.VALUE, Role.ACTION_PROBS, Role.LOG_PROB, Role.STD, Role.LOG_STD))
+#: Words that no field can have in C or C++.
+_KEYWORDS = tuple(
+    """auto break case char const continue default do double else enum extern float for goto if inline int long
+    register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while class
+    new delete this operator template typename public private protected virtual bool true false namespace using try
+    catch throw friend explicit export and or not xor""".split()  # noqa: SIM905  a list of sixty lines otherwise
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A member of one of the header's structs: ``size`` elements of a tensor of the policy."""
+
+    name: str
+    spec: TensorSpec
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The members of the structs: what is observed, what the memory keeps (the state, draws), what is answered."""
+
+    prefix: str
+    inputs: tuple[Field, ...]
+    noise: tuple[Field, ...]
+    state: Field | None
+    next_state: Field | None
+    outputs: tuple[Field, ...]
+
+
+def answers(signature: PolicySignature) -> list[str]:
+    """The outputs that a header answers: the actor's."""
+    heads = {head.name for head in signature.heads}
+    return [s.name for s in signature.outputs if s.name in heads or s.role not in _REST]
+
+
+def header_of(name: str, signature: PolicySignature) -> Header:
+    """What the header of the policy ``name`` calls what."""
+    word = identifier(name)
+    prefix = word if not word[0].isdigit() else f"policy_{word}"
+    memory_in, memory_out = signature.recurrence or ("", "")
+    wanted = answers(signature)
+    fields = _fields(s for s in signature.inputs)
+    outputs = [f for f in _fields(s for s in signature.outputs) if f.spec.name in wanted]
+    return Header(
+        prefix,
+        tuple(f for f in fields if f.spec.role is not Role.NOISE and f.spec.name != memory_in),
+        tuple(f for f in fields if f.spec.role is Role.NOISE),
+        next((f for f in fields if f.spec.name == memory_in), None),
+        next((f for f in outputs if f.spec.name == memory_out), None),
+        tuple(f for f in outputs if f.spec.name != memory_out),
+    )
+
+
+def _fields(specs: Iterable[TensorSpec]) -> list[Field]:
+    scope = NameScope(("floats", "ints", "longs", "stream", *_KEYWORDS))
+    found = []
+    for spec in specs:
+        word = identifier(spec.name)
+        size = 1
+        for length in spec.shape[1:] if spec.batched else spec.shape:
+            size *= length or 1
+        found.append(Field(scope.fresh(f"x{word}" if word[0].isdigit() else word), spec, size))
+    return found

@@ -1,0 +1,211 @@
+"""Policy to one C header: every stage a loop nest, weights as constants, nothing to link but the C library's maths."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from converters.compiler.targets import C, prepare
+from converters.files.chunks import Pieces
+from converters.formats.c.contract import Field, Header, header_of
+from converters.formats.c.text import C_TYPES, Printer, literal
+from converters.formats.format import WriteOptions
+from converters.graph.ops.table import traits
+from converters.graph.program import Program, program_of
+from converters.graph.run import run_graph
+from converters.policy.policy import Policy
+from signatures.contract import EMBEDDED
+from signatures.roles import Role
+
+#: Golden rows of the self test, and how far float32 may be off.
+_ROWS = 3
+_CLOSE = "1e-4f"
+
+_DRAWS = """
+/* The stream of draws: splitmix64 (Steele, Lea and Flood 2014), its top 23 bits, in the middle of their step: above 0,
+   below 1, and exact in a float. The same seed gives the same draws everywhere. */
+static float $P_uniform($P_memory *memory)
+{
+    uint64_t z = (memory->stream += UINT64_C(0x9E3779B97F4A7C15));
+    z = (z ^ (z >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
+    z = (z ^ (z >> 27)) * UINT64_C(0x94D049BB133111EB);
+    z ^= z >> 31;
+    return ((float)(int32_t)(z >> 41) + 0.5f) * 1.1920928955078125e-7f;
+}
+"""
+_NORMAL = """
+/* Draws from N(0, 1), by Box and Muller. */
+static void $P_normal($P_memory *memory, float *out, int count)
+{
+    for (int i = 0; i < count; i++) {
+        const float radius = sqrtf(-2.0f * logf($P_uniform(memory)));
+        out[i] = radius * cosf(6.28318531f * $P_uniform(memory));
+    }
+}
+"""
+
+
+def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
+    """The header. Raises UnsupportedOpError."""
+    header = header_of(policy.name, policy.signature)
+    outputs = [*header.outputs, *([header.next_state] if header.next_state else [])]
+    fetches = {f.spec.name: policy.fetches[f.spec.name] for f in outputs}
+    program = program_of(prepare(policy, C), policy.feeds, fetches)
+    text = _text(policy, header, program, options)
+    return {f"{policy.name}.h": Pieces(text.encode("ascii"))}
+
+
+def _text(policy: Policy, header: Header, program: Program, options: WriteOptions) -> str:
+    p = header.prefix
+    printer = Printer(p)
+    by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
+    by_name |= {f.spec.name: f"memory->{f.name}" for f in (*header.noise, *([header.state] if header.state else []))}
+    for name, tensor in program.inputs.items():
+        printer.called(tensor.place, by_name[name])
+    body = printer.body(program)
+    for f in (*header.outputs, *([header.next_state] if header.next_state else [])):
+        target = f"memory->{header.state.name}" if f is header.next_state and header.state else f"output->{f.name}"
+        source = printer.name(program.outputs[f.spec.name].place)
+        body.append(f"    for (int i = 0; i < {f.size}; i++) {target}[i] = {source}[i];")
+    contract = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in options.contract)
+    contract = contract.replace("*/", "*\\/").replace("/*", "\\/*")
+    chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
+    sizes = policy.signature.branches
+    choose = _choose(p, chosen, sizes) if chosen is not None and sum(sizes) == chosen.size else ""
+    draws = printer.draws or bool(header.noise) or bool(choose)
+    state = header.state
+    parts = [
+        f"/* {p}: a policy without a runtime. In one source file, write\n"
+        f"       #define {p.upper()}_IMPLEMENTATION\n"
+        f'       #include "{policy.name}.h"\n'
+        f"   and link the C library's maths (-lm). C99 or later, C++11 or later. Made by export-model.\n\n"
+        f"   {EMBEDDED}: {contract}\n*/",
+        f"#ifndef {p.upper()}_H\n#define {p.upper()}_H\n\n#include <stdint.h>\n\n"
+        f'#ifdef __cplusplus\nextern "C" {{\n#endif',
+        _struct(f"{p}_input", "What an agent observes.", map(_member, header.inputs)),
+        _struct(
+            f"{p}_memory",
+            "What an agent keeps: the stream of its draws, its state; the rest is for computing.",
+            [
+                "uint64_t stream;",
+                *map(_member, header.noise),
+                *([_member(state)] if state else []),
+                *(
+                    f"{c} {arena}[{size}];"
+                    for arena, size in program.arenas.items()
+                    for c in [{"floats": "float", "ints": "int32_t", "longs": "int64_t"}[arena]]
+                ),
+            ],
+        ),
+        _struct(f"{p}_output", "What an agent does.", map(_member, header.outputs)),
+        f"/* Begin an episode: no state, draws by a seed. */\nvoid {p}_reset({p}_memory *memory, uint64_t seed);\n"
+        f"/* Decide: draw the noise where there is some, then compute. */\n"
+        f"void {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
+        f"/* The same for some agents, each with a memory of its own. */\n"
+        f"void {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
+        f"/* Compute with the noise that stands in the memory (zeros: without chance). */\n"
+        f"void {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
+        f"#ifdef {p.upper()}_SELFTEST\n"
+        f"/* How many numbers are not what the policy's own kernels computed at export: 0. */\n"
+        f"int {p}_selftest({p}_memory *memory);\n#endif",
+        *([f"/* Draw a class for each of {len(sizes)} branches. */\n{choose.splitlines()[0]};"] if choose else []),
+        f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
+        f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <math.h>\n#include <string.h>",
+        *(printer.constant(place) for place in program.constants),
+        *sorted(printer.helpers.values()),
+        *([_DRAWS.replace("$P", p).strip()] if draws else []),
+        *([_NORMAL.replace("$P", p).strip()] if header.noise else []),
+        f"void {p}_reset({p}_memory *memory, uint64_t seed)\n{{\n    memset(memory, 0, sizeof *memory);\n"
+        f"    memory->stream = seed;\n}}",
+        f"void {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        f"    (void)input;\n    (void)memory;\n" + "\n".join(body) + "\n}",
+        f"void {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        + "".join(f"    {p}_normal(memory, memory->{f.name}, {f.size});\n" for f in header.noise)
+        + f"    {p}_compute(input, memory, output);\n}}",
+        f"void {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        f"    for (int i = 0; i < agents; i++) {p}_act(&input[i], &memory[i], &output[i]);\n}}",
+        *([choose] if choose else []),
+        _selftest(policy, header),
+        "#endif",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _choose(prefix: str, field: Field, sizes: Sequence[int]) -> str:
+    """The function that draws classes by their log-probabilities, by the Gumbel trick."""
+    return (
+        f"void {prefix}_choose({prefix}_memory *memory, const {prefix}_output *output, int32_t *action)\n{{\n"
+        f"    static const int sizes[{len(sizes)}] = {{{', '.join(map(str, sizes))}}};\n"
+        f"    const float *row = output->{field.name};\n"
+        f"    for (int branch = 0; branch < {len(sizes)}; branch++) {{\n"
+        f"        float best = -INFINITY;\n        action[branch] = 0;\n"
+        f"        for (int i = 0; i < sizes[branch]; i++) {{\n"
+        f"            const float drawn = row[i] - logf(-logf({prefix}_uniform(memory)));\n"
+        f"            if (best < drawn) {{ best = drawn; action[branch] = i; }}\n        }}\n"
+        f"        row += sizes[branch];\n    }}\n}}"
+    )
+
+
+def _struct(name: str, about: str, members: Iterable[str]) -> str:
+    lines = list(members) or ["int32_t nothing;"]
+    inner = "\n".join(f"    {line}" for line in lines)
+    return f"/* {about} */\ntypedef struct {{\n{inner}\n}} {name};"
+
+
+def _member(field: Field) -> str:
+    shape = " x ".join(str(n) for n in (field.spec.shape[1:] if field.spec.batched else field.spec.shape))
+    return f"{C_TYPES[field.spec.dtype]} {field.name}[{field.size}]; /* {field.spec.role.value}, {shape or '1'} */"
+
+
+def _fed(field: Field, row: int) -> np.ndarray:
+    """What the self test feeds: the same formula stands in the header."""
+    i = np.arange(field.size)
+    if field.spec.role is Role.MASKS:
+        return np.ones(field.size)
+    return ((i * 7 + row * 5) % 17 - 8) / 8 if field.spec.dtype == "float32" else np.zeros(field.size)
+
+
+def _selftest(policy: Policy, header: Header) -> str:
+    """Golden rows: inputs by a formula, what the kernels make of them, as far as nothing is drawn."""
+    p, graph = header.prefix, policy.graph
+    drawn = graph.descendants(n.name for n in graph.nodes if traits(n).sampler)
+    checked = [f for f in header.outputs if f.spec.dtype == "float32"]
+    checked = [f for f in checked if policy.fetches[f.spec.name].partition(":")[0] not in drawn]
+    lines, golden = list[str](), list[float]()
+    every = [*header.inputs, *header.noise, *([header.state] if header.state else [])]
+    quiet = {id(f) for f in (*header.noise, *([header.state] if header.state else []))}
+    for row in range(_ROWS if checked else 0):
+        feeds = {}
+        for f in every:
+            value = np.zeros(f.size) if id(f) in quiet else _fed(f, row)
+            shape = [1 if n is None else n for n in f.spec.shape]
+            feeds[policy.feeds[f.spec.name]] = value.astype(f.spec.dtype).reshape(shape)
+        found = run_graph(graph, feeds, [policy.fetches[f.spec.name] for f in checked])
+        golden += [float(x) for f in checked for x in found[policy.fetches[f.spec.name]].reshape(-1)]
+    for f in header.inputs:
+        kind = C_TYPES[f.spec.dtype]
+        formula = "0" if kind != "float" else "(float)((i * 7 + row * 5) % 17 - 8) / 8.0f"
+        formula = "1" if f.spec.role is Role.MASKS else formula
+        lines.append(f"        for (int i = 0; i < {f.size}; i++) input.{f.name}[i] = {formula};")
+    tests = [
+        f"        for (int i = 0; i < {f.size}; i++, at++)\n"
+        f"            if (golden[at] == golden[at] /* NaN: nothing to compare */\n"
+        f"                && !(fabsf(output.{f.name}[i] - golden[at])\n"
+        f"                    <= {_CLOSE} * (1.0f + fabsf(golden[at])))) wrong++;"
+        for f in checked
+    ]
+    if not golden:
+        empty = f"int {p}_selftest({p}_memory *memory)\n{{\n    (void)memory;\n    return 0;\n}}"
+        return f"#ifdef {p.upper()}_SELFTEST\n{empty}\n#endif"
+    rounded = [float(f"{x:.6g}") if np.isfinite(x) else np.nan for x in golden]  # NaN: not compared
+    numbers = ", ".join(literal(x, np.dtype(np.float32)) for x in rounded)
+    return (
+        f"#ifdef {p.upper()}_SELFTEST\nint {p}_selftest({p}_memory *memory)\n{{\n"
+        f"    static const float golden[{len(golden)}] = {{{numbers}}};\n    {p}_input input;\n    {p}_output output;\n"
+        f"    int wrong = 0, at = 0;\n    for (int row = 0; row < {_ROWS}; row++) {{\n"
+        f"        {p}_reset(memory, 0);\n        memset(&input, 0, sizeof input);\n"
+        + "\n".join([*lines, f"        {p}_compute(&input, memory, &output);", *tests])
+        + "\n    }\n    return wrong;\n}\n#endif"
+    )

@@ -1,0 +1,1 @@
+"""How each op is computed, element by element: what programs without a runtime are printed from."""

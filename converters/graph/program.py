@@ -1,0 +1,313 @@
+"""A graph as a program of loops for one agent: stages in their order, elementwise ones within those before them.
+
+What is computed lies in one arena per C-like type, planned once: a place is given to another tensor when its last
+reader has run. Nothing here knows a language.
+"""
+
+from __future__ import annotations
+
+from collections import Counter as Count
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import field, replace
+from typing import Any
+
+import numpy as np
+
+from converters.graph.nodes import Graph, Node, TensorShape, ref
+from converters.graph.ops.loops.base import (
+    DTYPES,
+    Applied,
+    Counter,
+    Drawn,
+    Element,
+    Expression,
+    Index,
+    Kind,
+    Number,
+    Reduced,
+    Tensor,
+    number,
+    refused,
+)
+from converters.graph.ops.table import is_fed, op_of
+from converters.graph.shapes import infer_types
+from converters.graph.types import FLOAT32, INT64, TensorType
+from signatures.records import dataclass
+
+
+@dataclass(eq=False)
+class Place:
+    """What holds the elements of a tensor: an input, a constant (``value``), or a part of the arena from ``offset``."""
+
+    kind: str
+    name: str
+    dtype: np.dtype
+    size: int
+    value: np.ndarray | None = None
+    offset: int = 0
+
+
+@dataclass(eq=False)
+class Stage:
+    """One nest of loops: every element of ``result``, and the layer of the source that it stands for."""
+
+    result: Tensor
+    counters: tuple[Counter, ...]
+    at: tuple[Expression, ...]
+    body: Expression
+    about: str
+
+
+@dataclass(eq=False)
+class Program:
+    """Stages in their order, the constants that they read, the inputs and outputs by name, the size of each arena."""
+
+    stages: list[Stage]
+    inputs: dict[str, Tensor]
+    outputs: dict[str, Tensor]
+    arenas: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def constants(self) -> list[Place]:
+        """In the order in which they are read."""
+        found = dict.fromkeys(e.tensor.place for s in self.stages for e in elements(s.body))
+        found |= dict.fromkeys(t.place for t in self.outputs.values())
+        return [p for p in found if p.kind == "constant"]
+
+
+def children(x: Expression) -> tuple[Expression, ...]:
+    """The expressions that one is made of."""
+    if isinstance(x, Element):
+        return x.at
+    if isinstance(x, Applied):
+        return x.operands
+    return (x.body,) if isinstance(x, Reduced) else ()
+
+
+def every(x: Expression) -> Iterator[Expression]:
+    """An expression and all that it is made of, each once."""
+    seen: dict[int, Expression] = {}
+    stack = [x]
+    while stack:
+        one = stack.pop()
+        if id(one) not in seen:
+            seen[id(one)] = one
+            stack.extend(children(one))
+            yield one
+
+
+def elements(x: Expression) -> list[Element]:
+    """The elements of tensors that an expression reads."""
+    return [e for e in every(x) if isinstance(e, Element)]
+
+
+def parted(stage: Stage, body: Expression) -> tuple[Counter, int, Expression, Expression] | None:
+    """Where a loop of a stage is two, one after the other, as in a concatenation: (counter, where, before, after)."""
+    if not (isinstance(body, Applied) and body.function == "select"):
+        return None
+    condition, before, after = body.operands
+    if not (isinstance(condition, Applied) and condition.function == "less"):
+        return None
+    counter, end = condition.operands
+    if counter not in stage.counters or not isinstance(counter, Counter) or not isinstance(end, Number):
+        return None
+    return counter, int(end.value), before, after
+
+
+def arena_of(dtype: np.dtype) -> str:
+    """The arena that holds tensors of a dtype."""
+    return "floats" if dtype == FLOAT32 else "longs" if dtype == INT64 else "ints"
+
+
+class _Builder:
+    def __init__(self, graph: Graph) -> None:
+        self.types = infer_types(graph)
+        self.tensors: dict[str, Tensor] = {}
+        self.stages: list[Stage] = []
+        self.node: Node | None = None
+        self._counted = 0
+
+    def type_of(self, reference: str) -> TensorType:
+        return self.types[reference]
+
+    def value(self, reference: str) -> Tensor:
+        if reference not in self.tensors:
+            constant = self.types[reference].constant
+            assert constant is not None and self.node is not None
+            self._check(constant.dtype)
+            place = Place("constant", reference, constant.dtype, constant.size, constant)
+            self.tensors[reference] = Tensor(place, constant.dtype, tuple(int(n) for n in constant.shape))
+        return self.tensors[reference]
+
+    def _check(self, dtype: np.dtype) -> None:
+        if dtype not in DTYPES:
+            assert self.node is not None
+            raise refused(self.node, f"programs compute in float32, int32, int64 and bool, not in {dtype}")
+
+    def _counters(self, lengths: Sequence[int]) -> tuple[tuple[Counter, ...], tuple[Expression, ...]]:
+        made, at = list[Counter](), list[Expression]()
+        for length in lengths:
+            if length == 1:
+                at.append(number(0))
+                continue
+            self._counted += 1
+            made.append(Counter(f"i{self._counted}", int(length)))
+            at.append(made[-1])
+        return tuple(made), tuple(at)
+
+    def compute(
+        self, shape: Sequence[int], element: Callable[[tuple[Expression, ...]], Expression], dtype: np.dtype
+    ) -> Tensor:
+        assert self.node is not None
+        self._check(dtype)
+        if 0 in shape:
+            raise refused(self.node, "a tensor of it is empty")
+        counters, at = self._counters(shape)
+        place = Place("computed", self.node.name, dtype, int(np.prod(shape, dtype=np.int64)))
+        result = Tensor(place, dtype, tuple(int(n) for n in shape))
+        origin = self.node.origin
+        source = "" if origin is None else f", {origin if isinstance(origin, str) else ' '.join(origin)}"
+        self.stages.append(Stage(result, counters, at, known(element(at)), f"{self.node.op} {self.node.name}{source}"))
+        return result
+
+    def reduce(
+        self, kind: Kind, lengths: Sequence[int], body: Callable[[tuple[Expression, ...]], Expression], dtype: np.dtype
+    ) -> Expression:
+        counters, at = self._counters(lengths)
+        if not counters and not kind.startswith("first"):
+            return body(at)
+        return Reduced(kind, counters, body(at), dtype) if counters else number(0)
+
+
+def known(x: Expression, swap: Mapping[int, Expression] | None = None) -> Expression:
+    """An expression with constants of one element as numbers, and others in the place of some (``swap``, by id)."""
+    done: dict[int, Expression] = dict(swap or {})
+
+    def visit(one: Expression) -> Expression:
+        if id(one) in done:
+            return done[id(one)]
+        made = one
+        if isinstance(one, Element):
+            value = one.tensor.place.value
+            made = (
+                Number(value.reshape(-1)[0].item(), one.dtype)
+                if value is not None and value.size == 1
+                else replace(one, at=tuple(map(visit, one.at)))
+            )
+        elif isinstance(one, Applied):
+            made = replace(one, operands=tuple(map(visit, one.operands)))
+        elif isinstance(one, Reduced):
+            made = replace(one, body=visit(one.body))
+        done[id(one)] = made
+        return made
+
+    return visit(x)
+
+
+def program_of(graph: Graph, feeds: Mapping[str, str], fetches: Mapping[str, str]) -> Program:
+    """The program of a graph for one agent; inputs and outputs by the names of ``feeds`` and ``fetches``.
+
+    Raises UnsupportedOpError.
+    """
+    graph = Graph(tuple(_for_one(n) for n in graph.nodes)).pruned(fetches.values())
+    builder = _Builder(graph)
+    inputs: dict[str, Tensor] = {}
+    names = {placeholder: name for name, placeholder in feeds.items()}
+    for node in graph.nodes:
+        builder.node, kind = node, builder.types[node.name]
+        if is_fed(node):
+            shape = tuple(n for n in kind.shape or () if isinstance(n, int))
+            if kind.shape is None or len(shape) < len(kind.shape) or kind.dtype not in DTYPES:
+                raise refused(node, "its type and length must be known: float32, int32, int64 or bool")
+            place = Place("input", names[node.name], kind.dtype, int(np.prod(shape, dtype=np.int64)))
+            builder.tensors[node.name] = inputs[names[node.name]] = Tensor(place, kind.dtype, shape)
+        elif kind.constant is None:
+            loops = op_of(node).loops
+            if loops is None:
+                raise refused(node, "it has no loops yet")
+            made = loops(node, builder)
+            for i, tensor in enumerate(made if isinstance(made, tuple) else (made,)):
+                builder.tensors[ref(node.name, i)] = tensor
+    outputs = {name: builder.value(reference) for name, reference in fetches.items()}
+    program = Program(builder.stages, inputs, outputs)
+    _leave_out(program)
+    _join(program)
+    _plan(program)
+    return program
+
+
+def _for_one(node: Node) -> Node:
+    if not is_fed(node) or not node.dims or node.dims[0] is not None:
+        return node
+    return replace(node, attrs={**node.attrs, "shape": TensorShape((1, *node.dims[1:]))})
+
+
+def _leave_out(program: Program) -> None:
+    """Stages that nothing reads go."""
+    needed = {t.place for t in program.outputs.values()}
+    kept = []
+    for stage in reversed(program.stages):
+        if stage.result.place in needed:
+            needed |= {e.tensor.place for e in elements(stage.body)}
+            kept.append(stage)
+    program.stages = kept[::-1]
+
+
+def _join(program: Program) -> None:
+    """A stage that one other alone reads, element by element and in the same loops, becomes a part of that."""
+    made: dict[Any, Stage] = {s.result.place: s for s in program.stages}
+    readers = Count(p for s in program.stages for p in {e.tensor.place for e in elements(s.body)})
+    kept_places = {t.place for t in program.outputs.values()}
+    gone: set[Any] = set()
+    for stage in program.stages:
+        within = {id(e) for r in every(stage.body) if isinstance(r, Reduced) for e in every(r.body)}
+        reads: dict[Any, list[Element]] = {}
+        for e in elements(stage.body):
+            reads.setdefault(e.tensor.place, []).append(e)
+        swap: dict[int, Expression] = {}
+        for place, found in reads.items():
+            before = made.get(place)
+            if before is None or readers[place] > 1 or place in kept_places:
+                continue
+            alike = all(id(e) not in within and _same_place(e, before, stage) for e in found)
+            if not alike or parted(before, before.body) or any(isinstance(x, Drawn) for x in every(before.body)):
+                continue
+            turned = {id(a): b for a, b in zip(before.counters, stage.counters, strict=True)}
+            body = known(before.body, turned)
+            swap |= {id(e): body for e in found}
+            gone.add(place)
+        if swap:
+            stage.body = known(stage.body, swap)
+    program.stages = [s for s in program.stages if s.result.place not in gone]
+
+
+def _same_place(e: Element, before: Stage, stage: Stage) -> bool:
+    if e.tensor.shape != before.result.shape or len(before.counters) != len(stage.counters):
+        return False
+    return [i for i in e.at if not isinstance(i, Number)] == list(stage.counters) and all(
+        a.length == b.length for a, b in zip(before.counters, stage.counters, strict=True)
+    )
+
+
+def _plan(program: Program) -> None:
+    """Give each computed tensor a part of its arena that is free as long as it is read."""
+    last: dict[Any, int] = {}
+    for i, stage in enumerate(program.stages):
+        last |= {e.tensor.place: i for e in elements(stage.body)}
+    last |= {t.place: len(program.stages) for t in program.outputs.values()}
+    taken: dict[str, list[tuple[int, int, int]]] = {}
+    for i, stage in enumerate(program.stages):
+        place = stage.result.place
+        arena = arena_of(place.dtype)
+        live = sorted((a, b) for a, b, until in taken.get(arena, []) if until >= i)
+        start = 0
+        for a, b in live:
+            if start + place.size <= a:
+                break
+            start = max(start, b)
+        place.offset = start
+        taken.setdefault(arena, []).append((start, start + place.size, last[place]))
+        program.arenas[arena] = max(program.arenas.get(arena, 0), start + place.size)
+
+
+__all__ = ["Index", "Place", "Program", "Stage", "arena_of", "children", "elements", "every", "program_of"]

@@ -1,0 +1,28 @@
+"""C: a header that a C compiler makes a library of, with all warnings as errors."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from functools import partial
+
+from converters.files.children.python import child_command
+from converters.runtimes.base import Runtime, RuntimeInfo
+
+#: In the order in which they are looked for.
+COMPILERS = ("gcc", "clang")
+_HOW = "sudo apt-get install gcc" if os.name == "posix" else "gcc or clang on Linux or macOS"
+
+
+def compiler() -> str | None:
+    """The path of the first compiler that is here."""
+    return next((found for found in map(shutil.which, COMPILERS) if found), None)
+
+
+def _find() -> RuntimeInfo:
+    here = compiler() if os.name == "posix" else None
+    return RuntimeInfo("c", here is not None, None, _HOW, supported=os.name == "posix")
+
+
+#: Its child gives up the network, and writing outside a folder, by itself: the compiler is a process that it starts.
+RUNTIMES = (Runtime("c", _find, partial(child_command, "converters.runtimes.c.child"), automatic=True, confined=False),)

@@ -1,0 +1,167 @@
+"""C in its own process: ``python -m converters.runtimes.c.child``.
+
+Two processes: one compiles headers, and may start the compiler; this one loads the libraries that come of it, and may
+start nothing. Neither writes outside of a folder of their own, and neither reaches a network.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from converters.files.children import confinement
+from converters.files.children.child import Model, claim_stdout, serve
+from converters.files.children.frames import Tensors
+from converters.formats.c.artifact import held
+from converters.formats.c.contract import Field, Header, header_of
+from converters.runtimes.c import compiler
+from signatures.contract import parse
+from signatures.errors import ExportModelError
+
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
+_C_DTYPES = {"bool": "int32"}
+
+
+class CompileError(Exception):
+    """The compiler's own words."""
+
+
+def driver(header: Header) -> str:
+    """A source file that calls a header's functions row by row, for whatever is fed under the policy's names."""
+    p = header.prefix
+    state = [header.state] if header.state else []
+    fed = [f"input.{f.name}" for f in header.inputs] + [f"memory.{f.name}" for f in (*header.noise, *state)]
+    given = [f"output.{f.name}" for f in header.outputs]
+    given += [f"memory.{header.state.name}"] if header.state and header.next_state else []
+    copies = [f"memcpy(&{n}, (const char *)in[{i}] + row * sizeof {n}, sizeof {n});" for i, n in enumerate(fed)]
+    answers = [f"memcpy((char *)out[{i}] + row * sizeof {n}, &{n}, sizeof {n});" for i, n in enumerate(given)]
+    lines = "\n        ".join([*copies, f"{p}_compute(&input, &memory, &output);", *answers])
+    return (
+        f'#define {p.upper()}_IMPLEMENTATION\n#define {p.upper()}_SELFTEST\n#include "policy.h"\n#include <stddef.h>\n'
+        f"static {p}_memory memory;\nvoid judge_reset(uint64_t seed);\nint judge_selftest(void);\n"
+        f"void judge(size_t rows, const void *const *in, void *const *out);\n"
+        f"void judge_reset(uint64_t seed) {{ {p}_reset(&memory, seed); }}\n"
+        f"int judge_selftest(void) {{ return {p}_selftest(&memory); }}\n"
+        f"void judge(size_t rows, const void *const *in, void *const *out)\n{{\n    static {p}_input input;\n"
+        f"    static {p}_output output;\n    (void)in;\n    (void)out;\n"
+        f"    for (size_t row = 0; row < rows; row++) {{\n        {lines}\n    }}\n}}\n"
+    )
+
+
+class _Library:
+    def __init__(self, path: Path, seed: int, build: _Builder) -> None:
+        text = held(path)
+        if text is None:
+            raise ValueError(f"{path.name} has no contract")
+        self.header = header_of(path.stem, parse(json.loads(text)).signature)
+        self.library = ctypes.CDLL(str(build(driver(self.header), path)))
+        if wrong := self.library.judge_selftest():
+            raise ValueError(f"its self test finds {wrong} wrong numbers")
+        self.library.judge_reset(ctypes.c_uint64(seed))
+
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        header = self.header
+        state = [header.state] if header.state else []
+        after = [header.next_state] if header.state and header.next_state else []
+        batched = [f.spec.name for f in (*header.inputs, *header.noise, *state) if f.spec.batched]
+        rows = max((len(feeds[n]) for n in batched if n in feeds), default=1)
+        fed = [_as_c(f, feeds.get(f.spec.name), rows) for f in (*header.inputs, *header.noise, *state)]
+        outputs = (*header.outputs, *after)
+        made = [np.zeros((rows, f.size), _C_DTYPES.get(f.spec.dtype, f.spec.dtype)) for f in outputs]
+        pointers = [(ctypes.c_void_p * max(1, len(a)))(*(x.ctypes.data for x in a)) for a in (fed, made)]
+        self.library.judge(ctypes.c_size_t(rows), *pointers)
+        found = {f.spec.name: _as_declared(f, a, rows) for f, a in zip(outputs, made, strict=True)}
+        return {name: found[name] for name in fetch}
+
+
+def _as_declared(field: Field, array: np.ndarray, rows: int) -> np.ndarray:
+    """An answer in the dtype and shape of the contract."""
+    lengths = tuple(n or 1 for n in field.spec.shape)
+    if field.spec.batched:
+        lengths = (rows, *lengths[1:])
+    declared = (array if field.spec.batched else array[-1]).astype(field.spec.dtype)
+    return np.asarray(declared.reshape(lengths))
+
+
+def _as_c(field: Field, array: np.ndarray | None, rows: int) -> np.ndarray:
+    """What is fed, row by row; zeros where nothing is."""
+    kind = _C_DTYPES.get(field.spec.dtype, field.spec.dtype)
+    if array is None:
+        return np.zeros((rows, field.size), kind)
+    flat = np.asarray(array).astype(kind).reshape(-1, field.size)
+    return np.ascontiguousarray(flat if len(flat) == rows else np.broadcast_to(flat, (rows, field.size)))
+
+
+class _Builder:
+    """The process that compiles: a source goes in, the path of a library or the compiler's words come out."""
+
+    def __init__(self, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:
+        self.folder, self.asked, self.answers, self.count = folder, asked, answers, 0
+
+    def __call__(self, source: str, header: Path) -> Path:
+        self.count += 1
+        file = self.folder / f"{self.count}.c"
+        file.write_text(source, "ascii")
+        shutil.copyfile(header, self.folder / "policy.h")
+        self.asked.write(f"{file}\n".encode())
+        self.asked.flush()
+        answer = json.loads(self.answers.readline())
+        if answer["rc"]:
+            raise CompileError(answer["said"][:2000])
+        return file.with_suffix(".so")
+
+
+def _compile(program: str, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:
+    """Compile what is asked for until nobody asks."""
+    for line in asked:
+        file = Path(line.decode().strip())
+        command = [program, *FLAGS, "-o", str(file.with_suffix(".so")), str(file), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+        answers.write(json.dumps({"rc": done.returncode, "said": done.stderr}).encode() + b"\n")
+        answers.flush()
+
+
+def main() -> None:
+    """Entry of the child process."""
+    program = compiler()
+    assert program is not None
+    folder = Path(tempfile.mkdtemp(prefix="export-model-c-"))
+    os.environ["TMPDIR"] = str(folder)
+    (ask_out, ask_in), (answer_out, answer_in) = os.pipe(), os.pipe()
+    if os.fork() == 0:
+        for end in (ask_in, answer_out, 0, 1):
+            os.close(end)
+        os.dup(os.open(os.devnull, os.O_RDWR))
+        if (worker := os.fork()) == 0:
+            confinement.confine(str(folder), starts=True)
+            _compile(program, folder, os.fdopen(ask_out, "rb"), os.fdopen(answer_in, "wb"))
+            os._exit(0)
+        os.waitpid(worker, 0)  # it ends when nobody asks any more; it may not remove its own folder
+        shutil.rmtree(folder, ignore_errors=True)
+        os._exit(0)
+    os.close(ask_out)
+    os.close(answer_in)
+    build = _Builder(folder, os.fdopen(ask_in, "wb"), os.fdopen(answer_out, "rb"))
+    confinement.confine(str(folder))
+    out = claim_stdout()
+
+    def load(header: Mapping[str, Any]) -> Model:
+        seed = header.get("seed")
+        return _Library(Path(header["path"]), int.from_bytes(os.urandom(8), "little") if seed is None else seed, build)
+
+    serve("c", Path(program).name, load, (CompileError, ExportModelError), out)
+
+
+if __name__ == "__main__":
+    main()
+    sys.exit()

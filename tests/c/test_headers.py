@@ -1,0 +1,158 @@
+"""Policies as C headers, compiled with all warnings as errors: they act as their sources do."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.formats.c.contract import answers
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
+from converters.graph.nodes import Graph, Node
+from converters.graph.types import FLOAT32
+from converters.runtimes.c.child import FLAGS
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import available_runtimes
+from exporter.api import verify_bundle
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
+from fixtures import FIXTURES, path
+from signatures.errors import UnsupportedOpError
+from tests import known
+from tests.conftest import Chosen
+from tests.graph.harness import policy_of
+
+pytestmark = pytest.mark.xdist_group("c")
+
+
+@pytest.fixture(scope="module")
+def here(processes: RuntimePool) -> RuntimePool:
+    (found,) = (i for i in available_runtimes() if i.name == "c")
+    if not found.installed:
+        pytest.skip(f"no C compiler is installed: {found.how}")
+    return processes
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_fixtures_agree(name: str, tmp_path: Path, here: RuntimePool) -> None:
+    for result in export([path(name)], ExportOptions(tmp_path, ("bytes", "c"), verify=("c",)), pool=here):
+        report = result.report
+        assert report is not None
+        assert report.passed is True, "\n".join(failure_lines(report))
+        compared = {c.output for c in report.comparisons if c.runtime == "c"}
+        assert compared >= set(answers(result.policy.signature))
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("source", known.params(known.sources()))
+def test_every_policy_that_has_loops_acts_alike(
+    source: Path, tmp_path: Path, here: RuntimePool, is_new: Chosen
+) -> None:
+    policies = known.policies_or_skip(source)
+    try:
+        for policy in policies:
+            WRITTEN["c"].artifact(policy, WriteOptions("{}"))
+    except UnsupportedOpError as error:
+        pytest.skip(str(error))
+    if not is_new("c", policies):  # type: ignore[call-arg, arg-type]
+        return
+    for result in export([source], ExportOptions(tmp_path, ("c",), verify=("c",)), pool=here):
+        assert result.report is not None
+        assert result.report.passed is True, "\n".join(failure_lines(result.report))
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_the_same_policy_gives_the_same_bytes(name: str) -> None:
+    def written() -> list[bytes]:
+        artefacts = [WRITTEN["c"].artifact(p, WriteOptions("{}")) for p in read_source(path(name)).policies()]
+        return [data.joined() for a in artefacts for data in a.files.values()]
+
+    assert written() == written()
+
+
+def test_an_op_without_loops_is_refused_by_its_name() -> None:
+    draw = Node("draw", "TruncatedNormal", ("shape",), {"dtype": FLOAT32, "seed": 0, "seed2": 0})
+    shape = Node("shape", "Const", value=np.array([1, 2], np.int32))
+    policy = policy_of(Graph((shape, draw)), ["draw"])
+    with pytest.raises(UnsupportedOpError, match=r"'draw' \(TruncatedNormal\) is not written as source code"):
+        WRITTEN["c"].artifact(policy, WriteOptions("{}"))
+
+
+def test_a_header_in_a_bundle_is_not_compiled_again(tmp_path: Path, here: RuntimePool) -> None:
+    """Anyone may have made it: its bytes are compared, and the report says so."""
+    (result,) = export([path("continuous")], ExportOptions(tmp_path, ("bytes", "c"), verify="none"), pool=here)
+    report = verify_bundle(result.folder, allow_unverified=True)
+    assert any("not compiled again: c" in note for note in report.notes)
+    assert "c" not in {c.format for c in report.comparisons}
+
+
+# ------------------------------------------------------------------ as people call it
+
+
+def printed(name: str, main: str, folder: Path) -> list[str]:
+    """What a program that includes a fixture's header prints; every compiler that is here must take it."""
+    (result,) = export([path(name)], ExportOptions(folder / "out", ("c",), verify="none"))
+    source = folder / "main.c"
+    text = f'#define {name.upper()}_IMPLEMENTATION\n#include "{name}.h"\n#include <stdio.h>\n{main}'
+    source.write_text(text)
+    compilers = [found for found in map(shutil.which, ("gcc", "clang")) if found]
+    said = set()
+    for compiler in compilers:
+        flags = [f for f in FLAGS if f not in ("-shared", "-fPIC")]
+        command = [compiler, *flags, "-I", str(result.folder), "-o", str(folder / "main"), str(source), "-lm"]
+        subprocess.run(command, check=True)
+        said.add(subprocess.run([str(folder / "main")], check=True, capture_output=True, text=True).stdout)
+    (only,) = said
+    return only.split()
+
+
+def test_draws_are_those_of_the_seed(tmp_path: Path, here: RuntimePool) -> None:
+    main = """
+int main(void)
+{
+    static continuous_memory memory;
+    continuous_input input = {{0}};
+    continuous_output output;
+    for (uint64_t seed = 0; seed < 6; seed++) {
+        continuous_reset(&memory, seed / 2);
+        continuous_act(&input, &memory, &output);
+        printf("%.9g\\n", (double)memory.epsilon[0]);
+    }
+    return 0;
+}
+"""
+    drawn = printed("continuous", main, tmp_path)
+    assert drawn[0::2] == drawn[1::2]
+    assert len(set(drawn)) == 3
+
+
+def test_classes_are_drawn_by_their_probabilities(tmp_path: Path, here: RuntimePool) -> None:
+    """4000 draws of the first branch: no class is farther off than five standard deviations."""
+    main = """
+int main(void)
+{
+    static discrete_memory memory;
+    discrete_input input = {{0}, {0}};
+    discrete_output output;
+    int32_t action[8];
+    int counts[8] = {0};
+    for (int i = 0; i < (int)(sizeof input.action_masks / sizeof input.action_masks[0]); i++) input.action_masks[i] = 1;
+    discrete_reset(&memory, 3);
+    discrete_act(&input, &memory, &output);
+    for (int i = 0; i < 4000; i++) {
+        discrete_choose(&memory, &output, action);
+        counts[action[0]]++;
+    }
+    for (int i = 0; i < 2; i++) printf("%d %.9g ", counts[i], (double)expf(output.action[i]));
+    return 0;
+}
+"""
+    numbers = [float(word) for word in printed("discrete", main, tmp_path)]
+    for count, share in zip(numbers[0::2], numbers[1::2], strict=True):
+        assert abs(count - 4000 * share) <= 5 * (4000 * share * (1 - share)) ** 0.5 + 1
