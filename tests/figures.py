@@ -87,7 +87,7 @@ class Cell:
         place[key] = max(place.get(key, 0.0), comparison.max_abs_diff)
         self.elements = added([self.elements, comparison.histogram])
 
-    def by_decade(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         return {
             "policies": len(self.policies),
             "comparisons": self.comparisons,
@@ -193,7 +193,8 @@ def page(content: Mapping[str, Any]) -> str:
         "",
         f"Measured on {content['date']} by `python -m tests.figures`: {content['files']} frozen graphs, which are "
         f"{sum(origins.values())} policies ({origins.get('genuine', 0)} written by the trainers of "
-        f"ML-Agents 0.3 to 0.22, {origins.get('corpus', 0)} from public repositories), each exported to four "
+        f"ML-Agents 0.3 to 0.22, with the random weights that training begins with, and "
+        f"{origins.get('corpus', 0)} trained ones from public repositories), each exported to four "
         f"formats and run in {len(order)} independent runtimes. {comparisons:,} comparisons, {failures} failures. "
         "The reference is TensorFlow running the original file; what is fed, and what counts as agreement, is in "
         "[agreement.md](agreement.md).",

@@ -6,6 +6,7 @@ import json
 
 from tests import figures
 from tests.commands import ROOT
+from tests.reports.made import comparison
 
 CONTENT = json.loads(figures.FIGURES.read_text(encoding="utf-8"))
 INDEX = (ROOT / "docs/index.md").read_text(encoding="utf-8")
@@ -13,6 +14,12 @@ INDEX = (ROOT / "docs/index.md").read_text(encoding="utf-8")
 
 def test_the_page_is_that_of_the_figures() -> None:
     assert figures.PAGE.read_text(encoding="utf-8") == figures.page(CONTENT)
+
+
+def test_what_is_measured_is_what_the_page_reads() -> None:
+    cell = figures.Cell()
+    cell.add("3DBall", comparison("onnx", "onnxruntime"))
+    assert set(CONTENT["cells"][0]) - {"kind", "format", "runtime"} == set(cell.to_dict())
 
 
 def test_no_policy_acts_otherwise_under_a_profile() -> None:
