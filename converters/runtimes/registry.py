@@ -7,13 +7,13 @@ whether it is here, how its child is started and how it is installed; and its na
 
 from __future__ import annotations
 
-from converters.runtimes import c, javascript, js, litert, numpy, onnxruntime, tensorflow, tensorflow1
+from converters.runtimes import c, javascript, js, litert, numpy, onnxruntime, openvino, tensorflow, tensorflow1
 from converters.runtimes.base import Runtime, RuntimeInfo
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 
 #: In the order in which they are reported.
-_FAMILIES = (numpy, tensorflow, tensorflow1, onnxruntime, javascript, js, litert, c)
+_FAMILIES = (numpy, tensorflow, tensorflow1, onnxruntime, javascript, js, litert, c, openvino)
 RUNTIMES: tuple[Runtime, ...] = tuple(runtime for family in _FAMILIES for runtime in family.RUNTIMES)
 
 

@@ -38,6 +38,6 @@ FORMATS = (
         vetted=_vetted.vetted,
         inner=_artifact.inner,
         origins=_artifact.origins,
-        runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium"),
+        runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium", "openvino"),
     ),
 )
