@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from converters.formats.c.contract import answers
+from converters.formats.c.text import comment
 from converters.formats.format import WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node
 from converters.graph.types import FLOAT32
+from converters.runtimes.c import COMPILERS
 from converters.runtimes.c.child import FLAGS
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
@@ -90,6 +93,16 @@ def test_a_header_in_a_bundle_is_not_compiled_again(tmp_path: Path, here: Runtim
     report = verify_bundle(result.folder, allow_unverified=True)
     assert any("not compiled again: c" in note for note in report.notes)
     assert "c" not in {c.format for c in report.comparisons}
+
+
+def test_no_name_of_a_source_leaves_its_comment(tmp_path: Path, here: RuntimePool) -> None:
+    """What stands behind a comment's end would be code of whoever made the policy."""
+    pieces = ("*", "/", "\\", "\n", "??/", "\r", "#error left\n", "é", " ")
+    names = ["".join(word) for length in (2, 3, 4) for word in itertools.product(pieces, repeat=length)]
+    source = tmp_path / "names.c"
+    source.write_text("".join(f"{comment(name)}\n" for name in names) + "int nothing;\n", "ascii")
+    for compiler in filter(None, map(shutil.which, COMPILERS)):
+        subprocess.run([compiler, "-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", source], check=True)
 
 
 # ------------------------------------------------------------------ as people call it

@@ -65,6 +65,15 @@ def literal(value: float, dtype: np.dtype) -> str:
     return f"(-{-whole - 1} - 1)" if whole < -(2**31) + 1 else f"({whole})" if whole < 0 else str(whole)
 
 
+def comment(text: str) -> str:
+    """Return a text as a comment that it cannot leave: a source's names are a stranger's.
+
+    A ``*`` and a ``/`` on two lines end a comment, too, where a backslash, or C99's ``??/`` for it, joins the lines.
+    """
+    safe = re.sub(r"[^ -~]|[\\?]", "_", text).replace("*/", "* /").replace("/*", "/ *")
+    return f"/* {safe} */"
+
+
 class Printer:
     """The functions of a program in the making; ``prefix`` begins every name of file scope."""
 
@@ -126,8 +135,7 @@ class Printer:
         self._lines.append("    " * self._depth + line)
 
     def _stage(self, stage: Stage) -> None:
-        about = stage.about.encode("ascii", "replace").decode().replace("*/", "* /").replace("/*", "/ *")
-        self._say(f"/* {about[:200]} */")
+        self._say(comment(stage.about[:200]))
         self._part(stage, stage.body, {})
 
     def _part(self, stage: Stage, body: Expression, bounds: dict[str, tuple[int, int]]) -> None:
