@@ -9,13 +9,13 @@ PYTEST := $(BIN)/python -m pytest
 # Where the machine forbids it, each of hundreds of processes would compile all modules anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install browser demo check test lint types docs figures pictures bench fuzz train clean help
+.PHONY: install browser compiler demo check test lint types docs figures pictures bench fuzz train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
 	@echo "make demo      two trained policies in four formats, compared in every runtime, with a report to look at"
 	@echo "make check     lint, types and the tests that start no runtime: two minutes, for the daily loop"
-	@echo "make test      lint, types and all tests (installs Chromium where apt-get can, for those in a browser)"
+	@echo "make test      lint, types and all tests (installs Chromium and gcc where apt-get can)"
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes), and docs/consumers.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
@@ -33,17 +33,20 @@ $(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json $(TESTS_JS)/pac
 	cd $(TESTS_JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	@touch $(STAMP)
 
-# Without it the tests in a browser are skipped, so a Debian machine that may install it does.
-APT_CHROMIUM := apt-get update -qq && \
-	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null
+# Without them the tests in a browser, and those of C headers, are skipped, so a Debian machine that may install them does.
+APT := apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends
+# $(1): commands of which one is enough; $(2): Debian's packages; $(3): what is skipped without
+define needed
+	@for name in $(1); do if command -v "$$name" >/dev/null; then exit 0; fi; done; \
+	if ! command -v apt-get >/dev/null; then echo "none of $(1) here: $(3) will be skipped"; \
+	elif [ "$$(id -u)" = 0 ]; then $(APT) $(2) >/dev/null; \
+	elif command -v sudo >/dev/null; then sudo sh -c '$(APT) $(2) >/dev/null'; \
+	else echo "none of $(1) here, and no right to install it: $(3) will be skipped"; fi
+endef
 browser:
-	@for name in "$$EXPORT_MODEL_CHROMIUM" chromium chromium-browser google-chrome google-chrome-stable; do \
-	  if command -v "$$name" >/dev/null; then exit 0; fi; \
-	done; \
-	if ! command -v apt-get >/dev/null; then echo "no Chromium here: the tests in a browser will be skipped"; \
-	elif [ "$$(id -u)" = 0 ]; then $(APT_CHROMIUM); \
-	elif command -v sudo >/dev/null; then sudo sh -c '$(APT_CHROMIUM)'; \
-	else echo "no Chromium, and no right to install it: the tests in a browser will be skipped"; fi
+	$(call needed,"$$EXPORT_MODEL_CHROMIUM" chromium chromium-browser google-chrome google-chrome-stable,chromium,the tests in a browser)
+compiler: browser # one apt-get at a time
+	$(call needed,gcc clang,gcc libc6-dev,the tests of C headers)
 
 # The first is a folder that training left, the second has an LSTM memory, which every runtime is fed back.
 OUT := exported
@@ -67,7 +70,7 @@ check: lint types
 	EXPORT_MODEL_TEST_DAILY=1 $(PYTEST) -n 2 --dist worksteal -q -m "$(DAILY)"
 
 test: install
-	$(MAKE) --jobs 2 browser lint types # one fetches, the others compute
+	$(MAKE) --jobs 2 browser compiler lint types # one fetches, the others compute
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90 --durations=25
 
 docs: install
