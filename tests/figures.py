@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.runtimes.pool import RuntimePool
+from converters.runtimes.pool import INDEPENDENT, RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.difference import added, by_decade
@@ -174,14 +174,20 @@ def _table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str
     return [_row(head), "|" + "---|" * len(head), *map(_row, rows), ""]
 
 
+def counted(content: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (comparisons, failures) in independent runtimes, which the front page quotes."""
+    cells = [c for c in content["cells"] if c["runtime"] in INDEPENDENT]
+    return sum(c["comparisons"] for c in cells), sum(c["failures"] for c in cells)
+
+
 def page(content: Mapping[str, Any]) -> str:
     """docs/figures.md."""
     cells = {(c["kind"], c["format"], c["runtime"]): c for c in content["cells"]}
     order = [r for r in content["runtimes"] if r != "numpy"]
     rows = [(f, r) for f in FORMATS for r in order if any((k, f, r) in cells for k in KINDS)]
     kinds = list(content["kinds"])
-    origins, comparisons = content["policies"], sum(c["comparisons"] for c in content["cells"])
-    failures = sum(c["failures"] for c in content["cells"])
+    origins, others = content["policies"], [r for r in order if r in INDEPENDENT]
+    comparisons, failures = counted(content)
     apart: dict[tuple[str, str], float] = {}
     for cell in content["cells"]:
         for output, worst in cell["apart"].items():
@@ -195,7 +201,7 @@ def page(content: Mapping[str, Any]) -> str:
         f"{sum(origins.values())} policies ({origins.get('genuine', 0)} written by the trainers of "
         f"ML-Agents 0.3 to 0.22, with the random weights that training begins with, and "
         f"{origins.get('corpus', 0)} trained ones from public repositories), each exported to four "
-        f"formats and run in {len(order)} independent runtimes. {comparisons:,} comparisons, {failures} failures. "
+        f"formats and run in {len(others)} independent runtimes. {comparisons:,} comparisons, {failures} failures. "
         "The reference is TensorFlow running the original file; what is fed, and what counts as agreement, is in "
         "[agreement.md](agreement.md).",
         "",
