@@ -313,7 +313,7 @@ def main() -> int:
         if not files or not SHARED.is_dir():
             print("not measured: ../shared is not beside this checkout")
             return 0
-        automatic = {r.name for r in RUNTIMES if r.automatic or options.browsers}
+        automatic = {r.name for r in RUNTIMES if r.taken_by == "auto" or (options.browsers and r.browser)}
         content = figures(files, [i.name for i in available_runtimes() if i.installed and i.name in automatic])
         if options.only:
             print(page(content))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from signatures.records import dataclass
 
@@ -49,7 +49,9 @@ class Runtime:
     sessions_alike: bool = False
     #: Multiplications that a policy's products take a second on one core, about (measured).
     products_per_second: float = 1e9
-    #: ``auto`` takes it where it is installed; a browser and js are started only on request.
-    automatic: bool = True
+    #: The word that takes it: ``auto`` where it is installed, ``full``, or its own name alone.
+    taken_by: Literal["auto", "full", "name"] = "auto"
+    #: It runs in a browser (the word ``browser``).
+    browser: bool = False
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.
     confined: bool = True

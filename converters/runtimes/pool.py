@@ -15,8 +15,11 @@ INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
 #: Runtimes that read originals by themselves.
 _ORIGINALS = tuple(r.name for r in RUNTIMES if r.originals)
 #: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for, and js shows little beside others.
-_ON_REQUEST = frozenset(r.name for r in RUNTIMES if not r.automatic)
-#: Runtimes that have a sandbox of their own: browsers.
+_ON_REQUEST = frozenset(r.name for r in RUNTIMES if r.taken_by != "auto")
+#: Runtimes that no word takes.
+_BY_NAME = frozenset(r.name for r in RUNTIMES if r.taken_by == "name")
+_IN_BROWSERS = frozenset(r.name for r in RUNTIMES if r.browser)
+#: Runtimes that are not confined here: browsers have a sandbox of their own, and a compiler's process confines itself.
 _FREE = frozenset(r.name for r in RUNTIMES if not r.confined)
 _COMMANDS: Mapping[str, Callable[[], list[str]]] = {r.name: r.command for r in RUNTIMES}
 
@@ -27,8 +30,8 @@ def chosen_runtimes(
     """(runtimes to use, what is known of all of them) for ``none``, or names, or words that stand for several.
 
     ``auto`` are those that are installed and fit the formats, without a browser's; ``browser`` those in a browser;
-    ``full`` all that this system can have. Raises UsageError on a name that is none, RuntimeUnavailableError when one
-    that was asked for is not installed.
+    ``full`` all that fit the formats and this system can have, but those that no word takes. Raises UsageError on a
+    name that is none, RuntimeUnavailableError when one that was asked for is not installed.
     """
     infos = list(available_runtimes())
     known = {info.name: info for info in infos}
@@ -40,8 +43,8 @@ def chosen_runtimes(
         return automatic, infos
     several = {
         "auto": automatic,
-        "browser": [n for n in known if n in _FREE],
-        "full": [n for n in known if known[n].supported],
+        "browser": [n for n in known if n in _IN_BROWSERS],
+        "full": [n for n in known if known[n].supported and n in useful and n not in _BY_NAME],
     }
     words = [word for word in wanted.split(",") if word] if isinstance(wanted, str) else wanted
     names = [name for word in words for name in several.get(word, (word,))]

@@ -40,7 +40,7 @@ def installed_runtimes() -> list[str]:
     """The runtimes of this machine, browsers apart. Asked in another process: this one has to stay small."""
     program = (
         "import json; from converters.runtimes.registry import RUNTIMES;"
-        "print(json.dumps([r.name for r in RUNTIMES if r.automatic and r.find().installed]))"
+        "print(json.dumps([r.name for r in RUNTIMES if r.taken_by == 'auto' and r.find().installed]))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     names: list[str] = json.loads(done.stdout)

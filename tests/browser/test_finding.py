@@ -110,5 +110,6 @@ def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 def test_a_browser_is_started_only_on_request() -> None:
-    assert not WEBGL.automatic
+    assert WEBGL.taken_by == "full"
+    assert WEBGL.browser
     assert WEBGL.independent

@@ -25,4 +25,4 @@ def _find() -> RuntimeInfo:
 
 
 #: Its child gives up the network, and writing outside a folder, by itself: the compiler is a process that it starts.
-RUNTIMES = (Runtime("c", _find, partial(child_command, "converters.runtimes.c.child"), automatic=True, confined=False),)
+RUNTIMES = (Runtime("c", _find, partial(child_command, "converters.runtimes.c.child"), confined=False),)

@@ -96,7 +96,8 @@ def _runtime(name: str, kind: str, *packages: str, arithmetic: Arithmetic = "pro
     find, command = partial(_find, name, packages), partial(_command, name)
     return Runtime(
         *(name, find, command, install_packages),
-        automatic=False,
+        taken_by="full",
+        browser=True,
         confined=False,
         arithmetic=arithmetic,
         sessions_alike=kind == "onnx",

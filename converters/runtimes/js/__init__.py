@@ -31,6 +31,6 @@ RUNTIMES = (
         *("js", _find, _command),
         independent=False,
         products_per_second=2e8,
-        automatic=False,
+        taken_by="full",
     ),
 )

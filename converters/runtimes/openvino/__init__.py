@@ -8,7 +8,7 @@ DISTRIBUTIONS = ("openvino", "openvino-nightly")
 RUNTIMES = (
     replace(
         package_runtime("openvino", "pip install 'export-model[openvino]'", DISTRIBUTIONS),
-        automatic=False,
+        taken_by="name",
         arithmetic="compiled",
     ),
 )
