@@ -41,7 +41,7 @@ def test_a_nn_exports_to_four_formats_that_agree(
     )
     assert result.report is not None
     assert result.report.passed is True, "\n".join(failure_lines(result.report))
-    assert {c.runtime for c in result.report.comparisons} == {"numpy", *runtimes}
+    assert {c.runtime for c in result.report.comparisons} == set(runtimes)  # numpy would be held against itself
     assert {c.format for c in result.report.comparisons} >= formats_in(runtimes)
     assert not result.report.reference.startswith("source/")
 
