@@ -72,6 +72,6 @@ def test_both_are_looked_into_by_their_files(tmp_path: Path, monkeypatch: pytest
         return found
 
     monkeypatch.setattr(Mapped, "read", noted)
-    (result,) = export_model(fixture("continuous"), tmp_path, verify="numpy,onnxruntime")
+    (result,) = export_model(fixture("continuous"), tmp_path, verify="tensorflow,onnxruntime")
     assert result.passed
     assert seen == {(".onnx", memoryview), (".bytes", memoryview)}

@@ -33,6 +33,7 @@ DEMO = "exporter/demo/3DBall.bytes"
 LARGEST = 150
 #: Needs Node alone, which is beside the environment or not.
 NODES = ["js"] if shutil.which("node") else []
+COMPILERS = ["c"] if any(map(shutil.which, ("gcc", "clang"))) else []
 #: Python's own, in every environment that has pip.
 NOT_OURS = {"pip", "setuptools"}
 
@@ -183,7 +184,7 @@ def test_the_runtimes_are_listed_with_what_installs_them(installed: Installed) -
     done = installed.run("export-model", "runtimes", "--json")
     assert done.returncode == 0, done.stderr
     found = {r["name"]: r for r in json.loads(done.stdout)["runtimes"]}
-    assert [name for name, r in found.items() if r["installed"]] == ["numpy", *NODES]
+    assert [name for name, r in found.items() if r["installed"]] == ["numpy", *NODES, *COMPILERS]
     assert "export-model[tensorflow]" in found["tensorflow"]["install"]
     assert "export-model[onnxruntime]" in found["onnxruntime"]["install"]
     assert "export-model runtimes install tfjs" in found["tfjs-cpu"]["install"]
