@@ -21,7 +21,6 @@ from converters.graph.ops.base import (
     Lower,
     OnnxBuilder,
     OpDef,
-    bounded,
     broadcast_of,
     chain,
     direct,
@@ -35,7 +34,7 @@ from converters.graph.ops.litert.base import builtin, steps
 from converters.graph.ops.loops import elementwise as loops
 from converters.graph.ops.loops.base import elementwise, simple
 from converters.graph.ops.older import clip, leaky_relu
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64, Symbols, TensorType
+from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
 
 T = type_attr()
 
@@ -195,21 +194,6 @@ def _lower_add_n(node: Node, builder: OnnxBuilder) -> Any:
     return value
 
 
-def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
-    kind = builder.type_of(node.inputs[0])
-    zero = builder.const(np.zeros((), kind.dtype), "zero")
-    if not builder.reads("Expand") and kind.dtype == FLOAT32:
-        return builder.emit("Mul", [bounded(builder, builder.value(node.inputs[0]), kind), zero])
-    shape = builder.emit("Shape", [builder.value(node.inputs[0])])
-    return builder.emit("Expand", [zero, shape])
-
-
-def _lower_ones_like(node: Node, builder: OnnxBuilder) -> Any:
-    dtype = builder.type_of(node.inputs[0]).dtype
-    shape = builder.emit("Shape", [builder.value(node.inputs[0])])
-    return builder.emit("Expand", [builder.const(np.ones((), dtype), "one"), shape])
-
-
 def _tfjs_softsign(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
     """TensorFlow.js 4.22 has no Softsign."""
     size = builder.add("Abs", [node.inputs[0]], f"{node.name}/abs")
@@ -360,24 +344,6 @@ UNARY = (
         litert=litert.cast,
         precision="exact",
         elementwise=True,
-    ),
-    _unary(
-        "ZerosLike",
-        lambda node, x: np.zeros_like(x),
-        _lower_zeros_like,
-        precision="exact",
-        full_of=0,
-        loops=loops.full_of(0),
-        litert=litert.full_like(0),
-    ),
-    _unary(
-        "OnesLike",
-        lambda node, x: np.ones_like(x),
-        _lower_ones_like,
-        precision="exact",
-        full_of=1,
-        loops=loops.full_of(1),
-        litert=litert.full_like(1),
     ),
 )
 

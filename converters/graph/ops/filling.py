@@ -15,21 +15,25 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
+    bounded,
     by_shape,
     constant_input,
     direct,
     inserted,
     not_constant,
     require_constant,
+    same_as,
     shape_error,
     type_attr,
     unsqueezed,
 )
 from converters.graph.ops.litert import arrays as litert
 from converters.graph.ops.litert.base import builtin
+from converters.graph.ops.litert.elementwise import full_like
 from converters.graph.ops.loops import arrays as loops
+from converters.graph.ops.loops.elementwise import full_of
 from converters.graph.ops.older import broadcast_to
-from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
+from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast, product
 
 T = type_attr()
 
@@ -143,6 +147,21 @@ def _tfjs_one_hot(builder: GraphBuilder, node: Node, types: Mapping[str, TensorT
     return Node(node.name, "Add", (product, off), origin=node.origin)
 
 
+def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
+    kind = builder.type_of(node.inputs[0])
+    zero = builder.const(np.zeros((), kind.dtype), "zero")
+    if not builder.reads("Expand") and kind.dtype == FLOAT32:
+        return builder.emit("Mul", [bounded(builder, builder.value(node.inputs[0]), kind), zero])
+    shape = builder.emit("Shape", [builder.value(node.inputs[0])])
+    return builder.emit("Expand", [zero, shape])
+
+
+def _lower_ones_like(node: Node, builder: OnnxBuilder) -> Any:
+    dtype = builder.type_of(node.inputs[0]).dtype
+    shape = builder.emit("Shape", [builder.value(node.inputs[0])])
+    return builder.emit("Expand", [builder.const(np.ones((), dtype), "one"), shape])
+
+
 OPS = (
     OpDef(
         "Fill",
@@ -185,5 +204,29 @@ OPS = (
         precision="exact",
         looks_up=0,
         table_size=_depth,
+    ),
+    OpDef(
+        "ZerosLike",
+        same_as(0, count=1),
+        lambda node, x: np.zeros_like(x),
+        _lower_zeros_like,
+        (T,),
+        elementwise=True,
+        precision="exact",
+        full_of=0,
+        loops=full_of(0),
+        litert=full_like(0),
+    ),
+    OpDef(
+        "OnesLike",
+        same_as(0, count=1),
+        lambda node, x: np.ones_like(x),
+        _lower_ones_like,
+        (T,),
+        elementwise=True,
+        precision="exact",
+        full_of=1,
+        loops=full_of(1),
+        litert=full_like(1),
     ),
 )
