@@ -55,8 +55,8 @@ SCENES = (
     Scene("tennis", "Tennis", 5, continuous=1, side="right"),
     Scene("crawler2d", "Crawler2D", 26, continuous=8),
 )
-"""The environments of fixtures/environments: after examples of ML-Agents, but for Crawler2D. That is no example's name
-or shape, so that a policy of ML-Agents' Crawler, which another physics made, does not end here.
+"""The environments of exporter/play/environments: after examples of ML-Agents, but for Crawler2D. That is the name and
+shape of no example, so that a policy of ML-Agents' Crawler, which another physics made, does not end here.
 """
 
 

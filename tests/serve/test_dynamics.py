@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from converters.runtimes.javascript.node import INSTALL_NODE, node_executable
+from exporter.play.environments import ENVIRONMENTS
 from exporter.serve.site import PAGE
-from fixtures.environments import ENVIRONMENTS
 
 AGENTS, STEPS = 5, 400
 #: How many continuous actions.

@@ -12,9 +12,9 @@ import pytest
 
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model
+from exporter.play.environments import ENVIRONMENTS
+from exporter.play.environments.tennis import BRAINS
 from fixtures import trained
-from fixtures.environments import ENVIRONMENTS
-from fixtures.environments.tennis import BRAINS
 from fixtures.evaluate import Contract, Decide, Player, Score, play, together
 from fixtures.trained.scores import EPISODES, SEED
 

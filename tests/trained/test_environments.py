@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fixtures.environments import (
+from exporter.play.environments import (
     ENVIRONMENTS,
     Ball3D,
     Crawler2D,
@@ -23,7 +23,7 @@ from fixtures.environments import (
     gridworld,
     tennis,
 )
-from fixtures.environments.base import Environment, Streams
+from exporter.play.environments.base import Environment, Streams
 from fixtures.evaluate import play, together
 
 Array = np.ndarray[Any, Any]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from exporter.play.environments import ENVIRONMENTS
 from fixtures import trained
-from fixtures.environments import ENVIRONMENTS
 from fixtures.evaluate import Player, Score, play
 from fixtures.goldens import read_npz
 from fixtures.trained import TRAINED, weights_file

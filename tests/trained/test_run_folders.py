@@ -14,8 +14,8 @@ from converters.formats.frozen_graph.reader import read_graph
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model, inspect_model
 from exporter.demo import BALL
+from exporter.play.environments import ENVIRONMENTS
 from fixtures import trained
-from fixtures.environments import ENVIRONMENTS
 from fixtures.evaluate import play
 from fixtures.goldens import read_npz
 from fixtures.trained import FOLDER, TRAINED, run_folder, weights_file

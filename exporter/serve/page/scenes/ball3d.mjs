@@ -1,4 +1,4 @@
-/** 3DBall: keep a ball on a platform that can be tilted about two axes. The same as fixtures/environments/ball3d.py. */
+/** 3DBall: keep a ball on a platform that can be tilted about two axes. The same as exporter/play/environments/ball3d.py. */
 
 import { Environment, chance, clip, pairs } from "./base.mjs";
 

@@ -1,5 +1,5 @@
 /**
- * What the environments have in common; fixtures/environments/base.py in JavaScript, the same lives for the same seed.
+ * What the environments have in common; exporter/play/environments/base.py in JavaScript, the same lives for the same seed.
  *
  * Numbers are doubles, as in numpy; what an agent sees is rounded to float32 last. `step` resets the agents whose
  * episode ended, so the observation it gives is already the first of their next one.

@@ -1,4 +1,4 @@
-/** Crawler2D: walk to the right on four legs, in the plane. The same as fixtures/environments/crawler2d.py. */
+/** Crawler2D: walk to the right on four legs, in the plane. The same as exporter/play/environments/crawler2d.py. */
 
 import { Environment, chance, clip } from "./base.mjs";
 

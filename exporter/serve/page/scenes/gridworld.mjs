@@ -1,4 +1,4 @@
-/** GridWorld: walk to the goal and around the pit. The same as fixtures/environments/gridworld.py. */
+/** GridWorld: walk to the goal and around the pit. The same as exporter/play/environments/gridworld.py. */
 
 import { Environment } from "./base.mjs";
 

@@ -1,6 +1,6 @@
 /**
  * Hallway: a cue at the start says which of two doors at the far end is the right one. It takes memory.
- * The same as fixtures/environments/hallway.py.
+ * The same as exporter/play/environments/hallway.py.
  */
 
 import { Environment } from "./base.mjs";

@@ -1,4 +1,4 @@
-/** Tennis: two brains keep a ball in play. The same as fixtures/environments/tennis.py. */
+/** Tennis: two brains keep a ball in play. The same as exporter/play/environments/tennis.py. */
 
 import { Environment, chance, clip, pairs } from "./base.mjs";
 

@@ -1,0 +1,1 @@
+"""Episodes of an environment, played by every format in every runtime, and how their returns compare."""
