@@ -17,6 +17,8 @@ from typing import Any
 from exporter.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
+#: What Python finds the packages by, as an install in place does.
+PLACES = (ROOT, ROOT / "exporter/public")
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def python(*arguments: object, environment: Mapping[str, str] | None = None, cwd
     done = subprocess.run(
         [sys.executable, *(str(a) for a in arguments)],
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **(environment or {})},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PLACES)), **(environment or {})},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         encoding="utf-8",

@@ -16,7 +16,9 @@ from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, 
 from signatures.fields import printable
 
 if TYPE_CHECKING:
+    from converters.compiler.options import CompileOptions
     from converters.formats.bundle.bundle import Declared
+    from converters.formats.source import ReadOptions
 
 Array = np.ndarray
 #: Runtime → the format that it runs.
@@ -27,28 +29,34 @@ RUNTIMES = tuple(_TAKES)
 def load_policy(
     source: Path | str, *, runtime: str | None = None, seed: int = 0, brain: str | None = None
 ) -> LoadedPolicy:
-    """A policy that acts in this process.
-
-    - ``source``: a bundle, or anything that can be exported (an ``.onnx``, a ``.bytes``, a run's folder): that is
-      converted in memory, and nothing is written. ``brain`` chooses one of several policies in it.
-    - ``runtime``: ``onnxruntime`` (``pip install 'export-model[onnxruntime]'``; of a bundle it needs the ``.onnx``) or
-      ``numpy`` (of a bundle it needs the ``.bytes``; slower). Without it, the first that is there. A
-      bundle's file must be the one that was exported, by its hash.
-    - ``seed`` starts the draws: the same seed gives the same actions.
+    """Load a policy that acts in this process: ``export_model.load``, where ``brain`` chooses one of several policies.
 
     Raises BundleError, RuntimeUnavailableError, UsageError, and for a source what an export would raise::
 
         policy = load_policy("exported/3DBall")
         action = policy.decide(observation, deterministic=True).action
     """
+    from converters.compiler.options import CompileOptions
+
+    return load_as(Path(source), runtime, seed, CompileOptions(brain=brain))
+
+
+def load_as(
+    path: Path, runtime: str | None, seed: int, compiling: CompileOptions, read: ReadOptions | None = None
+) -> LoadedPolicy:
+    """Load the policy of a bundle or a source, read as the options say. A bundle's file is checked by its hash."""
+    from converters.compiler.options import CompileOptions
+    from converters.formats.source import ReadOptions
+
     if runtime not in (None, *RUNTIMES):
         raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
-    path = Path(source)
     if path.is_dir() and (path / POLICY).exists():
-        if brain is not None:
-            raise UsageError(f"brain={brain!r}", why="a bundle holds one policy", fix="leave brain out")
+        if compiling.brain is not None:
+            raise UsageError(f"brain={compiling.brain!r}", why="a bundle holds one policy", fix="leave brain out")
+        if compiling != CompileOptions() or read not in (None, ReadOptions()):
+            raise UsageError("a bundle is loaded as it is", why="read= is for sources", fix="leave read= out")
         return _of_bundle(path, runtime, seed)
-    return _of_source(path, runtime, seed, brain)
+    return _of_source(path, runtime, seed, compiling, read)
 
 
 def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
@@ -83,14 +91,15 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
     return LoadedPolicy(found.name, signature, run, chosen, seed, draws_itself=kept)
 
 
-def _of_source(path: Path, runtime: str | None, seed: int, brain: str | None) -> LoadedPolicy:
+def _of_source(
+    path: Path, runtime: str | None, seed: int, compiling: CompileOptions, read: ReadOptions | None
+) -> LoadedPolicy:
     """A source's only policy, compiled and written in memory."""
-    from converters.compiler.options import CompileOptions
     from converters.formats.format import WriteOptions
     from converters.formats.registry import WRITTEN
     from exporter.export.sources import read_source
 
-    policies = read_source(path).policies(CompileOptions(brain=brain))
+    policies = read_source(path, read).policies(compiling)
     if len(policies) != 1:
         raise UsageError(
             f"{path} holds {len(policies)} policies",

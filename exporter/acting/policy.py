@@ -73,6 +73,12 @@ class LoadedPolicy:
     def __repr__(self) -> str:
         return f"<LoadedPolicy {self.name!r} in {self.runtime}: {self.signature.flow}>"
 
+    def _repr_html_(self) -> str:
+        from exporter.inspect.inspection import port_tables
+        from exporter.reports.markup import notebook
+
+        return notebook(f"{self.name}: a policy in {self.runtime}", *port_tables(self.signature))
+
     def seed(self, seed: int) -> None:
         """Start the draws anew: the same seed gives the same actions for the same inputs, here and in policy.mjs."""
         self._generator = Generator(seed)

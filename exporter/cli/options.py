@@ -129,17 +129,13 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     def collected(
         *args: Any, brain: str | None, inputs: Sequence[str], outputs: Sequence[str], values: Sequence[str], **rest: Any
     ) -> Any:
-        from exporter.export.options import compile_options
+        from exporter.options import ReadOptions, WriteOptions, compile_options
 
-        compiling = compile_options(
-            rest.pop("names", "canonical"),
-            rest.pop("noise", "lift"),
-            bool(rest.pop("deterministic", False)),
-            brain,
-            pairs(inputs, "--input"),
-            pairs(outputs, "--output"),
-            _numbers(values),
+        read = ReadOptions(
+            brain=brain, inputs=pairs(inputs, "--input"), outputs=pairs(outputs, "--output"), values=_numbers(values)
         )
+        write = WriteOptions(**{name: rest.pop(name) for name in ("names", "noise", "deterministic") if name in rest})
+        compiling = compile_options(read, write)
         return command(*args, compiling=compiling, **rest)
 
     for option in (

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import get_args
 
-from converters.compiler.options import CompileOptions, NoiseMode
+from converters.compiler.options import CompileOptions
 from converters.compiler.passes.weights import Storage
 from converters.formats.source import ReadOptions
 from exporter.export.labels import Labels
 from exporter.verify.options import VerifyOptions
 from signatures.errors import UsageError
 from signatures.records import dataclass
-from signatures.roles import Role, parse_role
 
 
 @dataclass(frozen=True)
@@ -38,43 +37,6 @@ class ExportOptions:
     weights: Storage = "float32"
     #: for how many agents the files are (``--batch``; None: for any number)
     batch: int | None = None
-
-
-def _roles(given: Mapping[str, str | Role] | None, flag: str) -> dict[str, Role]:
-    roles: dict[str, Role] = {}
-    for name, role in (given or {}).items():
-        parsed = role if isinstance(role, Role) else parse_role(role)
-        if parsed is None:
-            known = ", ".join(r.value for r in Role)
-            raise UsageError(f"{flag} {name}={role}: there is no such role", fix=f"the roles are {known}")
-        roles[name] = parsed
-    return roles
-
-
-def compile_options(
-    names: str,
-    noise: str,
-    deterministic: bool,
-    brain: str | None,
-    inputs: Mapping[str, str | Role] | None,
-    outputs: Mapping[str, str | Role] | None,
-    values: Mapping[str, float] | None,
-) -> CompileOptions:
-    """What a person says of an export, checked; ``inputs`` and ``outputs`` give roles by name. Raises UsageError."""
-    modes: dict[str, NoiseMode] = {"lift": "lift", "keep": "keep", "zero": "zero"}
-    if names not in ("canonical", "source"):
-        raise UsageError(f"names={names!r}", fix="one of: canonical, source")
-    if noise not in modes:
-        raise UsageError(f"noise={noise!r}", fix="one of: lift, keep, zero")
-    return CompileOptions(
-        names,
-        modes[noise],
-        deterministic,
-        brain,
-        _roles(inputs, "--input"),
-        _roles(outputs, "--output"),
-        dict(values or {}),
-    )
 
 
 def storage(dtype: str, quantize: str | None) -> Storage:

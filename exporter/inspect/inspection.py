@@ -111,7 +111,7 @@ class Inspection:
     def _repr_html_(self) -> str:
         from exporter.reports.markup import notebook
 
-        tables = [t for p in self.policies for t in _tables(p.policy.signature)]
+        tables = [t for p in self.policies for t in port_tables(p.policy.signature)]
         return notebook(f"{self.path}: {self.kind}, {size_text(self.size)}", *tables)
 
     def to_dict(self) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
         layout = f" [{'|'.join(signature.memory.layout)}]" if signature.memory.layout else ""
         facts.append(f"memory {signature.memory.size}{layout}")
     head = f"policy {safe_name(inspected.policy.name)}: {', '.join(facts)}"
-    lines = [paragraph(head, "", "  "), "", "\n\n".join(table(head, rows) for head, rows in _tables(signature))]
+    lines = [paragraph(head, "", "  "), "", "\n\n".join(table(head, rows) for head, rows in port_tables(signature))]
     lines += _reason_lines(inspected.decisions)
     lines += ["", f"parameters: {inspected.parameters:,}"]
     for name, way in inspected.layers.items():
@@ -246,7 +246,7 @@ def _reason_lines(decisions: Sequence[Decision]) -> list[str]:
     return ["", *lines] if lines else []
 
 
-def _tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[list[str]]]]:
+def port_tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[list[str]]]]:
     """Inputs with what to feed, and outputs with what they mean: head and rows of each."""
     fed = [_row(s, _feed(s, signature.preprocess.get(s.name, {}))) for s in signature.inputs]
     meant = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]

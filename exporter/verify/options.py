@@ -28,6 +28,8 @@ class VerifyOptions:
     budget: Mapping[str, int] = field(default_factory=dict)
     #: Formats that an independent runtime must have checked, or ``all`` (``--require``); else nothing is decided.
     require: Sequence[str] = ()
+    #: Where: ``auto``, ``full``, ``browser``, ``none``, or runtimes by name.
+    runtimes: str | Sequence[str] = "auto"
 
     def __post_init__(self) -> None:
         for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):

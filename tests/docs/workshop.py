@@ -19,7 +19,7 @@ from converters.formats.barracuda.vocabulary import Activation, LayerType
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.barracuda.nn_files import Maker, write_nn
-from tests.commands import ROOT
+from tests.commands import PLACES, ROOT
 from tests.docs.blocks import Block
 
 TRAINED = ROOT / "fixtures/trained/3DBall"
@@ -125,7 +125,7 @@ class Workshop:
         return {
             **os.environ,
             "PATH": f"{own}{os.pathsep}{os.environ['PATH']}",
-            "PYTHONPATH": os.pathsep.join(map(str, (NARROW, ROOT) if self.narrow else (ROOT,))),
+            "PYTHONPATH": os.pathsep.join(map(str, (NARROW, *PLACES) if self.narrow else PLACES)),
             "GITHUB_STEP_SUMMARY": str(self.folder / "summary.md"),
             "TF_CPP_MIN_LOG_LEVEL": "3",
             "CUDA_VISIBLE_DEVICES": "-1",

@@ -1,4 +1,4 @@
-"""``from exporter import export_model, inspect_model, verify_bundle``: typed results, the same exceptions."""
+"""``import export_model``, and the functions of ``exporter``: typed results, the same exceptions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import export_model as public
 import exporter
 from exporter import export_model, inspect_model, load_policy, verify_bundle
 from exporter.export.pipeline import ExportResult
@@ -36,6 +37,42 @@ def test_the_package_offers_its_functions_and_its_version() -> None:
     assert set(exporter.__all__) == {"__version__", *functions}
     assert all(hasattr(exporter, name) for name in exporter.__all__)
     assert set(exporter.__all__) <= set(dir(exporter))
+
+
+def test_the_public_module_takes_options_in_groups(tmp_path: Path) -> None:
+    """The same files as with flat keywords."""
+    assert set(dir(public)) == set(public.__all__) and len(dir(public)) <= 12
+    assert all(getattr(public, name) is not None for name in dir(public))
+    read = public.ReadOptions(brain="StrikerBrain", inputs={"StrikerBrain/state": Role.VECTOR})
+    write = public.WriteOptions(names="source", noise="zero", deterministic=True)
+    none = VerifyOptions(runtimes="none")
+    (result,) = public.export(
+        fixture("twobrains"), tmp_path / "a", to=["bytes"], name="S", read=read, write=write, verify=none
+    )
+    export_model(
+        fixture("twobrains"),
+        tmp_path / "b",
+        to="bytes",
+        name="S",
+        brain="StrikerBrain",
+        names="source",
+        noise="zero",
+        deterministic=True,
+        inputs={"StrikerBrain/state": "vector_observation"},
+        verify="none",
+    )
+    first, second = ((tmp_path / place / "S/S.bytes").read_bytes() for place in "ab")
+    assert first == second
+    assert [s.name for s in result.policy.signature.inputs] == ["StrikerBrain/state"]
+    (found,) = public.inspect(fixture("twobrains"), read=read).policies
+    assert found.policy.name == "twobrains-StrikerBrain"
+    assert public.load(fixture("twobrains"), read=read).name == "twobrains-StrikerBrain"
+    judged = VerifyOptions(runtimes="numpy", samples=1)
+    assert public.verify(result.folder, verify=judged, allow_unverified=True).samples == 1
+    report = public.compare(fixture("twobrains"), result.folder, read=read, verify=judged, allow_unverified=True)
+    assert report.passed is None
+    with pytest.raises(UsageError, match="loaded as it is"):
+        public.load(result.folder, read=public.ReadOptions(step=3))
 
 
 def test_an_export_gives_a_list_of_results(tmp_path: Path) -> None:
@@ -226,6 +263,8 @@ def test_a_notebook_shows_tables_of_escaped_text(tmp_path: Path) -> None:
     assert "&lt;b&gt;" in html
     assert html.count("<p>") == html.count('<div class="tex2jax_ignore mathjax_ignore"><p>')  # no name is mathematics
     assert html.count("<tr>") > len(ALL)
+    acting = load_policy(BALL, runtime="numpy")._repr_html_()
+    assert "continuous: a policy in numpy" in acting and "<td>action</td>" in acting
     assert "normalised inside the policy" in inspect_model(BALL)._repr_html_()
 
 

@@ -25,6 +25,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("exporter", "converters", "signatures")
+#: The folder of the package that users import, which stands beside the others where it is installed.
+PUBLIC = "exporter/public/"
 #: Suffixes of what is in the packages beside modules: pages, scripts, schemas, templates of snippets.
 DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl", ".typed"}
 #: The trained policy that comes along, for ``export-model demo``.
@@ -102,9 +104,10 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
         metadata = archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))).decode()
     assert {n.split("/")[0] for n in names} == {
         *PACKAGES,
+        "export_model",
         f"export_model-{__version__}.dist-info",
     }
-    data = {p.relative_to(ROOT).as_posix() for t in PACKAGES for p in files(t, "*") if p.suffix in DATA}
+    data = {in_wheel(p) for t in PACKAGES for p in files(t, "*") if p.suffix in DATA}
     js, templates = "converters/runtimes/javascript/js", "exporter/snippets/templates"
     assert data >= {f"{js}/package.json", f"{js}/package-lock.json", f"{js}/runner.mjs", f"{js}/browser.mjs"}
     assert data >= {"exporter/serve/page/index.html", "exporter/reports/parity.schema.json"}
@@ -118,12 +121,23 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     assert not strays
     with zipfile.ZipFile(wheel) as archive:
         assert archive.getinfo(DEMO).file_size <= 44_000
-    code = {p.relative_to(ROOT).as_posix() for t in PACKAGES for p in files(t, "*.py")}
+    code = {in_wheel(p) for t in PACKAGES for p in files(t, "*.py")}
     assert {n for n in names if n.endswith(".py")} == code
     required = [line for line in metadata.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
     names_required = sorted(re.split(r"[<>=!~;]", line.split()[1])[0] for line in required)
     assert names_required == ["click", "numpy", "onnx", "protobuf"]
     assert any(n.endswith("/licenses/LICENSE") for n in names)
+    shown = metadata.partition("\n\n")[2]
+    targets = re.findall(r"\]\(([^)]+)\)", shown)
+    assert len(targets) > 15
+    assert [t for t in targets if not t.startswith(("https://", "#"))] == []  # a page elsewhere has no files beside it
+    assert "/raw/HEAD/docs/pictures/" in shown and "<!-- test" not in shown
+    assert len(re.findall(r"^Project-URL: ", metadata, re.MULTILINE)) == 4
+
+
+def in_wheel(file: Path) -> str:
+    """The name of a file of the checkout in the wheel."""
+    return file.relative_to(ROOT).as_posix().removeprefix(PUBLIC)
 
 
 def files(package: str, pattern: str) -> Iterator[Path]:
@@ -230,15 +244,30 @@ def test_a_module_starts_it_too(installed: Installed) -> None:
 PROGRAM = """
 from pathlib import Path
 import numpy as np
-from exporter import export_model, inspect_model, load_policy, verify_bundle
+import export_model
+from exporter import load_policy
 
-names: list[str] = [p.policy.name for p in inspect_model("3DBall.bytes").policies]
-(result,) = export_model(Path("3DBall.bytes"), "out", to="onnx,bytes", strict=False)
-passed: bool | None = verify_bundle(result.folder, runtimes=["onnxruntime"]).passed
-shape: tuple[int, ...] = load_policy("out/3DBall").decide(np.zeros(8)).action.shape
+names: list[str] = [p.policy.name for p in export_model.inspect("3DBall.bytes").policies]
+read = export_model.ReadOptions(brain="Ball", inputs={"epsilon": "noise"})
+verify = export_model.VerifyOptions(runtimes=["onnxruntime"], samples=1)
+(result,) = export_model.export(Path("3DBall.bytes"), "out", to="onnx,bytes", read=read, verify=verify, strict=False)
+passed: bool | None = export_model.verify(result.folder, verify="numpy").passed
+shape: tuple[int, ...] = export_model.load("out/3DBall").decide(np.zeros(8)).action.shape
+same: bool = isinstance(load_policy("out/3DBall"), type(export_model.load("out/3DBall")))
+reveal_type(export_model.compare("3DBall.bytes", "theirs.onnx"))
 reveal_type(result.sizes)
-export_model("3DBall.bytes", opset="15")
+export_model.export("3DBall.bytes", write=export_model.WriteOptions(opset="15"))
 """
+
+
+def test_the_public_module_is_found_and_shows_its_names_alone(installed: Installed) -> None:
+    say = "import sys, export_model; print(*dir(export_model)); print({'numpy', 'click', 'onnx'} & {*sys.modules})"
+    done = installed.run("python", "-c", say)
+    assert done.returncode == 0, done.stderr
+    names, heavy = done.stdout.splitlines()
+    assert {"export", "load", "inspect", "verify", "compare", "ReadOptions"} <= set(names.split())
+    assert len(names.split()) <= 12
+    assert heavy == "set()"
 
 
 def test_a_program_that_uses_it_is_checked_by_mypy(installed: Installed) -> None:
@@ -260,5 +289,6 @@ def test_a_program_that_uses_it_is_checked_by_mypy(installed: Installed) -> None
     done = subprocess.run(mypy, cwd=installed.scratch, env=hidden, capture_output=True, encoding="utf-8", check=False)
     errors = [line for line in done.stdout.splitlines() if "error:" in line]
     assert len(errors) == 1, done.stdout
-    assert "program.py:11" in errors[0] and "opset" in errors[0]
+    assert "program.py:16" in errors[0] and "opset" in errors[0]
+    assert "ParityReport" in done.stdout
     assert "Mapping[str, int]" in done.stdout

@@ -1,0 +1,92 @@
+"""How to read a source and how to write its policies, as the Python interface and the command line say it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+
+from converters.compiler.options import CompileOptions, NoiseMode
+from converters.formats import source
+from exporter.export.labels import Labels
+from signatures.errors import UsageError
+from signatures.records import dataclass
+from signatures.roles import Role, parse_role
+
+_NOISE: Mapping[str, NoiseMode] = {"lift": "lift", "keep": "keep", "zero": "zero"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """How to read a source, where it does not say so itself."""
+
+    #: A run's checkpoint (default: the newest).
+    step: int | None = None
+    #: Only this brain of a graph that holds several.
+    brain: str | None = None
+    #: Input name → what it is for; output name → what it means.
+    inputs: Mapping[str, str | Role] = field(default_factory=dict)
+    outputs: Mapping[str, str | Role] = field(default_factory=dict)
+    #: Placeholder → its fixed value.
+    values: Mapping[str, float] = field(default_factory=dict)
+    #: Shapes of the sensors of a ``.pt``, in order, and the places of those that are goals.
+    sensors: Sequence[Sequence[int]] = ()
+    goals: Sequence[int] = ()
+    #: Activation between the layers of a bare ``.pt``.
+    activation: str | None = None
+    #: Let Keras load what is not plain data. It can run code.
+    trust_source: bool = False
+
+    def for_reader(self) -> source.ReadOptions:
+        """Return what a format's reader needs of them."""
+        sensors = tuple(tuple(shape) for shape in self.sensors)
+        return source.ReadOptions(self.step, sensors, self.trust_source, tuple(self.goals), self.activation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteOptions:
+    """How to write a policy."""
+
+    #: ``canonical`` tensor names, or the trainer's own: ``source``.
+    names: str = "canonical"
+    #: Noise drawn in the graph becomes an input (``lift``), stays (``keep``) or is removed (``zero``).
+    noise: str = "lift"
+    #: Make ``action`` the deterministic one.
+    deterministic: bool = False
+    #: ONNX opset (default: 15, or that of the consumer).
+    opset: int | None = None
+    #: ``float16`` stores weights in half the bytes, ``quantize="int8"`` in a quarter; computation stays in float32.
+    dtype: str = "float32"
+    quantize: str | None = None
+    #: Write ONNX and LiteRT files for this many agents at a time (default: any number).
+    batch: int | None = None
+    #: Names of observations and actions: a file or a mapping.
+    labels: Labels | None = None
+
+
+def compile_options(read: ReadOptions, write: WriteOptions | None = None) -> CompileOptions:
+    """Return what the compiler needs of both. Raises UsageError."""
+    write = write or WriteOptions()
+    if write.names not in ("canonical", "source"):
+        raise UsageError(f"names={write.names!r}", fix="one of: canonical, source")
+    if write.noise not in _NOISE:
+        raise UsageError(f"noise={write.noise!r}", fix="one of: lift, keep, zero")
+    return CompileOptions(
+        names=write.names,
+        noise=_NOISE[write.noise],
+        deterministic=write.deterministic,
+        brain=read.brain,
+        inputs=_roles(read.inputs, "--input"),
+        outputs=_roles(read.outputs, "--output"),
+        values=dict(read.values),
+    )
+
+
+def _roles(given: Mapping[str, str | Role], flag: str) -> dict[str, Role]:
+    roles: dict[str, Role] = {}
+    for name, role in given.items():
+        parsed = role if isinstance(role, Role) else parse_role(role)
+        if parsed is None:
+            known = ", ".join(r.value for r in Role)
+            raise UsageError(f"{flag} {name}={role}: there is no such role", fix=f"the roles are {known}")
+        roles[name] = parsed
+    return roles
