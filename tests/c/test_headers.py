@@ -5,19 +5,21 @@ from __future__ import annotations
 import itertools
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from converters.files.children.process import RunFailedError
 from converters.formats.c.contract import answers
 from converters.formats.c.text import comment
 from converters.formats.format import WriteOptions
 from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node
-from converters.graph.types import FLOAT32
-from converters.runtimes.c import COMPILERS
-from converters.runtimes.c.child import FLAGS
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.types import FLOAT32, INT32
+from converters.runtimes.c import COMPILERS, compiler
+from converters.runtimes.c.child import FLAGS, run_bounded
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.api import verify_bundle
@@ -28,7 +30,7 @@ from fixtures import FIXTURES, path
 from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.conftest import Chosen
-from tests.graph.harness import policy_of
+from tests.graph.harness import Runtimes, policy_of
 
 pytestmark = pytest.mark.xdist_group("c")
 
@@ -75,12 +77,30 @@ def test_the_same_policy_gives_the_same_bytes(name: str) -> None:
     assert written() == written()
 
 
-def test_an_op_without_loops_is_refused_by_its_name() -> None:
-    draw = Node("draw", "TruncatedNormal", ("shape",), {"dtype": FLOAT32, "seed": 0, "seed2": 0})
-    shape = Node("shape", "Const", value=np.array([1, 2], np.int32))
-    policy = policy_of(Graph((shape, draw)), ["draw"])
-    with pytest.raises(UnsupportedOpError, match=r"'draw' \(TruncatedNormal\) is not written as source code"):
+def test_an_op_of_unknown_length_is_refused_by_its_name() -> None:
+    observed = Node("x", "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, 2))})
+    policy = policy_of(Graph((observed, Node("where", "Where", ("x",)))), ["where"])
+    with pytest.raises(UnsupportedOpError, match=r"'where' \(Where\) is not written as source code") as refusal:
         WRITTEN["c"].artifact(policy, WriteOptions("{}"))
+    assert refusal.value.why == "how many places it finds is known only while it runs"
+
+
+@pytest.mark.parametrize("index", [-1, 0, 2, 3, 2**31 - 1, -(2**31)])
+def test_an_index_outside_of_its_table_is_an_error(index: int, processes: RuntimePool, tmp_path: Path) -> None:
+    """TensorFlow's on a processor; nothing is clamped."""
+    table = np.arange(6, dtype=np.float32).reshape(3, 2)
+    observed = Node("rows", "Placeholder", attrs={"dtype": INT32, "shape": TensorShape((None,))})
+    nodes = (observed, Node("table", "Const", value=table), Node("row", "Gather", ("table", "rows")))
+    policy, runtimes = policy_of(Graph(nodes), ["row"]), Runtimes(processes, tmp_path)
+    feeds = {"rows": np.array([index], np.int32)}
+    if 0 <= index < 3:
+        for (found,) in (runtimes.c(policy, feeds), runtimes.tensorflow(policy.graph, feeds, ["row"])):
+            assert np.array_equal(found, table[[index]])
+        return
+    with pytest.raises(RunFailedError, match="an index of 1 inputs lies outside of the table"):
+        runtimes.c(policy, feeds)
+    with pytest.raises(RunFailedError, match=rf"indices\[0\] = {index} is not in \[0, 3\)"):
+        runtimes.tensorflow(policy.graph, feeds, ["row"])
 
 
 def test_a_header_in_a_bundle_is_not_compiled_again(tmp_path: Path, here: RuntimePool) -> None:
@@ -97,8 +117,8 @@ def test_no_name_of_a_source_leaves_its_comment(tmp_path: Path, here: RuntimePoo
     names = ["".join(word) for length in (2, 3, 4) for word in itertools.product(pieces, repeat=length)]
     source = tmp_path / "names.c"
     source.write_text("".join(f"{comment(name)}\n" for name in names) + "int nothing;\n", "ascii")
-    for compiler in filter(None, map(shutil.which, COMPILERS)):
-        subprocess.run([compiler, "-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", source], check=True)
+    for each in filter(None, map(shutil.which, COMPILERS)):
+        subprocess.run([each, "-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", source], check=True)
 
 
 # ------------------------------------------------------------------ as people call it
@@ -112,9 +132,9 @@ def printed(name: str, main: str, folder: Path) -> list[str]:
     source.write_text(text)
     compilers = [found for found in map(shutil.which, ("gcc", "clang")) if found]
     said = set()
-    for compiler in compilers:
+    for each in compilers:
         flags = [f for f in FLAGS if f not in ("-shared", "-fPIC")]
-        command = [compiler, *flags, "-I", str(result.folder), "-o", str(folder / "main"), str(source), "-lm"]
+        command = [each, *flags, "-I", str(result.folder), "-o", str(folder / "main"), str(source), "-lm"]
         subprocess.run(command, check=True)
         said.add(subprocess.run([str(folder / "main")], check=True, capture_output=True, text=True).stdout)
     (only,) = said
@@ -165,3 +185,17 @@ int main(void)
     numbers = [float(word) for word in printed("discrete", main, tmp_path)]
     for count, share in zip(numbers[0::2], numbers[1::2], strict=True):
         assert abs(count - 4000 * share) <= 5 * (4000 * share * (1 - share)) ** 0.5 + 1
+
+
+def test_the_memory_of_a_compiler_is_bounded(tmp_path: Path) -> None:
+    done = run_bounded([sys.executable, "-c", "x = bytearray(1 << 32)"], tmp_path, 1 << 30, 9)
+    assert "MemoryError" in done.stderr
+
+
+def test_the_time_of_a_compiler_is_bounded(tmp_path: Path, here: RuntimePool) -> None:
+    """By a header whose macros become 2 to the 40 words."""
+    doubled = "".join(f"#define A{i} A{i - 1} A{i - 1}\n" for i in range(1, 41))
+    (tmp_path / "bomb.h").write_text(f"#define A0 0 +\n{doubled}int a = A40 0;\n")
+    done = run_bounded([str(compiler()), "-fsyntax-only", "bomb.h"], tmp_path, 1 << 32, 1)
+    assert done.returncode != 0
+    assert "CPU time limit exceeded" in done.stderr or "Killed" in done.stderr

@@ -38,6 +38,7 @@ _HELPERS = {
     "abs": ("fabsf(a)", "a < 0 ? -a : a"),
     "mod": ("fmodf(a, b) + ((fmodf(a, b) != 0.0f && (fmodf(a, b) < 0.0f) != (b < 0.0f)) ? b : 0.0f)",
             "a % b + ((a % b != 0 && (a % b < 0) != (b < 0)) ? b : 0)"),
+    "within": ("", "0 <= a && a < b ? a : (*outside = 1, 0)"),
     "intdiv": ("floorf(a / b)", "a / b - ((a % b != 0 && (a % b < 0) != (b < 0)) ? 1 : 0)"),
 }  # fmt: skip
 _SUFFIX = {"float": "f", "int32_t": "i", "int64_t": "l"}
@@ -81,6 +82,7 @@ class Printer:
         self.prefix = prefix
         self.helpers: dict[str, str] = {}
         self.draws = False
+        self.looks_up = False
         self._scope = NameScope(())
         self._names: dict[int, str] = {}
         self._keep: list[object] = []
@@ -219,6 +221,9 @@ class Printer:
             name = f"{self.prefix}_{function}{_SUFFIX[kind]}"
             takes = ", ".join(f"{kind} {a}" for a in "ab"[: len(operands)])
             said = _HELPERS[function][kind != "float"]
+            if function == "within":
+                self.looks_up = True
+                takes, operands = f"{takes}, int *outside", [*operands, "&outside"]
             self.helpers[name] = f"static {kind} {name}({takes}) {{ return {said}; }}"
             return f"{name}({', '.join(operands)})"
         if kind != "float":  # whole numbers are whole

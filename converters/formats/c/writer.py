@@ -17,6 +17,7 @@ from converters.graph.program import Program, program_of
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from signatures.contract import EMBEDDED
+from signatures.errors import GraphError
 from signatures.roles import Role
 
 #: Golden rows of the self test, and how far float32 may be off.
@@ -65,12 +66,15 @@ def _text(policy: Policy, header: Header, program: Program, options: WriteOption
     for name, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[name])
     body = printer.body(program)
-    for f in (*header.outputs, *([header.next_state] if header.next_state else [])):
+    answered = (*header.outputs, *([header.next_state] if header.next_state else []))
+    for f in answered:
         target = f"memory->{header.state.name}" if f is header.next_state and header.state else f"output->{f.name}"
         source = printer.name(program.outputs[f.spec.name].place)
         body.append(f"    for (int i = 0; i < {f.size}; i++) {target}[i] = {source}[i];")
     contract = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in options.contract)
     contract = contract.replace("*/", "*\\/").replace("/*", "\\/*")
+    if printer.looks_up:
+        body = ["    int outside = 0;", *body[: -len(answered)], "    if (outside) return 1;", *body[-len(answered) :]]
     chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
     sizes = policy.signature.branches
     choose = _choose(p, chosen, sizes) if chosen is not None and sum(sizes) == chosen.size else ""
@@ -101,12 +105,13 @@ def _text(policy: Policy, header: Header, program: Program, options: WriteOption
         ),
         _struct(f"{p}_output", "What an agent does.", map(_member, header.outputs)),
         f"/* Begin an episode: no state, draws by a seed. */\nvoid {p}_reset({p}_memory *memory, uint64_t seed);\n"
-        f"/* Decide: draw the noise where there is some, then compute. */\n"
-        f"void {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
-        f"/* The same for some agents, each with a memory of its own. */\n"
-        f"void {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
+        f"/* Decide: draw the noise where there is some, then compute. 0; 1, and no output, where an observed index\n"
+        f"   lies outside of the table that it is looked up in. */\n"
+        f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
+        f"/* The same for some agents, each with a memory of its own; how many of them have no output. */\n"
+        f"int {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
         f"/* Compute with the noise that stands in the memory (zeros: without chance). */\n"
-        f"void {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
+        f"int {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
         f"#ifdef {p.upper()}_SELFTEST\n"
         f"/* How many numbers are not what the policy's own kernels computed at export: 0. */\n"
         f"int {p}_selftest({p}_memory *memory);\n#endif",
@@ -119,13 +124,15 @@ def _text(policy: Policy, header: Header, program: Program, options: WriteOption
         *([_NORMAL.replace("$P", p).strip()] if header.noise else []),
         f"void {p}_reset({p}_memory *memory, uint64_t seed)\n{{\n    memset(memory, 0, sizeof *memory);\n"
         f"    memory->stream = seed;\n}}",
-        f"void {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
-        f"    (void)input;\n    (void)memory;\n" + "\n".join(body) + "\n}",
-        f"void {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        f"int {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        f"    (void)input;\n    (void)memory;\n" + "\n".join(body) + "\n    return 0;\n}",
+        f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
         + "".join(f"    {p}_normal(memory, memory->{f.name}, {f.size});\n" for f in header.noise)
-        + f"    {p}_compute(input, memory, output);\n}}",
-        f"void {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
-        f"    for (int i = 0; i < agents; i++) {p}_act(&input[i], &memory[i], &output[i]);\n}}",
+        + f"    return {p}_compute(input, memory, output);\n}}",
+        f"int {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        f"    int without = 0;\n"
+        f"    for (int i = 0; i < agents; i++) without += {p}_act(&input[i], &memory[i], &output[i]);\n"
+        f"    return without;\n}}",
         *([choose] if choose else []),
         _selftest(policy, header),
         "#endif",
@@ -182,7 +189,11 @@ def _selftest(policy: Policy, header: Header) -> str:
             value = np.zeros(f.size) if id(f) in quiet else _fed(f, row)
             shape = [1 if n is None else n for n in f.spec.shape]
             feeds[policy.feeds[f.spec.name]] = value.astype(f.spec.dtype).reshape(shape)
-        found = run_graph(graph, feeds, [policy.fetches[f.spec.name] for f in checked])
+        try:
+            found = run_graph(graph, feeds, [policy.fetches[f.spec.name] for f in checked])
+        except GraphError:  # zeros are no places in order
+            golden = []
+            break
         golden += [float(x) for f in checked for x in found[policy.fetches[f.spec.name]].reshape(-1)]
     for f in header.inputs:
         kind = C_TYPES[f.spec.dtype]
@@ -206,6 +217,6 @@ def _selftest(policy: Policy, header: Header) -> str:
         f"    static const float golden[{len(golden)}] = {{{numbers}}};\n    {p}_input input;\n    {p}_output output;\n"
         f"    int wrong = 0, at = 0;\n    for (int row = 0; row < {_ROWS}; row++) {{\n"
         f"        {p}_reset(memory, 0);\n        memset(&input, 0, sizeof input);\n"
-        + "\n".join([*lines, f"        {p}_compute(&input, memory, &output);", *tests])
+        + "\n".join([*lines, f"        wrong += {p}_compute(&input, memory, &output);", *tests])
         + "\n    }\n    return wrong;\n}\n#endif"
     )

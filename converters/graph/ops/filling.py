@@ -191,7 +191,15 @@ OPS = (
         loops=loops.tile,
         moves="repeat",
     ),
-    OpDef("Range", _infer_range, _range, direct("Range"), (type_attr("Tidx"),), litert=builtin("RANGE")),
+    OpDef(
+        "Range",
+        _infer_range,
+        _range,
+        direct("Range"),
+        (type_attr("Tidx"),),
+        litert=builtin("RANGE"),
+        loops=loops.range_,
+    ),
     OpDef(
         "OneHot",
         _infer_one_hot,

@@ -16,6 +16,7 @@ from converters.graph.ops.arrays import target_dims
 from converters.graph.ops.base import Attr, GraphBuilder, OnnxBuilder, OpDef, as_int64, not_constant, type_attr
 from converters.graph.ops.litert.arrays import sparse_to_dense
 from converters.graph.ops.litert.base import builtin
+from converters.graph.ops.loops import arrays as loops
 from converters.graph.types import INT64, Symbols, TensorType
 from signatures.errors import UnsupportedOpError
 
@@ -102,6 +103,7 @@ OPS = (
         (type_attr(),),
         tfjs=_tfjs_where,
         litert=builtin("WHERE"),
+        loops=loops.places_found,
         precision="exact",
     ),
     OpDef(
@@ -111,6 +113,7 @@ OPS = (
         _lower_sparse_to_dense,
         (type_attr("T", "in:2"), type_attr("Tindices", "in:0"), Attr("validate_indices", "bool", True)),
         litert=sparse_to_dense,
+        loops=loops.sparse_to_dense,
         precision="exact",
     ),
 )

@@ -133,7 +133,7 @@ OPS = (
         random("RANDOM_STANDARD_NORMAL"),
         loops.normal,
     ),
-    _of_shape("TruncatedNormal", _truncated, None, "truncated normal"),
+    _of_shape("TruncatedNormal", _truncated, None, "truncated normal", loops=loops.truncated_normal),
     _of_shape(
         "RandomUniform",
         _uniform,

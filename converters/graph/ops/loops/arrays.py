@@ -139,18 +139,78 @@ def pack(node: Node, builder: LoopBuilder) -> Tensor:
 
 
 def gather(node: Node, builder: LoopBuilder) -> Tensor:
-    """Rows by their number, which is held to those that there are."""
+    """Rows by their number; one outside is an error, as in TensorFlow."""
     x, rows = (builder.value(r) for r in node.inputs[:2])
     axis = int(known(node, builder, 2)) % len(x.shape) if len(node.inputs) > 2 else 0
     many = len(rows.shape)
 
     def one(at: Index) -> Expression:
         row: Expression = Element(rows, tuple(at[axis : axis + many]))
-        row = apply("max", apply("min", row, Number(x.shape[axis] - 1, row.dtype)), Number(0, row.dtype))
-        row = row if row.dtype == INT32 else apply("cast", row, dtype=INT32)
-        return Element(x, (*at[:axis], row, *at[axis + many :]))
+        return Element(x, (*at[:axis], _index(row, x.shape[axis]), *at[axis + many :]))
 
     return builder.compute(shape_of(node, builder), one, x.dtype)
+
+
+def _index(x: Expression, count: int) -> Expression:
+    """An index that is computed while the graph runs, of ``count``."""
+    inside = apply("within", x, Number(count, x.dtype))
+    return inside if x.dtype == INT32 else apply("cast", inside, dtype=INT32)
+
+
+def range_(node: Node, builder: LoopBuilder) -> Tensor:
+    """Numbers at even distances; how many must be known before the graph runs."""
+    start, step = (builder.value(node.inputs[i]) for i in (0, 2))
+
+    def one(at: Index) -> Expression:
+        number_ = at[0] if start.dtype == INT32 else apply("cast", at[0], dtype=start.dtype)
+        return apply("add", element(start, ()), apply("mul", number_, element(step, ())))
+
+    return builder.compute(shape_of(node, builder), one, start.dtype)
+
+
+def places_found(node: Node, builder: LoopBuilder) -> Tensor:
+    """Raise UnsupportedOpError: a program's lengths are known when it is written."""
+    raise refused(node, "how many places it finds is known only while it runs")
+
+
+def sparse_to_dense(node: Node, builder: LoopBuilder) -> Tensor:
+    """A default, and values at places, the last where two have the same; an error where places are not as promised."""
+    places, values, default = (builder.value(node.inputs[i]) for i in (0, 2, 3))
+    shape, ordered = shape_of(node, builder), bool(node.attrs["validate_indices"])
+    count = places.shape[0] if places.shape else 1
+    strides = [int(np.prod(shape[a + 1 :], dtype=np.int64)) for a in range(len(shape))]
+
+    def flat(indices: Index) -> Expression:
+        found: Expression = number(0)
+        for index, stride in zip(indices, strides, strict=True):
+            found = apply("add", found, apply("mul", index, number(stride)))
+        return found
+
+    def place(k: Expression) -> Expression:
+        rows: tuple[Expression, ...] = (k,) if places.shape else ()
+        at = [(*rows, number(a)) for a in range(len(shape))] if len(places.shape) == 2 else [rows]
+        return flat([_index(Element(places, i), n) for i, n in zip(at, shape, strict=True)])
+
+    def checked(k: Expression) -> Expression:
+        if not ordered or count == 1:
+            return place(k)
+        first, before = holds("less", k, number(1)), apply("sub", k, number(1))
+        rising = chosen(first, number(1), apply("cast", holds("less", place(before), place(k)), dtype=INT32))
+        right = chosen(holds("less", number(0), rising), place(k), number(-1))
+        return apply("within", right, number(int(np.prod(shape, dtype=np.int64))))
+
+    def one(at: Index) -> Expression:
+        def hit(k: Index) -> Expression:
+            return chosen(holds("equal", checked(k[0]), flat(at)), apply("add", k[0], number(1)), number(0))
+
+        if not count:
+            return element(default, ())
+        last = builder.reduce("max", [count], hit, INT32)
+        which = apply("sub", last, number(1)) if count > 1 else number(0)
+        value = Element(values, (which,) * len(values.shape))
+        return chosen(holds("less", number(0), last), value, element(default, ()))
+
+    return builder.compute(shape, one, values.dtype)
 
 
 def one_hot(node: Node, builder: LoopBuilder) -> Tensor:

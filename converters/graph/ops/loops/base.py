@@ -23,6 +23,7 @@ FUNCTIONS = frozenset(
         *("add", "sub", "mul", "div", "neg", "abs", "floor", "ceil", "rint", "min", "max", "pow", "mod", "intdiv"),
         *("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "erf"),
         *("less", "less_equal", "equal", "and", "or", "not", "select", "cast"),
+        "within",  # an index, and how many there are: the program answers nothing where it lies outside
     )
 )
 #: What is kept of the elements that a reduction meets: ``first largest`` and ``first smallest`` keep where it was.
