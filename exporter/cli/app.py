@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from exporter.cli.group import Rooms, SourceGroup, show_version
+from exporter.cli.group import Rooms, SourceGroup, help_all_option, show_version
 
 _COMMANDS = (
     "compare",
@@ -24,8 +24,8 @@ _COMMANDS = (
     cls=SourceGroup,
     commands=Rooms({name: f"exporter.cli.{name}" for name in _COMMANDS}),
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Export trained Unity ML-Agents policies to .bytes, SavedModel, TensorFlow.js and ONNX, and prove by running "
-    "them that all agree. 'export-model SOURCE' exports; see the commands for the rest.",
+    help="Export trained policies to every runtime, and prove that all files agree.",
+    params=[help_all_option()],
 )
 @click.option(
     "--version",

@@ -10,7 +10,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import JUDGING, as_given, comparing, pairs, trusting, understanding
+from exporter.cli.options import JUDGING, as_given, comparing, located, pairs, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
@@ -23,12 +23,13 @@ if TYPE_CHECKING:
     "Compare files made by any tool with a reference.",
     ("export-model compare 3DBall.bytes theirs.onnx", ""),
     ("export-model compare 3DBall.bytes tfjs --map action=Identity", ""),
+    core=("mapped", "runtimes", "allow_unverified", "trust_source", "html", "junit", "as_json", "verbose", "quiet"),
 )
 @click.argument("reference", type=PATH)
 @click.argument("candidates", nargs=-1, required=True, type=PATH, metavar="CANDIDATE...")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
 @trusting
-@click.option("--runtimes", default="auto", metavar="WHERE", help="auto, full, browser, or runtimes by name.")
+@located
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if none of their runtimes is installed.")
 @reporting
 @understanding

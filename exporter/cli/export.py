@@ -11,7 +11,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import RULES, activating, as_given, comparing, read_options, trusting, understanding
+from exporter.cli.options import RULES, activating, as_given, comparing, located, read_options, trusting, understanding
 from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
@@ -30,10 +30,14 @@ if TYPE_CHECKING:
     ("export-model 3DBall.nn --to onnx", "one format"),
     ("export-model 3DBall.onnx --for unity6", "for the Model field"),
     ("export-model 3DBall.bytes --verify full", "in every runtime"),
+    core=(
+        *("out", "targets", "profile", "runtimes", "name", "deterministic"),
+        *("html", "as_json", "jobs", "trust_source", "verbose", "quiet"),
+    ),
 )
 @click.argument("sources", nargs=-1, type=PATH, metavar="SOURCE...")
 @click.option("-o", "--out", type=PATH, default=Path("exported"), help="Folder for the bundles, or an address.")
-@click.option("--to", "targets", metavar="FORMATS", help="bytes, saved_model, tfjs, onnx (the default), nn, litert, c.")
+@click.option("--to", "targets", metavar="FORMATS", help="bytes, saved_model, tfjs, onnx by default; nn, litert, c.")
 @click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
 @click.option(
@@ -63,13 +67,7 @@ if TYPE_CHECKING:
 @click.option("--batch", type=int, metavar="N", help="Write files for N agents at a time (ONNX, LiteRT).")
 @click.option("--labels", type=PATH, metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
-@click.option(
-    "--verify",
-    "runtimes",
-    default="auto",
-    metavar="WHERE",
-    help="auto, full, browser, none, or runtimes by name.",
-)
+@located
 @click.option("--jobs", type=int, metavar="N", help="Export N sources at a time (default: 1).")
 @click.option("--cluster", metavar="ADDRESS", help="Export on the workers of a Dask cluster.")
 @click.option("--again", is_flag=True, help="With many sources, export unchanged ones too.")

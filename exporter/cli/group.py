@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 PROGRAM = "export-model"
 #: What options and arguments take that are paths: of any kind, of a file.
 PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
-_OWN = frozenset(("--help", "-h", "--version"))
+_OWN = frozenset(("--help", "-h", "--help-all", "--version"))
+#: Commands that ``--help`` leaves to ``--help-all``.
+_RARE = frozenset(("completion", "consumers"))
 
 
 #: Title of a group of options → their parameters, in the order of the help.
@@ -41,23 +43,38 @@ GROUPS = {
     ),
     "Many sources": ("jobs", "cluster", "again", "fail_fast"),
     "The server": ("host", "port", "opens", "no_open"),
-    "Output": ("verbose", "quiet", "why", "as_json", "html", "markdown", "junit", "help"),
+    "Output": ("verbose", "quiet", "why", "as_json", "html", "markdown", "junit", "help", "help_all"),
 }
 
 
-class Command(click.Command):
-    """A command whose help has its options in groups, and examples: (what is typed, what it does)."""
+#: Where a context keeps that all options are to be shown.
+_ALL = "exporter.cli.help_all"
 
-    def __init__(self, *args: Any, examples: Sequence[tuple[str, str]] = (), **rest: Any) -> None:
+
+class Command(click.Command):
+    """A command whose help has examples, (what is typed, what it does), and its options: those of ``core``, which are
+    parameters, with ``--help``; all of them in groups with ``--help-all``. Without ``core`` both are the same.
+    """
+
+    def __init__(
+        self, *args: Any, examples: Sequence[tuple[str, str]] = (), core: Sequence[str] = (), **rest: Any
+    ) -> None:
         super().__init__(*args, **rest)
         self.context_settings.setdefault("show_default", True)
+        self.core = tuple(core)
+        if core:
+            self.params.append(help_all_option())
         self.examples = tuple(examples)
         width = max((len(typed) for typed, _ in examples), default=0)
-        lines = [f"  {typed:{width}}  {what}" for typed, what in examples]
+        lines = [f"  {typed:{width}}  {what}".rstrip() for typed, what in examples]
         self.epilog = "\n".join(["\b", "Examples:", *lines]) if lines else None
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The options by group; an option that is in none stands under Output."""
+        """Write the core options, or all of them by group; an option that is in no group stands under Output."""
+        if self.core and not ctx.meta.get(_ALL):
+            with formatter.section("Options"):
+                formatter.write_dl(self.core_options(ctx))
+            return
         options = (p for p in self.get_params(ctx) if isinstance(p, click.Option))
         found = {p.name: r for p in options if (r := p.get_help_record(ctx)) is not None}
         grouped = {name: title for title, names in GROUPS.items() for name in names}
@@ -67,10 +84,38 @@ class Command(click.Command):
                 with formatter.section(title):
                     formatter.write_dl([found[n] for n in sorted(names, key=_place)])
 
+    def core_options(self, ctx: click.Context) -> list[tuple[str, str]]:
+        """Return a line for each core option: its first name, and its help without the default."""
+        ctx.show_default = False
+        options = {p.name: p for p in self.get_params(ctx) if isinstance(p, click.Option)}
+        records = (options[name].get_help_record(ctx) for name in (*self.core, "help_all"))
+        return [(names.replace(", --runtimes", ""), text) for names, text in filter(None, records)]
 
-def command(name: str, short_help: str, *examples: tuple[str, str]) -> Callable[[Callable[..., Any]], Command]:
-    """A function as the command ``name``."""
-    return click.command(name, cls=Command, short_help=short_help, examples=examples)
+
+def help_all_option() -> click.Option:
+    """Return ``--help-all``."""
+    return click.Option(
+        ["--help-all"],
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=_show_all,
+        help="Show all options and exit.",
+    )
+
+
+def _show_all(ctx: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+    if wanted and not ctx.resilient_parsing:
+        ctx.meta[_ALL] = True
+        click.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
+def command(
+    name: str, short_help: str, *examples: tuple[str, str], core: Sequence[str] = ()
+) -> Callable[[Callable[..., Any]], Command]:
+    """Turn a function into the command ``name``."""
+    return click.command(name, cls=Command, short_help=short_help, examples=examples, core=core)
 
 
 def _place(name: str | None) -> int:
@@ -132,6 +177,21 @@ class SourceGroup(click.Group):
         """Both ways to call the program."""
         formatter.write_usage(ctx.command_path, "SOURCE... [-o DIR] [OPTIONS]")
         formatter.write_usage(ctx.command_path, "COMMAND ...", prefix="       ")
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options of an export, which needs no command's name, and the commands."""
+        export, everything = self.commands["export"], bool(ctx.meta.get(_ALL))
+        assert isinstance(export, Command)
+        own = click.Context(export, ctx, export.name, show_default=True)
+        if everything:
+            export.format_options(own, formatter)
+            super().format_options(ctx, formatter)
+            return
+        with formatter.section("Options"):
+            formatter.write_dl([*export.core_options(own)[:-1], ("--help-all", "Show all options and commands.")])
+        with formatter.section("Commands"):
+            shown = (name for name in self.list_commands(ctx) if name not in _RARE)
+            formatter.write_dl([(name, self.commands[name].get_short_help_str()) for name in shown])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Commands, and files: the first word may be a source."""

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     ("export-model inspect 3DBall.nn", "inputs, outputs, layers"),
     ("export-model inspect 3DBall.onnx --unity all", "what ML-Agents says to it"),
     ("export-model inspect 3DBall.nn --svg 3DBall.svg", "a picture"),
+    core=("releases", "why", "svg", "step", "trust_source", "as_json"),
 )
 @click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SOURCE...")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")

@@ -84,7 +84,7 @@ def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int
     for part in parts:
         if not re.fullmatch("(goal:)?[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}){0,2}", part):
             raise UsageError(
-                f"--sensors {text}: {part} is no shape of a sensor",
+                f"--sensors {text}: {part} is not the shape of a sensor",
                 fix="give one shape per sensor: 8 for a vector, 20x4 for a list of at most 20 entities of 4 numbers, "
                 "3x84x84 (channels, height, width) for an image, goal:8 for a goal",
             )
@@ -100,12 +100,21 @@ def read_options(step: int | None, sensors: str | None, trust_source: bool, acti
     return ReadOptions(step, shapes, trust_source, goals, activation)
 
 
+#: Where files are run; a word means the same in every command.
+located = click.option(
+    "--verify",
+    "--runtimes",
+    "runtimes",
+    default="auto",
+    metavar="WHERE",
+    help="auto, full, browser, none, or runtimes by name.",
+)
 #: For files that have the weights of layers and not what stands between them.
 activating = click.option(
     "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
 )
 #: For sources that only a loader of their own can read, which runs what they say.
-trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is no plain data; this can run code.")
+trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is not plain data; can run code.")
 
 
 def _numbers(values: Sequence[str]) -> dict[str, float]:

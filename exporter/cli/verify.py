@@ -12,7 +12,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import JUDGING, as_given, comparing, trusting
+from exporter.cli.options import JUDGING, as_given, comparing, located, trusting
 from exporter.cli.terminal import say_lines
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
 from signatures.fields import printable
@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     ("export-model verify exported/3DBall", "one bundle"),
     ("export-model verify exported --junit parity.xml", "all in a folder"),
     ("export-model verify out/3DBall --source 3DBall.bytes", "against the original"),
+    core=("source", "runtimes", "allow_unverified", "trust_source", "html", "junit", "as_json", "verbose", "quiet"),
 )
 @click.argument("bundles", nargs=-1, required=True, type=PATH, metavar="BUNDLE...")
 @click.option("--source", type=PATH, help="The file the bundle was exported from.")
 @click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
 @trusting
-@click.option("--runtimes", default="auto", metavar="WHERE", help="auto, full, browser, or runtimes by name.")
+@located
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if no independent runtime is installed.")
 @reporting
 @comparing

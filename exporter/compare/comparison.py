@@ -174,7 +174,7 @@ def compare_artefacts(
         report = merge_reports(reports)
     notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
     report = replace(report, notes=(*report.notes, *notes))
-    if report.passed is None and not report.undecided and not allow_unverified:
+    if report.passed is None and not report.undecided and not (allow_unverified or runtimes == "none"):
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",
             why=f"they are {', '.join(sorted({m.format.key for m in matched}))}",

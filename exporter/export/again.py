@@ -143,7 +143,7 @@ def verify_folder(
         # No runtime outside Unity has it, so none can be asked for: the files are whole and one contract says so.
         note = "only Unity runs a .nn: its bytes, its contract and that it answers by our own reader were verified"
         report = replace(report, notes=(*report.notes, note))
-    elif report.passed is None and not report.undecided and not allow_unverified:
+    elif report.passed is None and not report.undecided and not (allow_unverified or runtimes == "none"):
         raise RuntimeUnavailableError(
             "no independent runtime is installed, so nothing was verified",
             where=str(folder),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -94,9 +95,49 @@ def test_the_examples_of_a_help_are_commands_that_there_are(name: str) -> None:
 
 def test_help_fits_a_terminal_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    for name in app.commands:
-        shown = export_model(name, "--help").out
-        assert max(map(len, shown.splitlines())) <= 80, shown
+    for words in ((), *((name,) for name in app.commands)):
+        lines = export_model(*words, "--help").out.splitlines()
+        assert max(map(len, lines)) <= 80, lines
+        assert len(lines) <= 30, lines
+
+
+def test_help_shows_twelve_options_and_help_all_every_one() -> None:
+    short, long = (export_model("export", word).out for word in ("--help", "--help-all"))
+    core = [
+        "out",
+        "to",
+        "for",
+        "verify",
+        "name",
+        "deterministic",
+        "html",
+        "json",
+        "jobs",
+        "trust-source",
+        "verbose",
+        "quiet",
+    ]
+    assert re.findall(r"^  (?:-., )?--([a-z-]+)", short, re.MULTILINE) == [*core, "help-all"]
+    assert all(f"--{word} " in export_model("--help").out for word in core)
+    for name, command in app.commands.items():
+        flag = "--help-all" if isinstance(command, Command) and command.core else "--help"
+        shown = export_model(name, flag).out
+        assert [o for p in command.params if isinstance(p, click.Option) for o in p.opts if o not in shown] == []
+    everything = export_model("--help-all").out
+    assert [o for o in ("--noise", "--version", "\n  completion ", "\n  consumers ") if o not in everything] == []
+    assert "--noise" in long and "--noise" not in short
+
+
+@pytest.mark.parametrize("flag", ["--verify", "--runtimes"])
+def test_where_files_are_run_is_said_the_same_way_in_every_command(flag: str, tmp_path: Path) -> None:
+    assert export_model(BALL, "-o", tmp_path, flag, "numpy", "--to", "bytes,onnx").status == 0
+    folder = tmp_path / "continuous"
+    for words in (("verify", folder), ("compare", BALL, folder / "continuous.onnx")):
+        ran = export_model(*words, flag, "none")
+        assert (ran.status, ran.err) == (0, ""), ran
+        assert ran.out.endswith("NOT VERIFIED: no independent runtime ran\n")
+        is_refused(export_model(*words, flag, "numpy"), "--allow-unverified", status=3)
+        is_refused(export_model(*words, flag, "nothing"), "there is no runtime")
 
 
 def test_what_is_listed_fits_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
