@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from signatures.bounded import loads
-from signatures.fields import Field, FieldError, known
-from signatures.labels import parsed
+from signatures.fields import Field, FieldError, without_none
+from signatures.labels import parse_labels
 from signatures.memories import SourcePart
 from signatures.records import dataclass
 from signatures.roles import INPUT_ROLES, Constant, Role
@@ -75,7 +75,7 @@ class Origin:
 
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json."""
-        return known(
+        return without_none(
             path=self.path,
             sha256=self.sha256,
             model=self.model,
@@ -163,7 +163,7 @@ def parse(content: Any) -> Contract:
     )
     entries = whole["files"].members()
     files = {_key(p, e): FileEntry(_sha256(e["sha256"]), e["bytes"].integer(0)) for p, e in entries.items()}
-    made = known(
+    made = without_none(
         name=tool["name"].text(),
         version=tool["version"].text(),
         profile=None if tool["profile"].missing else tool["profile"].text(),
@@ -191,7 +191,7 @@ def parse_signature(whole: Field) -> PolicySignature:
     if not preprocess.keys() <= named.keys():
         raise whole["preprocess"].error(f"names {min(preprocess.keys() - named.keys())!r}, which is no input")
     try:
-        labels = parsed(whole["labels"].value)
+        labels = parse_labels(whole["labels"].value)
     except ValueError as error:
         raise whole["labels"].error(str(error)) from error
     return PolicySignature(

@@ -98,7 +98,7 @@ def whole(name: str, value: object, least: int, most: int | None = None) -> int:
     return number
 
 
-def meant(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, known: Iterable[str]) -> str:
     """``did you mean …?`` and a space where one that is known is close to a name that is not; else nothing."""
     import difflib  # 2 ms, which nobody needs who mistypes nothing
 

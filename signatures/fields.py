@@ -96,7 +96,7 @@ class Field:
         return tuple(None if item.missing else item.integer(0, 2**31 - 1) for item in self.items(32))
 
 
-def known(**given: Any) -> dict[str, Any]:
+def without_none(**given: Any) -> dict[str, Any]:
     """What is not None of what JSON is to say."""
     return {name: value for name, value in given.items() if value is not None}
 

@@ -20,7 +20,7 @@ MAX_LENGTH = 120
 PARTS = ("observations", "actions", "branches")
 
 
-def parsed(content: Any) -> dict[str, Any]:
+def parse_labels(content: Any) -> dict[str, Any]:
     """Labels in their form, parts without a text left out. Raises ValueError that says what is wrong."""
     if content is None:
         return {}
@@ -55,10 +55,10 @@ def _texts(texts: Any, where: str) -> list[str]:
     return list(texts)
 
 
-def checked(content: Any, signature: PolicySignature) -> dict[str, Any]:
+def validate_labels(content: Any, signature: PolicySignature) -> dict[str, Any]:
     """Labels that fit ``signature``. Raises UsageError that names the first which does not."""
     try:
-        labels = parsed(content)
+        labels = parse_labels(content)
     except ValueError as error:
         raise UsageError(
             f"labels: {error}",
@@ -69,17 +69,17 @@ def checked(content: Any, signature: PolicySignature) -> dict[str, Any]:
         if name not in wanted["observations"]:
             known = ", ".join(wanted["observations"]) or "none whose numbers can be named"
             raise UsageError(f"labels: there is no vector observation {name!r}", fix=f"the policy has {known}")
-        _counted(texts, wanted["observations"][name], f"observation {name!r}", "numbers")
+        _check_count(texts, wanted["observations"][name], f"observation {name!r}", "numbers")
     if "actions" in labels:
         if not wanted["actions"]:
             raise UsageError("labels: the policy has no continuous actions", fix="leave 'actions' out")
-        _counted(labels["actions"], wanted["actions"], "'actions'", "continuous actions")
+        _check_count(labels["actions"], wanted["actions"], "'actions'", "continuous actions")
     if "branches" in labels:
         if not wanted["branches"]:
             raise UsageError("labels: the policy has no branches of discrete actions", fix="leave 'branches' out")
-        _counted(labels["branches"], len(wanted["branches"]), "'branches'", "branches")
+        _check_count(labels["branches"], len(wanted["branches"]), "'branches'", "branches")
         for i, (texts, size) in enumerate(zip(labels["branches"], wanted["branches"], strict=True)):
-            _counted(texts, size, f"branch {i}", "actions")
+            _check_count(texts, size, f"branch {i}", "actions")
     return labels
 
 
@@ -106,7 +106,7 @@ def sizes(signature: PolicySignature) -> dict[str, Any]:
     }
 
 
-def _counted(texts: Sequence[object], size: int, where: str, of: str) -> None:
+def _check_count(texts: Sequence[object], size: int, where: str, of: str) -> None:
     if len(texts) != size:
         raise UsageError(
             f"labels: {where} has {len(texts)} texts, the policy has {size} {of}", fix="give one text for each"

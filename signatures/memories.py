@@ -36,7 +36,7 @@ class SourcePart:
         return {"tensor": self.tensor, "shape": list(self.shape)}
 
 
-def divided(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, np.ndarray]:
+def split_memory(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, np.ndarray]:
     """What the source is fed for a memory [B, n]: each part's columns in its shape."""
     ends = np.cumsum([part.size for part in parts])
     fed = {}
@@ -47,8 +47,8 @@ def divided(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, np.nda
     return fed
 
 
-def joined(parts: Sequence[SourcePart], values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The memory [B, n] that the source gave in ``parts``; the inverse of ``divided``."""
+def join_memory(parts: Sequence[SourcePart], values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The memory [B, n] that the source gave in ``parts``; the inverse of ``split_memory``."""
     rows = [np.moveaxis(values[part.tensor], part.axis, 0) for part in parts]
     return np.concatenate([r.reshape(r.shape[0], -1) for r in rows], axis=1)
 

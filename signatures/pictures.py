@@ -11,7 +11,7 @@ import numpy as np
 Picture: TypeAlias = "Callable[[np.random.Generator, np.ndarray, np.ndarray, np.ndarray], np.ndarray]"
 
 
-def structured(rng: np.random.Generator, shape: tuple[int, ...], *, first: int = 0) -> np.ndarray:
+def structured_images(rng: np.random.Generator, shape: tuple[int, ...], *, first: int = 0) -> np.ndarray:
     """Images of the kinds in turn from ``first`` on, float [B, …], in 0..1.
 
     Which axis is that of the channels is told by its size: the last, or the first of an image that is higher than it

@@ -51,7 +51,7 @@ _FACTORY = _Factory()
 
 
 def _declare(cls: type, *, frozen: bool = False, eq: bool = True, kw_only: bool = False, slots: bool = False) -> Any:
-    fields = _inherited(cls, frozen)
+    fields = _base_fields(cls, frozen)
     own = _own_fields(cls, kw_only)
     fields.update(own)
     named = dict(vars(cls))
@@ -88,7 +88,7 @@ def _declare(cls: type, *, frozen: bool = False, eq: bool = True, kw_only: bool 
 # ------------------------------------------------------------------ fields
 
 
-def _inherited(cls: type, frozen: bool) -> dict[str, Field[Any]]:
+def _base_fields(cls: type, frozen: bool) -> dict[str, Field[Any]]:
     fields: dict[str, Field[Any]] = {}
     for base in cls.__mro__[-1:0:-1]:
         if "__dataclass_fields__" in vars(base):
@@ -124,12 +124,12 @@ def _check_order(fields: Any) -> None:
     optional = False
     for f in fields:
         if f.init and not f.kw_only:
-            if optional and _required(f):
+            if optional and _is_required(f):
                 raise TypeError(f"non-default argument {f.name!r} follows default argument")
-            optional = optional or not _required(f)
+            optional = optional or not _is_required(f)
 
 
-def _required(f: Field[Any]) -> bool:
+def _is_required(f: Field[Any]) -> bool:
     return f.default is MISSING and f.default_factory is MISSING
 
 
@@ -185,7 +185,7 @@ def _compiled_init(cls: type, fields: Mapping[str, Field[Any]], frozen: bool) ->
         elif not f.init:
             continue
         if f.init:
-            default = "" if _required(f) else f"=__default{i}" if f.default is not MISSING else "=__factory"
+            default = "" if _is_required(f) else f"=__default{i}" if f.default is not MISSING else "=__factory"
             (named if f.kw_only else plain).append(f.name + default)
         body.append(f"__set(self, {f.name!r}, {value})" if frozen else f"self.{f.name} = {value}")
     if hasattr(cls, "__post_init__"):

@@ -17,7 +17,7 @@ import numpy as np
 
 from signatures.ids import id_bounds
 from signatures.masks import all_allowed, forbidden, one_allowed, random_masks
-from signatures.pictures import structured
+from signatures.pictures import structured_images
 from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -57,7 +57,7 @@ class Case:
     feeds: dict[str, np.ndarray]
     batch: int
 
-    def flushed(self) -> dict[str, np.ndarray] | None:
+    def flush_denormals(self) -> dict[str, np.ndarray] | None:
         """The feeds as a processor sees them that takes denormals for zero, None where there are none."""
         tiny = np.finfo(np.float32).tiny
         denormal = {n: (a != 0) & (np.abs(a) < tiny) for n, a in self.feeds.items() if a.dtype == np.float32}
@@ -100,18 +100,18 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
         cases.append(_case(signature, rng, "pixels at their ends", 3, _typical, pixels=_ends))
         cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical, pixels=_dim_and_bright))
         if any(_is_free(s) for s in signature.inputs):
-            pattern = len(_opposed(signature))
+            pattern = len(_opposite_signs(signature))
             if pattern * _pixels(signature) <= MAX_PIXELS:
                 cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature, EXTREMES[:1])))
             cases.append(_case(signature, rng, "8 to 1e4", len(FAR), _far(signature, few=True)))
         pixels = _pixels(signature)
         for batch in (n for n in PATTERN_BATCHES_OF_IMAGES if n * pixels <= MAX_PIXELS) if pixels else ():
             name = f"images with structure, batch {batch}"
-            cases.append(_case(signature, rng, name, batch, _every_pattern, pixels=_structured(batch)))
+            cases.append(_case(signature, rng, name, batch, _every_pattern, pixels=_image_sampler(batch)))
         return cases
     cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
     if any(_is_free(s) for s in signature.inputs):
-        pattern = len(_opposed(signature))
+        pattern = len(_opposite_signs(signature))
         cases.append(_case(signature, rng, "opposite extremes", pattern * len(EXTREMES), _opposite(signature)))
         cases.append(_case(signature, rng, "8 to 1e4", 2 * pattern * len(FAR), _far(signature)))
         cases.append(_case(signature, rng, "one number far away", _FEW_FAR, _one_far))
@@ -249,9 +249,9 @@ def _ends(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     return pixels
 
 
-def _structured(batch: int) -> Pixels:
+def _image_sampler(batch: int) -> Pixels:
     def pixels(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        return structured(rng, shape, first=batch // 4)  # another batch begins with other ones
+        return structured_images(rng, shape, first=batch // 4)  # another batch begins with other ones
 
     return pixels
 
@@ -353,7 +353,7 @@ def _is_free(spec: TensorSpec) -> bool:
     return spec.role not in decided and np.dtype(spec.dtype).kind not in "iu"
 
 
-def _opposed(signature: PolicySignature) -> np.ndarray:
+def _opposite_signs(signature: PolicySignature) -> np.ndarray:
     """Signs, [rows, numbers of all inputs]: every two numbers have both pairs of opposite signs in some row.
 
     Of two numbers, some bit of their places differs; a row for each bit and one for its complement, and one for each
@@ -382,10 +382,10 @@ def _numbers(shape: Sequence[int | None]) -> int:
 
 
 def _signs(signature: PolicySignature, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
-    """The part of ``_opposed`` that is ``spec``'s, repeated as often as ``shape`` has room for it."""
+    """The part of ``_opposite_signs`` that is ``spec``'s, repeated as often as ``shape`` has room for it."""
     before = [s for s in signature.inputs[: signature.inputs.index(spec)] if _is_free(s)]
     start = sum(_numbers(s.shape) for s in before)
-    own = _opposed(signature)[:, start : start + _numbers(spec.shape)]
+    own = _opposite_signs(signature)[:, start : start + _numbers(spec.shape)]
     return own[np.arange(shape[0] if shape else 1) % len(own)].reshape(shape)
 
 
@@ -398,14 +398,14 @@ def _opposite(signature: PolicySignature, strata: Sequence[tuple[float, float]] 
 
 
 def _far(signature: PolicySignature, *, few: bool = False) -> Style:
-    """The sizes of ``FAR`` with the signs of ``_opposed``, or with ``few`` a row of each, signs drawn."""
+    """The sizes of ``FAR`` with the signs of ``_opposite_signs``, or with ``few`` a row of each, signs drawn."""
 
     def style(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:
         if few:
             return np.asarray(rng.choice([-1.0, 1.0], shape) * _sizes(rng, FAR, shape))
         sizes = _sizes(rng, FAR, shape)
         # Of each stratum the signs twice: each number of its own size, and all numbers of a row alike.
-        same = np.arange(len(sizes)) // len(_opposed(signature)) % 2 == 1
+        same = np.arange(len(sizes)) // len(_opposite_signs(signature)) % 2 == 1
         if sizes.size:
             sizes[same] = sizes[same].reshape(int(same.sum()), -1)[:, :1].reshape(-1, *(1,) * (len(shape) - 1))
         return np.asarray(_signs(signature, spec, shape) * sizes)

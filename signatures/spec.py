@@ -140,7 +140,7 @@ class PolicySignature:
 
     def input(self, name: str) -> TensorSpec:
         """The input called ``name``; KeyError if there is none."""
-        return _named(self.inputs, name)
+        return _spec_named(self.inputs, name)
 
     def has_input(self, name: str) -> bool:
         """Whether an input is called ``name``."""
@@ -148,7 +148,7 @@ class PolicySignature:
 
     def output(self, name: str) -> TensorSpec:
         """The output called ``name``; KeyError if there is none."""
-        return _named(self.outputs, name)
+        return _spec_named(self.outputs, name)
 
     def rows(self, feeds: Mapping[str, np.ndarray]) -> int:
         """The batch that ``feeds`` have: a parameter's first axis may be longer, it is not free."""
@@ -219,7 +219,7 @@ def _cut(name: str) -> str:
     return name if len(name) <= 30 else f"{name[:29]}…"
 
 
-def _named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
+def _spec_named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
     for spec in specs:
         if spec.name == name:
             return spec
@@ -251,12 +251,12 @@ class SourceMap:
     rows: int | None = None
     parts: Mapping[str, tuple[SourcePart, ...]] = field(default_factory=dict)
 
-    def fetched(self) -> list[str]:
+    def all_fetches(self) -> list[str]:
         """Every tensor of the source that it may be asked for."""
         parts = [p.tensor for given in self.parts.values() for p in given]
         return list(dict.fromkeys([*self.fetches.values(), *parts, *(b for b in self.branches if b is not None)]))
 
-    def fed(self) -> list[str]:
+    def all_feeds(self) -> list[str]:
         """Every tensor of the source that may be fed."""
         return list(dict.fromkeys([*self.feeds.values(), *self.fixed, *self.batch_sizes, *self.noise]))
 

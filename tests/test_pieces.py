@@ -39,11 +39,11 @@ def test_an_array_of_any_layout_is_written_as_its_numbers(layout: str, tmp_path:
     array = LAYOUTS[layout]
     expected = array.astype(array.dtype.newbyteorder("<")).tobytes()
     whole = Pieces(b"before", array, b"behind")
-    assert whole.joined() == b"before" + expected + b"behind"
+    assert whole.to_bytes() == b"before" + expected + b"behind"
     assert whole.write(tmp_path / "file") == sha256_hex((tmp_path / "file").read_bytes())
     assert whole.size == (tmp_path / "file").stat().st_size
     cuts = sorted([0, 3, 8, whole.size // 3 + 1, whole.size - 3, whole.size + 9])
-    assert b"".join(whole.part(a, b).joined() for a, b in pairwise(cuts)) == whole.joined()
+    assert b"".join(whole.part(a, b).to_bytes() for a, b in pairwise(cuts)) == whole.to_bytes()
 
 
 def test_arrays_are_equal_where_their_bytes_are() -> None:
@@ -62,7 +62,7 @@ def test_a_message_without_its_weights_becomes_the_same_again() -> None:
     data, detached = graph_of_weights(), Detached()
     message = schema.parse(schema.GraphDef, data, "graph", detached)
     assert len(schema.serialise(message)) < 3 * LARGE
-    assert schema.pieces(message, detached).joined() == data
+    assert schema.pieces(message, detached).to_bytes() == data
     for node in read_graph(data).nodes:
         assert node.value is not None
         np.testing.assert_array_equal(node.value, np.arange(node.value.size))

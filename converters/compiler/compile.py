@@ -101,7 +101,7 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         roles = classify_inputs(graph, brain, options.inputs, facts.roles, declared=bool(facts.outputs))
         canonical = brain.canonical
         outputs = [(canonical[base], reference) for base, _, reference in brain.outputs if base in canonical]
-        upstream = graph.pruned([reference for _, reference in outputs])
+        upstream = graph.prune([reference for _, reference in outputs])
         for what, count, most in (
             ("nodes", len(upstream.nodes), MAX_NODES),
             ("tensors that its nodes read", sum(len(n.inputs) for n in upstream.nodes), MAX_READ),

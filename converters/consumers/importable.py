@@ -23,7 +23,7 @@ def importable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None
     for path, data in files.items():
         if not path.endswith(".onnx"):
             continue
-        model = constructs(onnx.ModelProto.FromString(data.joined()))
+        model = constructs(onnx.ModelProto.FromString(data.to_bytes()))
         found = list(misreadings(model, profile.importers))
         unknown = [c for c in model if c.op not in MEASURED]
         if found:

@@ -31,10 +31,10 @@ def _verdicts(profile: Profile, files: Mapping[str, Pieces]) -> Iterator[UnityVe
     releases = [consumer(player) for player in profile.players]
     for path, data in files.items():
         if path.endswith(".onnx"):
-            file = parsed_onnx(data.joined())
+            file = parsed_onnx(data.to_bytes())
             yield from (check_onnx(file, Path(path), r) for r in releases if "onnx" in r.formats)
         elif path.endswith(".nn"):
-            model = parse(data.joined())
+            model = parse(data.to_bytes())
             yield from (check_nn(model, Path(path), r) for r in releases if "nn" in r.formats)
 
 

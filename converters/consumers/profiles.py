@@ -8,7 +8,7 @@ from converters.consumers.mlagents import version2, version3
 from converters.consumers.mlagents.tensorflowsharp import Generation, dress
 from converters.consumers.profile import Profile
 from converters.consumers.unity.consumers import releases_for
-from signatures.errors import UsageError, meant
+from signatures.errors import UsageError, suggestion
 
 #: What CoreBrainInternal.cs gave as pictures until 0.4.0b.
 _GREY = "0.4.0 and 0.4.0a give grey ones from 0 to 255, not to 1: use 0.4.0b for those"
@@ -85,7 +85,7 @@ def profile(name: str) -> Profile:
     for known in PROFILES:
         if name.lower() in (known.name, *known.aliases):
             return known
-    close = meant(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
+    close = suggestion(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
     raise UsageError(
         f"--for {name}: there is no such profile",
         fix=f"{close}the profiles are {', '.join(p.name for p in PROFILES)}",

@@ -78,7 +78,7 @@ class Pieces:
             at += len(part)
         return Pieces(*found)
 
-    def joined(self) -> bytes:
+    def to_bytes(self) -> bytes:
         """All of it in memory."""
         return b"".join(self.chunks())
 
@@ -86,7 +86,7 @@ class Pieces:
         """Write the file; returns its sha256. Raises OSError."""
         digest = hashlib.sha256()
         with path.open("wb") as file:
-            for chunk in self.chunks() if self.size > _CHUNK else (self.joined(),):
+            for chunk in self.chunks() if self.size > _CHUNK else (self.to_bytes(),):
                 digest.update(chunk)
                 file.write(chunk)
         found: str = digest.hexdigest()

@@ -108,7 +108,7 @@ class Detached:
             return [array]
         parts: list[bytes | np.ndarray] = []
         kept = next_place = 0
-        for _, tag_end, start, end in _delimited(view, _MARK_BYTES):
+        for _, tag_end, start, end in _byte_fields(view, _MARK_BYTES):
             first = next_place
             while next_place < len(places) and places[next_place] < offset + end:
                 next_place += 1
@@ -135,10 +135,10 @@ class _NoMessageError(Exception):
 
 def _large(view: memoryview) -> Iterator[tuple[int, int, int, int]]:
     """The large fields. A message of more fields than any model's is left to protobuf, which is quicker with them."""
-    return _delimited(view, LARGE, MAX_FIELDS)
+    return _byte_fields(view, LARGE, MAX_FIELDS)
 
 
-def _delimited(view: memoryview, least: int, most: int | None = None) -> Iterator[tuple[int, int, int, int]]:
+def _byte_fields(view: memoryview, least: int, most: int | None = None) -> Iterator[tuple[int, int, int, int]]:
     """(number, end of the tag, start, end) of each field of bytes that has at least so many.
 
     Raises _NoMessageError for what is no message, or has more fields than ``most``.

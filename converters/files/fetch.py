@@ -61,14 +61,14 @@ class Fetched:
 
     def digest(self, files: Iterable[Path]) -> str:
         """The sha256 of a single file, or of the hashes of several in the order of their names. Raises SourceError for
-        what ``opened`` refuses, and where all together are larger than weights may be.
+        what ``open_regular_file`` refuses, and where all together are larger than weights may be.
         """
         left, hashes = MAX_WEIGHTS, []
         for each in sorted(set(files)):
             if each in self._read:
                 hashes.append(sha256_hex(self._read[each]))
                 continue
-            with opened(each, left) as file:
+            with open_regular_file(each, left) as file:
                 left -= os.fstat(file.fileno()).st_size
                 hashes.append(sha256_of_stream(file))
         return hashes[0] if len(hashes) == 1 else sha256_hex("\n".join(hashes).encode())
@@ -78,7 +78,7 @@ def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> byt
     """The file's bytes. Raises SourceError where it is missing, a folder or unreadable, DamagedFileError where it is
     empty, unless it may be; ``most`` bytes are read.
     """
-    with opened(path, most) as file:
+    with open_regular_file(path, most) as file:
         try:
             data = file.read(os.fstat(file.fileno()).st_size)
         except OSError as error:
@@ -88,7 +88,7 @@ def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> byt
     return data
 
 
-def opened(path: Path, most: int = MAX_BYTES) -> BinaryIO:
+def open_regular_file(path: Path, most: int = MAX_BYTES) -> BinaryIO:
     """A file that was written, open to be read: no pipe, device or folder, no circle of links, and not mostly a hole.
 
     Raises SourceError, too where it has more than ``most`` bytes.
@@ -185,7 +185,7 @@ def _missing(path: Path) -> SourceError:
     known = address.partition("://")[0] in FETCHED
     return SourceError(
         "is an address, not a file",
-        where=shown(path),
+        where=path_text(path),
         why=f"only {', '.join(FETCHED)} are fetched" if fetches() else "nothing is fetched from the network",
         fix=f"{fix}; or pip install 'export-model[remote]'" if known and not fetches() else fix,
     )
@@ -197,7 +197,7 @@ def address_of(path: Path) -> str | None:
     return None if scheme is None else f"{scheme[1]}://{path.as_posix()[scheme.end() :]}"
 
 
-def shown(path: Path | str) -> str:
+def path_text(path: Path | str) -> str:
     """A path as it is told and written down: of an address no user, password or query, which may be a signature."""
     address = address_of(Path(path))
     if address is None:

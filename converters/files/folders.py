@@ -41,7 +41,7 @@ class OwnFolder:
             _LIVE[self.path] = None  # before it is there: whenever this process is told to stop, it is known
             try:
                 self.path.mkdir(0o700)
-                _LIVE[self.path] = _held(self.path)
+                _LIVE[self.path] = _lock_folder(self.path)
                 (self.path / MARKER).write_bytes(OURS)
             except (FileExistsError, FileNotFoundError):  # the name is taken; or another run swept it, yet unmarked
                 _forget(self.path)
@@ -85,7 +85,7 @@ def remove_all() -> None:
 def sweep(parent: Path, prefix: str) -> None:
     """Remove what killed runs have left in ``parent``."""
     for left in left_in(parent, prefix):
-        with contextlib.suppress(OSError), taken(left) as ours:  # another run may sweep, too
+        with contextlib.suppress(OSError), try_lock(left) as ours:  # another run may sweep, too
             if ours is None:
                 ours = time.time() - left.stat().st_mtime >= _STALE_SECONDS
             if ours and not _holds_something_old(left):
@@ -93,13 +93,13 @@ def sweep(parent: Path, prefix: str) -> None:
 
 
 @contextlib.contextmanager
-def taken(path: Path) -> Iterator[bool | None]:
+def try_lock(path: Path) -> Iterator[bool | None]:
     """Whether nobody who lives holds a folder of ours; then nobody else can until the block ends.
 
     None where that cannot be known. Raises OSError.
     """
     try:
-        descriptor = _held(path)
+        descriptor = _lock_folder(path)
     except FileExistsError:
         yield False
         return
@@ -136,7 +136,7 @@ def _holds_something_old(path: Path) -> bool:
     return any((path / "old").glob("*"))
 
 
-def _held(path: Path) -> int | None:
+def _lock_folder(path: Path) -> int | None:
     """A descriptor that locks the folder until it is closed, or this process ends; None: there are no locks here.
 
     Raises FileExistsError where another holds it, OSError.

@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 
 from converters.files.external_data import LARGE_FILE
-from converters.files.fetch import MAX_BYTES, opened, read_bytes
+from converters.files.fetch import MAX_BYTES, open_regular_file, read_bytes
 
 #: Of a system that cannot be told to forget pages, they leave with the view.
 _FORGET: int | None = getattr(mmap, "MADV_DONTNEED", None)
@@ -26,7 +26,7 @@ class Mapped:
 
     def read(self, path: Path, *, most: int = MAX_BYTES) -> bytes | memoryview:
         """The content of a file. Raises SourceError, DamagedFileError as ``read_bytes`` does."""
-        with opened(path, most) as file:
+        with open_regular_file(path, most) as file:
             if os.fstat(file.fileno()).st_size < LARGE_FILE:
                 return read_bytes(path, most=most)
             try:

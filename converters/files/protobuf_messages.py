@@ -60,13 +60,13 @@ def _classes_in_c(library: Any, file: bytes, package: str, messages: Mapping[str
     pool.AddSerializedFile(file)
     classes: dict[str, Any] = {}
 
-    def made(descriptor: Any) -> Any:
+    def message_class(descriptor: Any) -> Any:
         return library.MessageMeta(descriptor.name, (Message,), {"DESCRIPTOR": descriptor, "__module__": None})
 
     for name in messages:
         descriptor = pool.FindMessageTypeByName(f"{package}.{name}")
-        classes[name] = made(descriptor)
-        classes.update({entry.full_name: made(entry) for entry in descriptor.nested_types})
+        classes[name] = message_class(descriptor)
+        classes.update({entry.full_name: message_class(entry) for entry in descriptor.nested_types})
     return classes
 
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from converters.files.unpickle import StorageType, Tensor, unpickle
-from converters.files.zip_archives import ZIP_ERRORS, opened
+from converters.files.zip_archives import ZIP_ERRORS, open_archive
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass
 
@@ -58,19 +58,21 @@ class Archive:
         """
         storage = tensor.storage
         if not isinstance(storage, Storage):
-            raise _damaged(f"{name}: its storage is none", "the pickle is damaged")
+            raise _damaged_error(f"{name}: its storage is none", "the pickle is damaged")
         data = self._storages.get(storage.key)
         if data is None:
-            raise _damaged(f"{name}: its storage {storage.key!r} is not in the file", "the file is cut or was edited")
+            raise _damaged_error(
+                f"{name}: its storage {storage.key!r} is not in the file", "the file is cut or was edited"
+            )
         dtype = np.dtype("uint16" if storage.dtype == "bfloat16" else storage.dtype).newbyteorder(self._order)
         count = math.prod(tensor.shape)
         last = tensor.offset + sum((n - 1) * s for n, s in zip(tensor.shape, tensor.strides, strict=True))
         if count and (last >= storage.count or storage.count * dtype.itemsize > len(data)):
-            raise _damaged(f"{name}: it reaches beyond its storage", "the file is cut off or damaged")
+            raise _damaged_error(f"{name}: it reaches beyond its storage", "the file is cut off or damaged")
         # A tensor that repeats its storage (stride 0), and many tensors of one storage, could ask for any memory.
         self._given += count * dtype.itemsize
         if count > storage.count or self._given > 4 * len(self._data):
-            raise _damaged(f"{name}: it has more numbers than the file", "no trainer repeats a weight")
+            raise _damaged_error(f"{name}: it has more numbers than the file", "no trainer repeats a weight")
         if not count:
             return np.zeros(tuple(min(n, 1) for n in tensor.shape), dtype.newbyteorder("="))
         flat = np.frombuffer(data, dtype, storage.count)[tensor.offset :]
@@ -85,10 +87,10 @@ class Archive:
     def _persistent(self, identity: tuple[Any, ...]) -> Storage:
         """``("storage", storage type, key, device, elements)``; before PyTorch 1.6 a view's place follows."""
         if len(identity) < 5 or identity[0] not in ("storage", b"storage"):
-            raise _damaged("a persistent id is no storage's", "the pickle is damaged")
+            raise _damaged_error("a persistent id is no storage's", "the pickle is damaged")
         kind, key, count = identity[1], identity[2], identity[4]
         if not isinstance(kind, StorageType) or not isinstance(key, str) or not isinstance(count, int):
-            raise _damaged("a storage has no type, key or length", "the pickle is damaged")
+            raise _damaged_error("a storage has no type, key or length", "the pickle is damaged")
         if identity[5:] not in ((), (None,)):
             raise NotAPolicyError(
                 "it holds a storage that is a view of another",
@@ -97,7 +99,7 @@ class Archive:
             )
         width = 2 if kind.dtype == "bfloat16" else np.dtype(kind.dtype).itemsize
         if not 0 <= count * width <= len(self._data):
-            raise _damaged(
+            raise _damaged_error(
                 f"the storage {key!r} should have {count} numbers, more than the file", "the file is cut off or damaged"
             )
         return Storage(key, kind.dtype, count)
@@ -106,11 +108,11 @@ class Archive:
 
     def _zip(self) -> Any:
         try:
-            with opened(self._data) as archive:
+            with open_archive(self._data) as archive:
                 entries = {e.filename: e for e in archive.infolist()}
                 names = [n for n in entries if n == "data.pkl" or n.endswith("/data.pkl")]
                 if len(names) != 1:
-                    raise _damaged("it has no data.pkl, or more than one", "torch.save writes one")
+                    raise _damaged_error("it has no data.pkl, or more than one", "torch.save writes one")
                 root = names[0].removesuffix("data.pkl")
                 if f"{root}constants.pkl" in entries or any(n.startswith(f"{root}code/") for n in entries):
                     raise NotAPolicyError(
@@ -123,13 +125,13 @@ class Archive:
                     self._order = ">"
                 for name, entry in entries.items():
                     if name.startswith(f"{root}data/"):
-                        self._storages[name.removeprefix(f"{root}data/")] = self._stored(entry)
+                        self._storages[name.removeprefix(f"{root}data/")] = self._uncompressed_entry(entry)
                 pickle = archive.read(names[0])
         except ZIP_ERRORS as error:
-            raise _damaged(f"its archive cannot be read: {error}", "the file is cut off or damaged") from error
+            raise _damaged_error(f"its archive cannot be read: {error}", "the file is cut off or damaged") from error
         return unpickle(io.BytesIO(pickle), self._persistent)
 
-    def _stored(self, entry: zipfile.ZipInfo) -> memoryview:
+    def _uncompressed_entry(self, entry: zipfile.ZipInfo) -> memoryview:
         """What ``ZipFile.read`` gives of an entry that is not compressed, without a copy. Raises what that raises."""
         at, view = entry.header_offset, memoryview(self._data)
         mark, flags, name, extra = struct.unpack_from("<4s2xH18xHH", view, at)
@@ -151,7 +153,9 @@ class Archive:
                     fix="give the file as training left it",
                 )
         if sum(entry.file_size for entry in entries) > len(self._data):
-            raise _damaged("its entries are larger than the file", "they overlap: the file was edited or is damaged")
+            raise _damaged_error(
+                "its entries are larger than the file", "they overlap: the file was edited or is damaged"
+            )
 
     # ------------------------------------------------------------------ pickles in a row
 
@@ -164,7 +168,7 @@ class Archive:
                 fix=_FOREIGN,
             )
         if unpickle(stream, _none) != _PROTOCOL:
-            raise _damaged("its protocol is not 1001", "no PyTorch wrote another")
+            raise _damaged_error("its protocol is not 1001", "no PyTorch wrote another")
         system = unpickle(stream, _none)
         if isinstance(system, dict) and system.get("little_endian") is False:
             self._order = ">"
@@ -177,25 +181,27 @@ class Archive:
         value = unpickle(stream, persistent)
         keys = unpickle(stream, _none)
         if not isinstance(keys, list):
-            raise _damaged("its list of storages is none", "the file is damaged")
+            raise _damaged_error("its list of storages is none", "the file is damaged")
         view, at = memoryview(self._data), stream.tell()
         for key in keys:
             if not isinstance(key, str) or key not in found or key in self._storages:
-                raise _damaged("its list of storages names one that no tensor has", "the file is damaged")
+                raise _damaged_error("its list of storages names one that no tensor has", "the file is damaged")
             storage = found[key]
             width = 2 if storage.dtype == "bfloat16" else np.dtype(storage.dtype).itemsize
             count = int.from_bytes(view[at : at + 8], "little" if self._order == "<" else "big")
             end = at + 8 + count * width
             if count != storage.count or end > len(view):
-                raise _damaged(f"its storage {key!r} is not as long as it should be", "the file is cut off or damaged")
+                raise _damaged_error(
+                    f"its storage {key!r} is not as long as it should be", "the file is cut off or damaged"
+                )
             self._storages[key] = view[at + 8 : end]
             at = end
         return value
 
 
 def _none(identity: tuple[Any, ...]) -> Storage:
-    raise _damaged("a tensor stands where none belongs", "the pickle is damaged")
+    raise _damaged_error("a tensor stands where none belongs", "the pickle is damaged")
 
 
-def _damaged(what: str, why: str) -> DamagedFileError:
+def _damaged_error(what: str, why: str) -> DamagedFileError:
     return DamagedFileError(what, why=why, fix=_COPY_AGAIN)

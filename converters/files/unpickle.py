@@ -82,14 +82,14 @@ def unpickle(stream: IO[bytes], storage: Callable[[tuple[Any, ...]], Any]) -> An
             warnings.simplefilter("ignore")
             for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
                 if count > MAX_OPCODES:
-                    raise _damaged(f"its pickle has more than {MAX_OPCODES} opcodes")
+                    raise _damaged_error(f"its pickle has more than {MAX_OPCODES} opcodes")
                 if opcode.name == "STOP":
                     return machine.pop()
                 machine.run(opcode.name, argument)
     except (ValueError, IndexError, KeyError, OverflowError, TypeError, AttributeError) as error:
         text = str(error).strip().splitlines()
-        raise _damaged(f"its pickle cannot be read: {text[0] if text else type(error).__name__}") from error
-    raise _damaged("its pickle has no end")
+        raise _damaged_error(f"its pickle cannot be read: {text[0] if text else type(error).__name__}") from error
+    raise _damaged_error("its pickle has no end")
 
 
 class _Machine:
@@ -114,14 +114,14 @@ class _Machine:
     def push(self, value: Any) -> None:
         """Put a value on the stack."""
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:  # Python would not write it as text
-            raise _damaged(f"its pickle holds a number of {value.bit_length()} bits")
+            raise _damaged_error(f"its pickle holds a number of {value.bit_length()} bits")
         self.stack.append(value)
 
     def pop(self) -> Any:
         """The top of the stack."""
         value = self.stack.pop()
         if value is _MARK:
-            raise _damaged("its pickle takes a mark for a value")
+            raise _damaged_error("its pickle takes a mark for a value")
         return value
 
     def last(self, count: int) -> tuple[Any, ...]:
@@ -135,12 +135,12 @@ class _Machine:
                 found = self.stack[at + 1 :]
                 del self.stack[at:]
                 return found
-        raise _damaged("its pickle asks for a mark that is not there")
+        raise _damaged_error("its pickle asks for a mark that is not there")
 
     def top(self, kind: type) -> Any:
         """The container that is being filled."""
         if not isinstance(self.stack[-1], kind):
-            raise _damaged(f"its pickle fills something that is no {kind.__name__}")
+            raise _damaged_error(f"its pickle fills something that is no {kind.__name__}")
         return self.stack[-1]
 
     def extend(self, values: Sequence[Any]) -> None:
@@ -152,10 +152,10 @@ class _Machine:
         target = self.top(dict)
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, _KEYS):
-                raise _damaged(f"a key in its pickle is a {type(key).__name__}")
+                raise _damaged_error(f"a key in its pickle is a {type(key).__name__}")
             target[key] = value
 
-    def filled(self, items: Sequence[Any]) -> None:
+    def push_dict(self, items: Sequence[Any]) -> None:
         """Put a new dictionary of these keys and values on the stack."""
         self.stack.append({})
         self.fill(items)
@@ -164,17 +164,17 @@ class _Machine:
         """The name that two texts on the stack are."""
         module, name = self.last(2)
         if not isinstance(name, str) or not isinstance(module, str):
-            raise _damaged("its pickle imports something that has no name")
-        return _named(module, name)
+            raise _damaged_error("its pickle imports something that has no name")
+        return _global(module, name)
 
     def reduce(self) -> Any:
         """What a call gives."""
         function, arguments = self.last(2)
         if not isinstance(function, _Function) or not isinstance(arguments, tuple):
-            raise _damaged("its pickle calls something that is no function")
+            raise _damaged_error("its pickle calls something that is no function")
         self.copied += sum(len(a) for a in arguments if isinstance(a, tuple | list | dict | str | bytes))
         if self.copied > MAX_COPIED:
-            raise _damaged(f"the calls of its pickle copy more than {MAX_COPIED} items")
+            raise _damaged_error(f"the calls of its pickle copy more than {MAX_COPIED} items")
         return function.make(arguments)
 
     def build(self) -> None:
@@ -186,7 +186,7 @@ class _Machine:
         """What a persistent id stands for."""
         identity = self.pop()
         if not isinstance(identity, tuple):
-            raise _damaged("a persistent id in its pickle is no tuple")
+            raise _damaged_error("a persistent id in its pickle is no tuple")
         return self.storage(identity)
 
 
@@ -212,7 +212,7 @@ _OPCODES: dict[str, Callable[[_Machine, Any], object]] = {
     "LIST": lambda m, _: m.stack.append(m.items()),
     "APPEND": lambda m, _: m.extend(m.last(1)),
     "APPENDS": lambda m, _: m.extend(m.items()),
-    "DICT": lambda m, _: m.filled(m.items()),
+    "DICT": lambda m, _: m.push_dict(m.items()),
     "SETITEM": lambda m, _: m.fill(m.last(2)),
     "SETITEMS": lambda m, _: m.fill(m.items()),
     "POP": lambda m, _: m.stack.pop(),
@@ -221,7 +221,7 @@ _OPCODES: dict[str, Callable[[_Machine, Any], object]] = {
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), lambda m, index: m.memo.update({index: m.stack[-1]})),
     "MEMOIZE": lambda m, _: m.memo.update({len(m.memo): m.stack[-1]}),
     **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda m, index: m.stack.append(m.memo[index])),
-    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(_named(*name.partition(" ")[::2]))),
+    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(_global(*name.partition(" ")[::2]))),
     "STACK_GLOBAL": lambda m, _: m.stack.append(m.stack_global()),
     "REDUCE": lambda m, _: m.stack.append(m.reduce()),
     "BUILD": lambda m, _: m.build(),
@@ -238,7 +238,7 @@ def _ordered_dict(arguments: tuple[Any, ...]) -> dict[Any, Any]:
     for pair in arguments[0] if arguments else ():
         key, value = pair
         if not isinstance(key, _KEYS):
-            raise _damaged(f"a key in its pickle is a {type(key).__name__}")
+            raise _damaged_error(f"a key in its pickle is a {type(key).__name__}")
         made[key] = value
     return made
 
@@ -247,9 +247,9 @@ def _tensor(arguments: tuple[Any, ...]) -> Tensor:
     """``_rebuild_tensor_v2(storage, storage_offset, size, stride, requires_grad, backward_hooks, metadata)``."""
     storage, offset, shape, strides = arguments[:4]
     if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) != len(strides):
-        raise _damaged("a tensor's shape and strides do not fit together")
+        raise _damaged_error("a tensor's shape and strides do not fit together")
     if len(shape) > MAX_AXES or not all(_is_count(n) for n in (offset, *shape, *strides)):
-        raise _damaged("a tensor's shape or strides are none")
+        raise _damaged_error("a tensor's shape or strides are none")
     return Tensor(storage, offset, shape, strides)
 
 
@@ -294,7 +294,7 @@ _OTHERS: tuple[tuple[tuple[str, ...], str, str], ...] = (
 )
 
 
-def _named(module: str, name: str) -> Any:
+def _global(module: str, name: str) -> Any:
     found = _NAMES.get((module, name))
     if found is None:
         parts = module[:100].split(".")
@@ -305,5 +305,5 @@ def _named(module: str, name: str) -> Any:
     return found
 
 
-def _damaged(what: str) -> DamagedFileError:
+def _damaged_error(what: str) -> DamagedFileError:
     return DamagedFileError(what, why="the file is cut off or damaged", fix="copy or download it again")

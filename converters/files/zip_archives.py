@@ -21,7 +21,7 @@ ZIP_ERRORS = (
 )
 
 
-def opened(data: bytes) -> zipfile.ZipFile:
+def open_archive(data: bytes) -> zipfile.ZipFile:
     """An archive whose entries were looked at. Raises one of ZIP_ERRORS."""
     archive = zipfile.ZipFile(io.BytesIO(data))
     seen: set[str] = set()

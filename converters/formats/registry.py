@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 
 from converters.formats.format import Format
-from signatures.errors import UsageError, meant
+from signatures.errors import UsageError, suggestion
 
 #: Packages of ``converters``, in the order in which formats are recognised, written and reported.
 ROOMS = (
@@ -34,7 +34,8 @@ def written(key: str) -> Format:
     """The format of a word of ``--to``. Raises UsageError."""
     if key not in WRITTEN:
         raise UsageError(
-            f"--to {key}: there is no such format", fix=f"{meant(key, WRITTEN)}the formats are {', '.join(WRITTEN)}"
+            f"--to {key}: there is no such format",
+            fix=f"{suggestion(key, WRITTEN)}the formats are {', '.join(WRITTEN)}",
         )
     return WRITTEN[key]
 

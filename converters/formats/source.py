@@ -42,7 +42,7 @@ class OriginalRun:
         """
         if self.definition is None:
             return self
-        asked = source_map.fetched(), source_map.fed()
+        asked = source_map.all_fetches(), source_map.all_feeds()
         check(self.definition, *asked)
         return replace(self, asked=asked)
 

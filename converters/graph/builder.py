@@ -169,13 +169,13 @@ class Builder:
         """The value of a tensor that is the same in every run."""
         return None if reference in self.tainted else self.types[reference].constant
 
-    def known(self, reference: str) -> np.ndarray | None:
+    def constant_of(self, reference: str) -> np.ndarray | None:
         """The value of a tensor under what is assumed of the inputs (``sequence_length`` is 1)."""
         return self.types[reference].constant
 
     def needed_constant(self, reference: str, meaning: str) -> np.ndarray:
         """The value of an operand that must be known; raises UnsupportedOpError."""
-        value = self.known(reference)
+        value = self.constant_of(reference)
         if value is None:
             raise UnsupportedOpError(
                 f"{meaning} is computed while the graph runs",
@@ -223,7 +223,7 @@ class Builder:
         except IndexError as error:
             raise UnsupportedOpError(str(error), why=_DAMAGED) from error
 
-    def joined(self, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
+    def common_shape(self, shapes: Sequence[tuple[Dim, ...]]) -> tuple[Dim, ...]:
         """The shape that several broadcast to; raises UnsupportedOpError where they do not."""
         dims: tuple[Dim, ...] | None = ()
         for shape in shapes:
@@ -367,5 +367,5 @@ class Builder:
             return self.add("Select", [condition, a, b])
         if self.is_float(a):
             return self.add("SelectV2", [condition, a, b])
-        dims = self.joined(shapes)
+        dims = self.common_shape(shapes)
         return self.add("Select", [self.broadcast(r, dims) for r in (condition, a, b)])

@@ -76,7 +76,7 @@ class Editor(Builder):
         for node in typed.nodes:
             older = op_of(node).older
             if older is None:
-                self.append(self._fed(node))
+                self.append(self._with_redirected_inputs(node))
             else:
                 attrs = {**node.attrs, "T": typed.dtype(node.inputs[-1])}
                 self.redirect(node.name, older(self, replace(node, attrs=attrs)))
@@ -84,7 +84,7 @@ class Editor(Builder):
 
     def _kind_of(self, reference: str) -> TensorType | None:
         while self._told < len(self.nodes):
-            node = self._fed(self.nodes[self._told])
+            node = self._with_redirected_inputs(self.nodes[self._told])
             self._told += 1
             with contextlib.suppress(ExportModelError, KeyError):  # of a loop, or of what nothing may need: not known
                 add_types(self._shapes, node, self._symbols, self._allowance)
@@ -98,11 +98,11 @@ class Editor(Builder):
     def keep(self, node: Node) -> None:
         """Take a node over, its inputs redirected."""
         if self._redirected:
-            node = self._fed(node)
+            node = self._with_redirected_inputs(node)
         self.position[node.name] = len(self.nodes)
         self.nodes.append(node)
 
-    def _fed(self, node: Node) -> Node:
+    def _with_redirected_inputs(self, node: Node) -> Node:
         if self._redirected.keys().isdisjoint(node.inputs):
             return node
         return node.with_inputs(self.resolve(r) for r in node.inputs)
@@ -126,14 +126,14 @@ class Editor(Builder):
         """A Const under the name of the node of the old graph that it stands for."""
         return self.append(Node(name, "Const", value=array, origin=origin))
 
-    def pruned(self, outputs: Iterable[str]) -> Graph:
+    def prune(self, outputs: Iterable[str]) -> Graph:
         """``graph``, where anything changed only what the outputs need, and what is fed."""
         made = self.graph()
-        return made if made is self._old else made.pruned([*outputs, *(n.name for n in made.nodes if is_fed(n))])
+        return made if made is self._old else made.prune([*outputs, *(n.name for n in made.nodes if is_fed(n))])
 
     def graph(self) -> Graph:
         """The new graph, redirections applied to all nodes, in topological order; the old one where nothing changed."""
-        nodes = [self._fed(n) for n in self.nodes] if self._redirected else self.nodes
+        nodes = [self._with_redirected_inputs(n) for n in self.nodes] if self._redirected else self.nodes
         if len(nodes) == len(self._old.nodes) and all(map(operator.is_, nodes, self._old.nodes)):
             return self._old
         return Graph(topological(nodes))

@@ -45,7 +45,7 @@ class Jitter:
         """
         if entry.precision != "summed":
             return list(operands)
-        return [self._moved(a) if a.size <= _MOST_DRAWN else a for a in operands]
+        return [self._perturb(a) if a.size <= _MOST_DRAWN else a for a in operands]
 
     def results(
         self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]
@@ -56,13 +56,13 @@ class Jitter:
         if entry.precision == "summed":
             results = self._added_up(entry, node, operands, results)
         known = self._approximations.get(entry.name, _ELSE if entry.precision == "approximate" else (1.0, 0.0))
-        moved = [self._moved(r, *known) for r in results]
+        moved = [self._perturb(r, *known) for r in results]
         return [r.clip(*RANGES[entry.name]) for r in moved] if entry.name in RANGES else moved
 
     def _signs(self, shape: tuple[int, ...]) -> np.ndarray:
         return np.where(self._random.random(shape) < 0.5, -1, 1)
 
-    def _moved(self, array: np.ndarray, ulps: float = 1, absolute: float = 0) -> np.ndarray:
+    def _perturb(self, array: np.ndarray, ulps: float = 1, absolute: float = 0) -> np.ndarray:
         """Every float moved up or down; zeros stay."""
         if array.dtype.kind != "f":
             return array

@@ -57,9 +57,9 @@ class Node:
 
     def with_inputs(self, inputs: Iterable[str]) -> Node:
         """The same node fed from other tensors."""
-        return self.moved(self.name, inputs)
+        return self.rewire(self.name, inputs)
 
-    def moved(self, name: str, inputs: Iterable[str]) -> Node:
+    def rewire(self, name: str, inputs: Iterable[str]) -> Node:
         """The same node under a name, fed from other tensors; what was inferred of it depends on neither."""
         fed = tuple(inputs)
         if fed == self.inputs and name == self.name:
@@ -100,7 +100,7 @@ def renamed_ref(reference: str, names: Mapping[str, str]) -> str:
     return ref(names.get(name, name), index)
 
 
-def reached(starts: Iterable[str], ahead: Callable[[str], Iterable[str]]) -> set[str]:
+def reachable(starts: Iterable[str], ahead: Callable[[str], Iterable[str]]) -> set[str]:
     """``starts`` and all names that ``ahead`` leads to from them."""
     seen: set[str] = set()
     stack = list(starts)
@@ -183,7 +183,7 @@ class Graph:
     def ancestors(self, references: Iterable[str], stop: frozenset[str] = frozenset()) -> set[str]:
         """Names of all nodes upstream of ``references``, themselves included; does not look behind ``stop``."""
         index = self._index
-        return reached(map(node_of, references), lambda n: () if n in stop else map(node_of, index[n].inputs))
+        return reachable(map(node_of, references), lambda n: () if n in stop else map(node_of, index[n].inputs))
 
     def descendants(self, names: Iterable[str]) -> set[str]:
         """Names of all nodes downstream of those called ``names``, themselves included, in a graph without loops."""
@@ -193,17 +193,17 @@ class Graph:
                 found.add(node.name)
         return found
 
-    def pruned(self, references: Iterable[str]) -> Graph:
+    def prune(self, references: Iterable[str]) -> Graph:
         """Only what is upstream of ``references``, in the same order."""
         keep = self.ancestors(references)
         return self if len(keep) == len(self.nodes) else Graph(tuple(n for n in self.nodes if n.name in keep))
 
-    def renamed(self, names: Mapping[str, str]) -> Graph:
+    def rename(self, names: Mapping[str, str]) -> Graph:
         """The graph with the nodes of ``names`` (old → new) renamed; their ``origin`` stays."""
         if not names:
             return self
         return Graph(
-            tuple(n.moved(names.get(n.name, n.name), (renamed_ref(r, names) for r in n.inputs)) for n in self.nodes)
+            tuple(n.rewire(names.get(n.name, n.name), (renamed_ref(r, names) for r in n.inputs)) for n in self.nodes)
         )
 
 
@@ -247,7 +247,7 @@ def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
     done: dict[str, bool] = {}  # False = being visited
     ordered: list[Node] = []
 
-    def visited(node: Node) -> tuple[Node, Iterator[str]]:
+    def start(node: Node) -> tuple[Node, Iterator[str]]:
         """A node, and the names of those that it reads and that are still to be looked at."""
         done[node.name] = False
         sources = (node_of(r) for r in node.inputs)
@@ -256,12 +256,12 @@ def topological(nodes: Sequence[Node]) -> tuple[Node, ...]:
     for root in nodes:
         if root.name in done:
             continue
-        stack = [visited(root)]
+        stack = [start(root)]
         while stack:
             node, sources = stack[-1]
             for source in sources:
                 if source not in done:
-                    stack.append(visited(index[source]))
+                    stack.append(start(index[source]))
                     break
                 if not done[source]:
                     raise GraphError(

@@ -101,7 +101,7 @@ def elements(x: Expression) -> list[Element]:
     return [e for e in every(x) if isinstance(e, Element)]
 
 
-def parted(stage: Stage, body: Expression) -> tuple[Counter, int, Expression, Expression] | None:
+def split_loop(stage: Stage, body: Expression) -> tuple[Counter, int, Expression, Expression] | None:
     """Where a loop of a stage is two, one after the other, as in a concatenation: (counter, where, before, after)."""
     if not (isinstance(body, Applied) and body.function == "select"):
         return None
@@ -167,7 +167,9 @@ class _Builder:
         result = Tensor(place, dtype, tuple(int(n) for n in shape))
         origin = self.node.origin
         source = "" if origin is None else f", {origin if isinstance(origin, str) else ' '.join(origin)}"
-        self.stages.append(Stage(result, counters, at, known(element(at)), f"{self.node.op} {self.node.name}{source}"))
+        self.stages.append(
+            Stage(result, counters, at, inline_scalars(element(at)), f"{self.node.op} {self.node.name}{source}")
+        )
         return result
 
     def reduce(
@@ -179,7 +181,7 @@ class _Builder:
         return Reduced(kind, counters, body(at), dtype) if counters else number(0)
 
 
-def known(x: Expression, swap: Mapping[int, Expression] | None = None) -> Expression:
+def inline_scalars(x: Expression, swap: Mapping[int, Expression] | None = None) -> Expression:
     """An expression with constants of one element as numbers, and others in the place of some (``swap``, by id)."""
     done: dict[int, Expression] = dict(swap or {})
 
@@ -209,7 +211,7 @@ def program_of(graph: Graph, feeds: Mapping[str, str], fetches: Mapping[str, str
 
     Raises UnsupportedOpError.
     """
-    graph = Graph(tuple(_for_one(n) for n in graph.nodes)).pruned(fetches.values())
+    graph = Graph(tuple(_for_one(n) for n in graph.nodes)).prune(fetches.values())
     builder = _Builder(graph)
     inputs: dict[str, Tensor] = {}
     names = {placeholder: name for name, placeholder in feeds.items()}
@@ -270,14 +272,14 @@ def _join(program: Program) -> None:
             if before is None or readers[place] > 1 or place in kept_places:
                 continue
             alike = all(id(e) not in within and _same_place(e, before, stage) for e in found)
-            if not alike or parted(before, before.body) or any(isinstance(x, Drawn) for x in every(before.body)):
+            if not alike or split_loop(before, before.body) or any(isinstance(x, Drawn) for x in every(before.body)):
                 continue
             turned = {id(a): b for a, b in zip(before.counters, stage.counters, strict=True)}
-            body = known(before.body, turned)
+            body = inline_scalars(before.body, turned)
             swap |= {id(e): body for e in found}
             gone.add(place)
         if swap:
-            stage.body = known(stage.body, swap)
+            stage.body = inline_scalars(stage.body, swap)
     program.stages = [s for s in program.stages if s.result.place not in gone]
 
 

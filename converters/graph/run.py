@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, reached, ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
 from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel_as_it_is
@@ -15,13 +15,13 @@ from signatures.errors import GraphError
 from signatures.records import dataclass
 
 
-def _needed(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:
+def _upstream_nodes(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:
     """Names of the nodes that must be computed: those upstream of ``fetch``, not behind tensors that are fed."""
 
     def makers(references: Iterable[str]) -> Iterator[str]:
         return (node_of(r) for r in references if r not in fed)
 
-    return reached(makers(map(normal_ref, fetch)), lambda name: makers(graph[name].inputs))
+    return reachable(makers(map(normal_ref, fetch)), lambda name: makers(graph[name].inputs))
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
     """The graph's own for these tensors: a policy is run hundreds of times for the same ones."""
     key = _plan, tuple(fed), tuple(fetch)
     if key not in graph.made:
-        needed = _needed(graph, fetch, fed)
+        needed = _upstream_nodes(graph, fetch, fed)
         constants, steps = dict[str, np.ndarray](), list[Node]()
         for node in graph.nodes:
             if node.name not in needed:

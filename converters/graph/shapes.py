@@ -39,11 +39,11 @@ def infer_types(graph: Graph, *, partial: bool = False) -> Types:
     contradict each other.
     """
     if partial not in graph.inferred:
-        graph.inferred[partial] = _inferred(graph, partial)
+        graph.inferred[partial] = _infer(graph, partial)
     return dict(graph.inferred[partial])
 
 
-def _inferred(graph: Graph, partial: bool) -> Types:
+def _infer(graph: Graph, partial: bool) -> Types:
     types: Types = {}
     symbols, allowance = Symbols(), Allowance()
     for node in graph.nodes:
@@ -89,7 +89,7 @@ def _inferred_anew(
     made = symbols.count
     results = _results(op_of(node), node, args, symbols, allowance)
     if symbols.count == made and allowance.left >= 0:
-        object.__setattr__(node, "inferred", (args, results, _folded(node, args, results)))
+        object.__setattr__(node, "inferred", (args, results, _folded_elements(node, args, results)))
     return results
 
 
@@ -99,7 +99,7 @@ def _are_same(now: Sequence[TensorType], before: Sequence[TensorType]) -> bool:
     )
 
 
-def _folded(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> int:
+def _folded_elements(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> int:
     """Elements of new memory that the values of results take; one for a view, so that it has its end, too."""
     values = [r.value for r in results if r.value is not None and r.value.size > _SMALL]
     if not values or not args:
@@ -150,7 +150,7 @@ def _results(
         folded: Sequence[TensorType] = [of_array(v) for v in run_kernel(op, node, known)]
     else:
         folded = _symbolic(op, node, args, known, results, symbols)
-    return folded if allowance.take(_folded(node, args, folded)) else results
+    return folded if allowance.take(_folded_elements(node, args, folded)) else results
 
 
 @cache
@@ -216,7 +216,7 @@ def _symbolic(
 ) -> Sequence[TensorType]:
     """Follow shape vectors that hold symbols through the ops that shape arithmetic is made of."""
     if op.moves:
-        positions = set(op.moved(range(len(values))))
+        positions = set(op.data_operands(range(len(values))))
         if any(v.dtype == object for i, v in enumerate(values) if i not in positions):
             return results
         objects = [v.astype(object) if i in positions else v for i, v in enumerate(values)]
@@ -230,7 +230,7 @@ def _symbolic(
     kind = results[0]
     if len(results) > 1 or kind.shape is None or not all(isinstance(d, int) for d in kind.shape):
         return results  # how much it makes depends on the symbols
-    found = _probed(op, node, values) if elements_of(kind) <= _SMALL else None
+    found = _probe(op, node, values) if elements_of(kind) <= _SMALL else None
     if found is None:
         return results
     for cell in np.ndindex(found.shape):
@@ -246,7 +246,7 @@ def _symbolic(
 _PROBES = (1, 2, 3, 5, 7, 11, (1 << 29) + 11)
 
 
-def _probed(op: OpDef, node: Node, values: Sequence[np.ndarray]) -> np.ndarray | None:
+def _probe(op: OpDef, node: Node, values: Sequence[np.ndarray]) -> np.ndarray | None:
     """Arithmetic on lengths, cell by cell: a number, a symbol, or None where it is neither; None for no array at all.
 
     A shape is computed by small steps (products, quotients, maxima with 0, broadcasting), each of which is looked at.

@@ -72,10 +72,10 @@ def broadcast(a: tuple[Dim, ...] | None, b: tuple[Dim, ...] | None, symbols: Sym
     rank = max(len(a), len(b))
     left = (1,) * (rank - len(a)) + a
     right = (1,) * (rank - len(b)) + b
-    return tuple(_joined(x, y, symbols) for x, y in zip(left, right, strict=True))
+    return tuple(_broadcast_dim(x, y, symbols) for x, y in zip(left, right, strict=True))
 
 
-def _joined(x: Dim, y: Dim, symbols: Symbols) -> Dim:
+def _broadcast_dim(x: Dim, y: Dim, symbols: Symbols) -> Dim:
     if x == y or y == 1:
         return x
     if x == 1:

@@ -58,7 +58,7 @@ class Evidence:
     holds: Callable[[Candidate], bool]
 
 
-def _named(given: Candidate) -> bool:
+def _has_q_name(given: Candidate) -> bool:
     return is_q_name(given.name)
 
 
@@ -83,7 +83,9 @@ def _trained_by_regression(given: Candidate) -> bool:
 
 
 EVIDENCE = (
-    Evidence("its name says so", "CleanRL (dqn.py, pqn.py: q_values), Keras and TensorFlow.js games (q, Q)", _named),
+    Evidence(
+        "its name says so", "CleanRL (dqn.py, pqn.py: q_values), Keras and TensorFlow.js games (q, Q)", _has_q_name
+    ),
     Evidence(
         "the network that makes it is named as one",
         "Stable-Baselines3 (dqn/policies.py: q_net.q_net.4.weight), TF-Agents (QNetwork/…), OpenAI Baselines "

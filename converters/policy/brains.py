@@ -138,7 +138,7 @@ def find_brains(
     """
     told = told or {}
     if wanted:
-        return _chosen(graph, wanted, declared, told)
+        return _brains_from_user(graph, wanted, declared, told)
     fed = depends_on_input(graph)
     given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
     says = {n: told[n].says if n in told and told[n].role is role else _KNOWN for n, role in given.items()}
@@ -153,7 +153,7 @@ def find_brains(
         scope = _scope_of(graph, [n for n, role in given.items() if role in ACTING])
         rest = [n for n in declared or () if n in fed and n not in given]
         others = _others(graph, outputs, rest, told)
-        return (Brain(scope, (*outputs, *others), _constants(graph, scope), says=says | _declared(others)),)
+        return (Brain(scope, (*outputs, *others), _constants(graph, scope), says=says | _reasons_declared(others)),)
     if declared:
         fed &= set(declared)
     scopes: dict[str, int] = {}
@@ -164,7 +164,7 @@ def find_brains(
     if scopes:
         depth = min(scopes.values())
         return tuple(_brain(graph, scope, fed) for scope, d in scopes.items() if d == depth)
-    return (_unnamed(graph, fed, set(declared or ()), given, told),)
+    return (_brain_of_sink(graph, fed, set(declared or ()), given, told),)
 
 
 def explain_outputs(brain: Brain, told: Mapping[str, Decision]) -> tuple[Decision, ...]:
@@ -235,7 +235,7 @@ def _shows_one_of(graph: Graph, name: str, nodes: Collection[str]) -> bool:
     return node.name in nodes
 
 
-def _chosen(
+def _brains_from_user(
     graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None, told: Mapping[str, Decision]
 ) -> tuple[Brain, ...]:
     outputs: list[tuple[str, Role, str]] = []
@@ -304,7 +304,7 @@ def close_names(name: str, names: Sequence[str]) -> str | None:
     return f"close to it: {', '.join(near)}" if near else None
 
 
-def _unnamed(
+def _brain_of_sink(
     graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role], told: Mapping[str, Decision]
 ) -> Brain:
     """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
@@ -335,7 +335,7 @@ def _unnamed(
     rest = [n.name for n in (*sinks, *(e for e in echoes if e not in sinks)) if n is not node]
     if declared:
         others = _others(graph, outputs, rest, told)
-        return Brain("", (*outputs, *others), _constants(graph, ""), says=says | _declared(others))
+        return Brain("", (*outputs, *others), _constants(graph, ""), says=says | _reasons_declared(others))
     return Brain("", outputs, _constants(graph, ""), tuple(rest), says)
 
 
@@ -356,7 +356,7 @@ def _is_choice(graph: Graph, node: Node) -> bool:
     return node.op == "ArgMax" or traits(node).sampler == "categorical"
 
 
-def _declared(outputs: Sequence[tuple[str, Role, str]]) -> dict[str, str]:
+def _reasons_declared(outputs: Sequence[tuple[str, Role, str]]) -> dict[str, str]:
     return {reference: _DECLARED for _, _, reference in outputs}
 
 

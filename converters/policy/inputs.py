@@ -45,7 +45,7 @@ def classify_inputs(
     PlaceholderWithDefault that is neither named there nor by ML-Agents is left out: its default is used. Raises
     SignatureError when no observation can be told.
     """
-    decisions = _Inputs(graph, brain, wanted or {}, known or {}, declared=declared).decided()
+    decisions = _Inputs(graph, brain, wanted or {}, known or {}, declared=declared).decide()
     return {d.tensor: d.role for d in decisions.values() if d.role is not None}
 
 
@@ -60,10 +60,10 @@ def explain_inputs(
 ) -> tuple[Decision, ...]:
     """What ``classify_inputs`` decides, why, and what speaks against it; ``told`` are the reader's own decisions."""
     inputs = _Inputs(graph, brain, wanted, known, declared=declared)
-    return tuple(_explained(inputs, decision, told.get(decision.tensor)) for decision in inputs.decided().values())
+    return tuple(_with_objections(inputs, decision, told.get(decision.tensor)) for decision in inputs.decide().values())
 
 
-def _explained(inputs: _Inputs, decision: Decision, told: Decision | None) -> Decision:
+def _with_objections(inputs: _Inputs, decision: Decision, told: Decision | None) -> Decision:
     """A decision with what speaks against it; the reader's own sentence where it decided the same."""
     if told is None or decision.says == _TOLD:
         return replace(decision, against=inputs.against(decision))
@@ -100,10 +100,10 @@ class _Inputs:
         self.consumers: Mapping[str, list[Node]] = {}
         self.recurrent = False
 
-    def decided(self) -> dict[str, Decision]:
+    def decide(self) -> dict[str, Decision]:
         """Placeholder → what it is for."""
         for node in self.found:
-            self.decisions[node.name] = self._told(node)
+            self.decisions[node.name] = self._decision_given(node)
         if self.wanted:
             name = next(iter(self.wanted))
             raise UsageError(
@@ -113,8 +113,8 @@ class _Inputs:
                 fix="export-model inspect FILE lists them",
             )
         self._read()
-        if not self._observed():
-            raise self._unobserved()
+        if not self._has_observation():
+            raise self._no_observation_error()
         return self.decisions
 
     def against(self, decision: Decision) -> tuple[str, ...]:
@@ -124,14 +124,14 @@ class _Inputs:
         said = [*against(BY_NAME, named, decision.role), *contradicted_names(named, decision.role)]
         if self.consumers and decision.role is not None:
             rules = (r for r in BY_READERS if r.role is not Role.PARAMETER)  # those tell nothing
-            said += against(rules, self._seen(node), decision.role)
+            said += against(rules, self._read_of(node), decision.role)
         return tuple(s for s in dict.fromkeys(said) if not s.startswith(decision.says))
 
     def _base(self, node: Node) -> str:
         scope = self.brain.scope
         return node.name[len(scope) :] if node.name.startswith(scope) else node.name
 
-    def _told(self, node: Node) -> Decision:
+    def _decision_given(self, node: Node) -> Decision:
         """What the user, the reader or the name says of a placeholder."""
         base = self._base(node)
         override = next((self.wanted.pop(k) for k in (node.name, f"{node.name}:0", base) if k in self.wanted), None)
@@ -157,31 +157,31 @@ class _Inputs:
         self.consumers = self.graph.consumers()
         self.recurrent = any(d.role is Role.MEMORY_IN for d in self.decisions.values())
         for node in unknown:
-            rule = first(BY_READERS, self._seen(node))
+            rule = first(BY_READERS, self._read_of(node))
             assert rule is not None
             self.decisions[node.name] = Decision(node.name, rule.role, rule.says)
         parameters = [n for n in unknown if self.decisions[n.name].role is Role.PARAMETER]
-        if self._observed():
+        if self._has_observation():
             free = [n for n in parameters if is_free(n)]
             if self.declared and not self.recurrent and free:
-                raise self._undecided(free)
+                raise self._ambiguous_error(free)
             return
         for last in LAST_RESORTS:
-            fitting = [n for n in parameters if last.when(self._seen(n))]
+            fitting = [n for n in parameters if last.when(self._read_of(n))]
             if len(fitting) == 1:
                 self.decisions[fitting[0].name] = Decision(fitting[0].name, last.role, last.says)
             if fitting:
                 return
 
-    def _seen(self, node: Node) -> Read:
-        return Read(node, self.graph, self.consumers, self.declared, self.recurrent, self._observed())
+    def _read_of(self, node: Node) -> Read:
+        return Read(node, self.graph, self.consumers, self.declared, self.recurrent, self._has_observation())
 
-    def _observed(self) -> bool:
+    def _has_observation(self) -> bool:
         return any(d.role in OBSERVATIONS for d in self.decisions.values())
 
     # -------------------------------------------------------------- what cannot be told
 
-    def _unobserved(self) -> SignatureError:
+    def _no_observation_error(self) -> SignatureError:
         names = ", ".join(f"{n.name} {_shape_text(n)}" for n in self.found) or "none"
         turned = next((n.name for n in self.found if _has_time_first(n)), None)
         if turned is not None:
@@ -196,7 +196,7 @@ class _Inputs:
             fix="say what they are: --input NAME=vector_observation, --input NAME=visual_observation, --set NAME=VALUE",
         )
 
-    def _undecided(self, nodes: Sequence[Node]) -> SignatureError:
+    def _ambiguous_error(self, nodes: Sequence[Node]) -> SignatureError:
         name = nodes[0].name
         roles = [f"--input {name}={r}" for r in ("masks", "vector_observation", "parameter")]
         known = ", ".join(roles[placeholder_rank(nodes[0]) != 2 :])

@@ -79,7 +79,7 @@ def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
         if read and not allowance.take(sum(r.size for r in read) + elements_of(types[node.name])):
             return ()
         if read and op_of(node).moves and len(known) == len(operands):
-            for index, columns in enumerate(_moved(node, known)):
+            for index, columns in enumerate(_move_row(node, known)):
                 shown[ref(node.name, index)] = columns
         elif joined or node.op == "Mul":
             for columns in read:
@@ -90,7 +90,7 @@ def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
     return tuple(parts[part] for part in ordered) if whole else ()
 
 
-def _moved(node: Node, row: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def _move_row(node: Node, row: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
     """The results of a node that moves elements, of one row; nothing where it takes several apart."""
     try:
         return run_kernel(op_of(node), node, row)

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from converters.files.children.process import RuntimeProcess
 from converters.formats.format import Format
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
-from signatures.errors import RuntimeUnavailableError, UsageError, meant
+from signatures.errors import RuntimeUnavailableError, UsageError, suggestion
 
 #: Runtimes that compute by themselves; numpy and js are this project's own.
 INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
@@ -51,7 +51,7 @@ def chosen_runtimes(
     for name in names:
         if name not in known:
             raise UsageError(
-                f"there is no runtime {name!r}", fix=f"{meant(name, known)}the runtimes are {', '.join(known)}"
+                f"there is no runtime {name!r}", fix=f"{suggestion(name, known)}the runtimes are {', '.join(known)}"
             )
         if not known[name].installed:
             raise RuntimeUnavailableError(f"the runtime {name} is not installed", fix=known[name].how)
@@ -72,15 +72,15 @@ class RuntimePool(AbstractContextManager["RuntimePool"]):
         Raises RuntimeUnavailableError where a program is not there; the processes that were started stay.
         """
         for name in names:
-            self._launched(name)
+            self._launch(name)
 
     def process(self, name: str) -> RuntimeProcess:
         """The runtime's process, started and ready. Raises RuntimeUnavailableError."""
-        process = self._launched(name)
+        process = self._launch(name)
         process.start()
         return process
 
-    def _launched(self, name: str) -> RuntimeProcess:
+    def _launch(self, name: str) -> RuntimeProcess:
         if name not in self._processes:
             self._processes[name] = RuntimeProcess(
                 name, self._commands[name](), confined=name not in _FREE, endless=self._endless

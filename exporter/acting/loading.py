@@ -111,7 +111,7 @@ def _of_source(
         raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
     with naming(path):
         artifact = WRITTEN[_TAKES[chosen]].artifact(policy, WriteOptions("{}"))
-        run, _ = _RUNS[chosen](artifact.files[artifact.main].joined())
+        run, _ = _RUNS[chosen](artifact.files[artifact.main].to_bytes())
     kept = policy.source.noise_kept and bool(policy.source.noise)
     return LoadedPolicy(policy.name, policy.signature, run, chosen, seed, draws_itself=kept)
 

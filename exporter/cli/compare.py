@@ -46,7 +46,7 @@ def compare_command(
     options: VerifyOptions,
 ) -> None:
     """Compare files made by any tool with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
-    from converters.files.fetch import shown
+    from converters.files.fetch import path_text
     from converters.formats.source import ReadOptions
     from exporter.compare.comparison import compare_artefacts
     from exporter.reports.entry import Entry
@@ -66,9 +66,9 @@ def compare_command(
             progress=progress,
             understood=read.append,
         )
-    console.verified(report, ", ".join(map(shown, candidates)))
+    console.verified(report, ", ".join(map(path_text, candidates)))
     console.json({"reports": [report.to_dict()]})
-    command = ("compare", *map(shown, (reference, *candidates)), *as_given(JUDGING))
+    command = ("compare", *map(path_text, (reference, *candidates)), *as_given(JUDGING))
     console.write_reports(
         lambda: [Entry(report, read[0].signature, read[0].graph, steps=options.steps, command=command)]
     )

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from converters.files.fetch import shown
+from converters.files.fetch import path_text
 from exporter.cli.console import Console
 from exporter.cli.options import RULES, as_given
 from exporter.cli.terminal import say_lines
@@ -64,7 +64,7 @@ def run_fleet(
     with console.progress_bar(len(paths)) as bar:
         for outcome in outcomes:
             tally.count(outcome)
-            bar.advance(Path(shown(outcome.path)).name, tally.rate)
+            bar.advance(Path(path_text(outcome.path)).name, tally.rate)
             entries.extend(
                 replace(p.entry, command=(*p.entry.command, *words)) for p in outcome.policies if p.entry is not None
             )
@@ -133,7 +133,7 @@ class _Tally:
 
 def _lines(outcome: Outcome, *, failed: bool = False) -> list[str]:
     """What is said of a source; ``failed``: only what went wrong."""
-    source = shown(outcome.path)
+    source = path_text(outcome.path)
     lines = [f"{source}: unchanged"] if outcome.unchanged else []
     for policy in outcome.policies:
         if failed and policy.passed is not False and not policy.undecided:
@@ -141,7 +141,7 @@ def _lines(outcome: Outcome, *, failed: bool = False) -> list[str]:
         verdict = {True: "passed", False: f"FAILED: {policy.failure}", None: "not verified"}[policy.passed]
         verdict += f": {policy.undecided}" if policy.undecided else ""
         note = "" if policy.renamed is None else f" ({policy.renamed})"
-        lines.append(f"{source}: {policy.what} -> {shown(policy.folder)}: {verdict}{note}")
+        lines.append(f"{source}: {policy.what} -> {path_text(policy.folder)}: {verdict}{note}")
     if outcome.error is not None:
         lines.append(f"error: {outcome.error.message}")
     return lines

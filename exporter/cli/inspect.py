@@ -71,7 +71,7 @@ def inspect_command(
     With --unity, what ML-Agents in Unity says about it instead; the status is 1 if a release does not accept it.
     """
     from converters.compiler.options import CompileOptions
-    from converters.files.fetch import shown
+    from converters.files.fetch import path_text
     from exporter.remote.fetching import nearby
     from exporter.tables import typed
 
@@ -113,13 +113,13 @@ def inspect_command(
             if len(sources) == 1:
                 raise
             say_lines(f"error: {error.message}", err=True)
-            found.append({"path": shown(source), **error.to_dict()})
+            found.append({"path": path_text(source), **error.to_dict()})
             status = 2
     if as_json:
         say_json(found[0] if len(sources) == 1 else {"sources": found})
     elif not releases and status == 0:
         both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
-        say(f"next: {typed(*map(shown, sources), *both, '-o', 'exported')}")
+        say(f"next: {typed(*map(path_text, sources), *both, '-o', 'exported')}")
     if status:
         sys.exit(status)
 

@@ -46,7 +46,7 @@ def one_bundle(place: Path, command: str) -> Path | None:
 
 def as_given(names: Container[str]) -> list[str]:
     """The options of this call whose parameters ``names`` has, word for word, where the command line had them."""
-    from converters.files.fetch import shown
+    from converters.files.fetch import path_text
 
     context = click.get_current_context()
     words: list[str] = []
@@ -60,7 +60,7 @@ def as_given(names: Container[str]) -> list[str]:
             words.append(option.opts[0])
             continue
         values = context.params[name] if option.multiple else [context.params[name]]
-        told = (shown(value) if isinstance(value, Path) else str(value) for value in values)
+        told = (path_text(value) if isinstance(value, Path) else str(value) for value in values)
         words += [word for value in told for word in (option.opts[0], value)]
     return words
 

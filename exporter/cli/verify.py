@@ -53,7 +53,7 @@ def verify_command(
 
     Given a folder of bundles, it verifies all of them.
     """
-    from converters.files.fetch import shown
+    from converters.files.fetch import path_text
     from converters.formats.bundle.bundle import bundles_in, other_folders_in
     from exporter.export.again import verify_folder
     from exporter.export.pipeline import counted
@@ -70,7 +70,9 @@ def verify_command(
             places += [(found, None if given == place else given) for found in (*whole, *broken) or [place]]
             if (whole or broken) and others and not console.quiet:
                 names = ", ".join(f"{p.name} (it holds some)" if bundles_in(p) else p.name for p in others)
-                say_lines(f"note: {shown(given)} also holds folders that are not bundles: {printable(names)}", err=True)
+                say_lines(
+                    f"note: {path_text(given)} also holds folders that are not bundles: {printable(names)}", err=True
+                )
         source = None if source is None else fetched.enter_context(nearby(source))
         verified = []
         for number, (folder, address) in enumerate(places, 1):

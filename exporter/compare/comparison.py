@@ -41,7 +41,7 @@ from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import verify
 from signatures.contract import POLICY
-from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, meant, naming
+from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, naming, suggestion
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import draw_cases
@@ -278,7 +278,7 @@ def _mapped(
 
 def _suggestion(name: str, names: Sequence[str]) -> str:
     names = list(dict.fromkeys(names))
-    return meant(name, names).strip() or f"there are {', '.join(names[:20])}"
+    return suggestion(name, names).strip() or f"there are {', '.join(names[:20])}"
 
 
 def _find(name: str, ports: Sequence[Port]) -> Port | None:

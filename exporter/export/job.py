@@ -20,7 +20,7 @@ from exporter.export.options import ExportOptions
 from exporter.export.sources import Source
 from signatures.contract import Contract, Origin, parse
 from signatures.errors import SignatureError, TooLargeError, UsageError, naming
-from signatures.fields import FieldError, known, printable
+from signatures.fields import FieldError, printable, without_none
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def contract_of(
         read.goals,
         read.activation,
     )
-    tool = known(name="export-model", version=__version__, profile=profile, weights=weights, batch=batch)
+    tool = without_none(name="export-model", version=__version__, profile=profile, weights=weights, batch=batch)
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
         parse(contract.to_dict())

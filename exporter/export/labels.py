@@ -10,7 +10,7 @@ from typing import Any
 from converters.policy.policy import Policy
 from exporter.options_file import read_options
 from signatures.errors import UsageError
-from signatures.labels import checked
+from signatures.labels import validate_labels
 
 Labels = Path | str | Mapping[str, Any]
 
@@ -43,7 +43,7 @@ def labelled(policy: Policy, labels: Mapping[str, Any] | None) -> Policy:
         labels = named.get(policy.name)
     if labels is None:
         return policy
-    return replace(policy, signature=replace(policy.signature, labels=checked(labels, policy.signature)))
+    return replace(policy, signature=replace(policy.signature, labels=validate_labels(labels, policy.signature)))
 
 
 def check_labels(labels: Mapping[str, Any] | None, policies: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import field
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Generic, Protocol, TypeVar
 
-from converters.files.fetch import address_of, shown
+from converters.files.fetch import address_of, path_text
 from signatures.contract import safe_name
 from signatures.records import dataclass
 
@@ -47,7 +47,7 @@ class Names:
         wishes = _numbered(name) if other == path else _wishes(path, name)
         found = next(wish for wish in wishes if wish.casefold() not in self._taken)
         self._taken[found.casefold()] = path
-        return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {shown(other)}"
+        return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {path_text(other)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Turns(Generic[Who]):
 
 def _wishes(path: Path, name: str) -> Iterator[str]:
     wish = name
-    inside: PurePath = PurePosixPath(f"/{shown(path).partition('://')[2]}") if address_of(path) else path.absolute()
+    inside: PurePath = PurePosixPath(f"/{path_text(path).partition('://')[2]}") if address_of(path) else path.absolute()
     for part in (inside.stem, *reversed(inside.parent.parts[1:])):
         if part != name:
             wish = safe_name(f"{part}-{wish}")

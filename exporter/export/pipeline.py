@@ -9,7 +9,7 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from converters.files.fetch import shown
+from converters.files.fetch import path_text
 from converters.files.folders import scratch_folder
 from converters.formats.bundle import bundle
 from converters.formats.format import Artifact, Format
@@ -70,7 +70,7 @@ class ExportResult:
 
     def __repr__(self) -> str:
         verdict = "not verified" if self.report is None else self.report.verdict
-        return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {shown(self.folder)!r}>"
+        return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {path_text(self.folder)!r}>"
 
     def _repr_html_(self) -> str:
         from exporter.reports.markup import notebook
@@ -91,7 +91,7 @@ class ExportResult:
         """For ``--json``."""
         return {
             "name": self.policy.name,
-            "folder": shown(self.folder),
+            "folder": path_text(self.folder),
             "passed": self.passed,
             "sizes": dict(self.sizes),
             **({"whole_sizes": dict(self.whole_sizes)} if self.whole_sizes else {}),

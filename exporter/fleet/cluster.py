@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from converters.files.fetch import address_of, shown
+from converters.files.fetch import address_of, path_text
 from converters.runtimes.pool import RuntimePool
 from exporter import __version__
 from exporter.export.labels import read_labels
@@ -112,7 +112,7 @@ class _Working:
             self.said.put(exported(station.exporter, self.path, self, station.pool, station.run.wanted))
         except BaseException as error:
             self.said.put(
-                Outcome(self.path, error=SourceError("was not exported", where=shown(self.path), why=repr(error)))
+                Outcome(self.path, error=SourceError("was not exported", where=path_text(self.path), why=repr(error)))
             )
             raise
 
@@ -244,7 +244,7 @@ class Cluster:
         path = self.paths[number]
         failed = SourceError(
             "was not exported by the cluster",
-            where=shown(path),
+            where=path_text(path),
             why=f"{type(error).__name__}: {error}",
             fix="export it alone to see more; if memory ran out, give the workers more",
         )

@@ -18,7 +18,7 @@ from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import shown
+from converters.files.fetch import path_text
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claim, Names, Turns
 from exporter.export.options import ExportOptions
@@ -165,7 +165,7 @@ class _Crew(AbstractContextManager["_Crew"]):
                 path,
                 error=SourceError(
                     "the process that exported it ended",
-                    where=shown(path),
+                    where=path_text(path),
                     why=f"its status is {worker.process.exitcode}",
                     fix="export it alone to see more; if memory ran out, use fewer --jobs",
                 ),

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import address_of, read_bytes, shown
+from converters.files.fetch import address_of, path_text, read_bytes
 from converters.formats.bundle.bundle import Bundle
 from exporter import __version__
 from exporter.export.labels import read_labels
@@ -128,7 +128,7 @@ def stamps(source: Path, files: Iterable[Path]) -> dict[str, Stamp]:
 def _called(source: Path) -> str:
     """A source in its line; of an address that has a password or a signature its hash."""
     address = address_of(source)
-    return shown(source) if address in (None, shown(source)) else sha256_hex(str(address).encode())
+    return path_text(source) if address in (None, path_text(source)) else sha256_hex(str(address).encode())
 
 
 def _is_as_it_was(source: Path, seen: State, files: Mapping[str, Stamp]) -> bool:

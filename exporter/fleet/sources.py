@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
-from converters.files.fetch import Fetched, shown, unreadable
+from converters.files.fetch import Fetched, path_text, unreadable
 from converters.formats.bundle import BUNDLE
 from converters.formats.recognise import recognised
 from converters.formats.source import ReadOptions
@@ -66,7 +66,7 @@ def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None 
             recognised(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
-                f"{shown(path)} stands for no source",
+                f"{path_text(path)} stands for no source",
                 why=f"not a model in any form that is read: {named(others)}" if others else "it matches nothing",
                 fix="give model files, run folders, or folders that hold them",
             )
@@ -79,7 +79,7 @@ def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None 
 def named(paths: Sequence[Path]) -> str:
     """The paths, or the first and how many more."""
     more = f" and {len(paths) - _MOST_NAMED} more" if len(paths) > _MOST_NAMED else ""
-    return ", ".join(map(shown, paths[:_MOST_NAMED])) + more
+    return ", ".join(map(path_text, paths[:_MOST_NAMED])) + more
 
 
 def _expanded(path: Path, out: Path, others: list[Path]) -> Iterator[Path]:

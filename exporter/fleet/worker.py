@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Any
 
 from converters.files.children.child import end_with_parent
-from converters.files.fetch import shown
+from converters.files.fetch import path_text
 from converters.runtimes.pool import RuntimePool
 from exporter.export.names import Claim, Claimed, Naming
 from exporter.export.options import ExportOptions
@@ -81,7 +81,7 @@ def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, w
     except ExportModelError as error:
         refused.append(error)
     except OSError as error:
-        return Outcome(path, tuple(policies), SourceError("cannot be read", where=shown(path), why=error.strerror))
+        return Outcome(path, tuple(policies), SourceError("cannot be read", where=path_text(path), why=error.strerror))
     if refused:
         told = refused[0] if len(refused) == 1 else RefusedError(refused, len(refused) + min(len(policies), 1))
         return Outcome(path, tuple(policies), told)

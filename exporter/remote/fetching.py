@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from converters.files.fetch import shown
+from converters.files.fetch import path_text
 from converters.files.folders import scratch_folder
 from exporter.remote.filesystem import MAX_FILES, Pace, asking, filesystem, is_http, remote
 from signatures.digest import sha256_hex
@@ -49,7 +49,7 @@ def name_address(error: ExportModelError, local: Path, address: str) -> None:
     """Have an error about a copy name the address that it came from."""
     for part in ("what", "where", "why", "fix"):
         if (text := getattr(error, part)) is not None:
-            setattr(error, part, text.replace(str(local), shown(address)))
+            setattr(error, part, text.replace(str(local), path_text(address)))
     error.args = (error.message,)
 
 
@@ -71,18 +71,18 @@ def _fetched(address: str, folder: Path) -> Path:
     with asking(address):
         found = _files(system, place)
     if not found:
-        raise SourceError("there is nothing there", where=shown(address), fix="check the address")
+        raise SourceError("there is nothing there", where=path_text(address), fix="check the address")
     if len(found) > MAX_FILES:
         raise SourceError(
             f"has {len(found)} files, and of one source {MAX_FILES} are fetched",
-            where=shown(address),
+            where=path_text(address),
             fix="give the folder of one run, or a pattern that stands for files: **/*.onnx",
         )
     left = MAX_BYTES - sum(info.get("size") or 0 for info in found.values())
     _within(left, address)
     left, top = (
         MAX_BYTES,
-        folder / _name(unquote(urlsplit(address).path) if is_http(address) else shown(address), address),
+        folder / _name(unquote(urlsplit(address).path) if is_http(address) else path_text(address), address),
     )
     with asking(address):  # which may say that a file has files in it, or lies elsewhere
         for name in found:
@@ -120,7 +120,7 @@ def _within(left: int, address: str) -> None:
     if left < 0:
         raise SourceError(
             f"has more than {MAX_BYTES >> 30} GiB",
-            where=shown(address),
+            where=path_text(address),
             fix="give the model alone, or download it first",
         )
 
@@ -130,5 +130,7 @@ def _name(path: str, address: str) -> str:
     name = path.rstrip("/").rpartition("/")[2]
     wrong = not name or name in (".", "..") or len(name) > _LONGEST_NAME or any(c in name for c in "\\\0")
     if wrong or (os.name == "nt" and any(c in name for c in ':*?"<>|')):
-        raise SourceError("a file there has a name that it cannot have here", where=shown(address), why=repr(name[:80]))
+        raise SourceError(
+            "a file there has a name that it cannot have here", where=path_text(address), why=repr(name[:80])
+        )
     return name

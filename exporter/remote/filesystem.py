@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
 
-from converters.files.fetch import FETCHED, address_of, fetches, shown
+from converters.files.fetch import FETCHED, address_of, fetches, path_text
 from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
 #: Files of one source, or links of one level of a web server's pages; bytes of these pages.
@@ -46,7 +46,7 @@ def filesystem(address: str) -> tuple[Any, str]:
     except ImportError as error:
         raise UsageError(
             f"{address.partition('://')[0]}:// needs another package",
-            where=shown(address),
+            where=path_text(address),
             why=str(error),
             fix="install it beside export-model",
         ) from error
@@ -94,7 +94,7 @@ class Pace:
         if seconds > self.FREE and self._bytes < self.LEAST * (seconds - self.FREE):
             raise SourceError(
                 "comes too slowly",
-                where=shown(self._address),
+                where=path_text(self._address),
                 why=f"{self._bytes} bytes came in {seconds:.0f} s, and {self.LEAST} a second are waited for",
                 fix="download it first, and give the file",
             )
@@ -113,11 +113,11 @@ def asking(address: str, *, writes: bool = False) -> Iterator[None]:
         said = error.__cause__ if isinstance(error, FileNotFoundError) and is_http(address) else None
         said = error if said is None else said
         if isinstance(said, FileNotFoundError):
-            raise kind("there is no such file", where=shown(address), fix="check the address") from error
+            raise kind("there is no such file", where=path_text(address), fix="check the address") from error
         raise kind(
             "cannot be written" if writes else "cannot be fetched",
-            where=shown(address),
-            why=f"{type(said).__name__}: {_ADDRESS.sub(lambda found: shown(found[0]), str(said))}",
+            where=path_text(address),
+            why=f"{type(said).__name__}: {_ADDRESS.sub(lambda found: path_text(found[0]), str(said))}",
             fix="check the address, your rights there, and the connection",
         ) from error
 
@@ -147,7 +147,7 @@ def _linked(address: str) -> list[Path]:
     if "**" in address:
         raise UsageError(
             "** is not for a web server",
-            where=shown(address),
+            where=path_text(address),
             why="its pages may link without end",
             fix="give a pattern for each level (*/*.onnx), or a list of addresses in a .txt",
         )
@@ -182,7 +182,7 @@ def _linked(address: str) -> list[Path]:
             if size > MAX_LISTING or len(found) > MAX_FILES:
                 raise SourceError(
                     "lists more than is read",
-                    where=shown(address),
+                    where=path_text(address),
                     why=f"of all levels {MAX_LISTING >> 20} MiB and of each {MAX_FILES} links are read",
                     fix="give a narrower pattern, or a list of addresses in a .txt",
                 )

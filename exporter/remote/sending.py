@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from converters.files.fetch import address_of, fetches, shown
+from converters.files.fetch import address_of, fetches, path_text
 from converters.files.folders import scratch_folder
 from converters.formats.bundle import bundle
 from exporter.remote.filesystem import asking, filesystem, is_http, remote
@@ -47,7 +47,7 @@ def check_sendable(out: Path) -> None:
     if address is not None and (remote(out) is None or is_http(address)):
         raise UsageError(
             "nothing can be written there",
-            where=shown(address),
+            where=path_text(address),
             why=None if fetches() else "that needs fsspec: pip install 'export-model[remote]'",
             fix="give a folder, or an address of s3, gs or hf",
         )
@@ -67,7 +67,7 @@ def _there(address: str) -> set[str]:
     if found and POLICY not in found and _SENDING not in found:
         raise BundleError(
             "already exists and is not a bundle",
-            where=shown(address),
+            where=path_text(address),
             why=f"it has no {POLICY}, so it is not this tool's to replace",
             fix="move it, or choose another address with -o or another --name",
         )

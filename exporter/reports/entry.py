@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.files.fetch import shown
+from converters.files.fetch import path_text
 from converters.formats.bundle.bundle import Bundle
 from converters.graph.nodes import Graph
 from exporter.export.pipeline import ExportResult
@@ -57,7 +57,12 @@ def of_result(result: ExportResult, steps: int, words: Sequence[str] = ()) -> En
         return None
     policy = result.policy
     return Entry(
-        result.report, policy.signature, policy.graph, result.agreed, steps, ("verify", shown(result.folder), *words)
+        result.report,
+        policy.signature,
+        policy.graph,
+        result.agreed,
+        steps,
+        ("verify", path_text(result.folder), *words),
     )
 
 
@@ -70,4 +75,4 @@ def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int
         graph = found.graph()
     except (OSError, ExportModelError):  # a report without a picture is better than none where it has gone since
         graph = None
-    return Entry(report, found.signature, graph, found.contract, steps, ("verify", shown(place or folder), *words))
+    return Entry(report, found.signature, graph, found.contract, steps, ("verify", path_text(place or folder), *words))

@@ -24,7 +24,7 @@ def drawn_columns(graph: Graph, outputs: Collection[str]) -> dict[str, np.ndarra
     if not asked:
         return {}
     # A bundle's own .bytes leaves out the attributes that TF 1.4 does not know (a draw's output_dtype).
-    graph = normalise(graph.pruned(asked), asked)
+    graph = normalise(graph.prune(asked), asked)
     drawn = graph.descendants(n.name for n in graph.nodes if n.op in SAMPLERS)
     types = infer_types(graph)
     columns = {name: _columns(graph, types, drawn, name) for name in asked}

@@ -9,7 +9,7 @@ from converters.files.children.process import RunFailedError
 from exporter.verify.difference import by_decade
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
-from signatures.fields import known
+from signatures.fields import without_none
 from signatures.records import dataclass
 
 
@@ -46,7 +46,7 @@ class Bisection:
             "source": list(self.source) if isinstance(self.source, tuple) else self.source,
             "index": None if self.index is None else list(self.index),
             **{k: None if v is None else _number(v) for k, v in numbers.items()},
-            **known(hidden=list(self.hidden) or None, input=self.input, reason=self.reason or None),
+            **without_none(hidden=list(self.hidden) or None, input=self.input, reason=self.reason or None),
         }
 
     def sentence(self) -> str:
@@ -181,7 +181,7 @@ class Finding:
             "rtol": self.tolerance.rtol,
             "passed": self.passed,
             "worst_input": self.worst_input,
-            **known(
+            **without_none(
                 tolerance_reason=self.tolerance.reason or None,
                 rounding=self.rounding or None,
                 reason=self.reason or None,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.files.fetch import read_bytes
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
 from exporter.verify.npy import read_array
 from signatures.errors import SourceError, UsageError
 from signatures.records import dataclass
@@ -82,7 +82,7 @@ def recorded(path: Path) -> bytes:
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     data = recorded(path)
     try:
-        with opened(data) as archive:
+        with open_archive(data) as archive:
             names = archive.namelist()
             odd = next((name for name in names if not name.endswith(".npy")), None)
             if odd is not None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.compiler.passes.noise import laid_out
 from converters.files.children.process import LoadedModel, RunFailedError
-from signatures.memories import SourcePart, divided, joined
+from signatures.memories import SourcePart, join_memory, split_memory
 from signatures.roles import Role
 from signatures.spec import PolicySignature, SourceMap, TensorSpec
 
@@ -124,7 +124,7 @@ class Original:
         for given in parts.values():
             values.update({p.tensor: self._row(values[p.tensor], p.shape) for p in given})
         results = {n: self._row(values[tensor], self.signature.output(n).shape) for n, tensor in fetches.items()}
-        results.update({name: joined(given, values) for name, given in parts.items()})
+        results.update({name: join_memory(given, values) for name, given in parts.items()})
         scores = [self._row(values[b], (None, values[b].size)) for b in logits]
         for spec in self.signature.outputs:
             if spec.name in results or not self._derivable(spec):
@@ -164,7 +164,7 @@ class Original:
         placed = {tensor: feeds[name] for name, tensor in self.source.feeds.items()}
         for spec in self.signature.inputs:
             if spec.name in self.source.parts:
-                placed.update(divided(self.source.parts[spec.name], feeds[spec.name]))
+                placed.update(split_memory(self.source.parts[spec.name], feeds[spec.name]))
         placed.update({name: np.asarray(value) for name, value in self.source.fixed.items()})
         placed.update({n: np.full([1] * rank, batch, np.int32) for n, rank in self.source.batch_sizes.items()})
         for tensor, dims in self.source.noise.items():

@@ -109,7 +109,7 @@ class Trial:
         found = self._compared(name, expected, got, participant)
         if at is None or found.passed or found.reason:
             return found
-        if isinstance(at, Case) and (flushed := at.flushed()) is not None:
+        if isinstance(at, Case) and (flushed := at.flush_denormals()) is not None:
             if at.name not in self._flushed:
                 (self._flushed[at.name],) = self.reference.answers([flushed])
             if (other := self._compared(name, self._flushed[at.name], got, participant)).passed:

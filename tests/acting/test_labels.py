@@ -16,7 +16,7 @@ from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import path as fixture
 from signatures.errors import DamagedFileError, UsageError
-from signatures.labels import parsed, remaining
+from signatures.labels import parse_labels, remaining
 from tests.commands import export_model as run
 
 DISCRETE: dict[str, Any] = {
@@ -148,7 +148,7 @@ _JSON = st.recursive(
 @given(_JSON | st.dictionaries(st.sampled_from(["observations", "actions", "branches"]), _JSON))
 def test_anything_is_labels_or_a_value_error(content: Any) -> None:
     try:
-        labels = parsed(content)
+        labels = parse_labels(content)
     except ValueError:
         return
-    assert parsed(labels) == labels
+    assert parse_labels(labels) == labels

@@ -43,7 +43,7 @@ def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str
         signature = policy.signature
         contract = WriteOptions(json.dumps(signature.to_dict()))
         (data,) = WRITTEN["nn"].artifact(policy, contract).files.values()
-        nn = NnPolicy(data.joined())
+        nn = NnPolicy(data.to_bytes())
         assert nn.signature.to_dict() == signature.to_dict()
         names = answered(signature)
         assert names == [s.name for s in signature.outputs if s.role is not Role.SAMPLED]
@@ -68,13 +68,13 @@ def test_what_a_nn_has_no_name_for_is_not_answered_by_its_action(role: Role) -> 
     names = answered(signature)
     assert names == [s.name for s in policy.signature.outputs]
     feeds = some(policy, 3)
-    assert NnPolicy(data.joined()).run(feeds, names).keys() == run_graph(policy.graph, feeds, names).keys()
+    assert NnPolicy(data.to_bytes()).run(feeds, names).keys() == run_graph(policy.graph, feeds, names).keys()
 
 
 def test_a_file_without_a_contract_says_so() -> None:
     policy = policies(FIXTURES[0])[0]
     (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
-    model = parse(data.joined())
+    model = parse(data.to_bytes())
     for other in (model, replace(model, trailer=None)):
         with pytest.raises(DamagedFileError, match="no contract"):
             contract_of(other)

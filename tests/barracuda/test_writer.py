@@ -45,7 +45,7 @@ def written(policy: Policy, contract: str = "{}") -> NnModel:
     """A policy's file, read again; it is safe in every Barracuda."""
     files = write(policy, WriteOptions(contract))
     assert list(files) == [f"{policy.name}.nn"]
-    model = parse(files[f"{policy.name}.nn"].joined())
+    model = parse(files[f"{policy.name}.nn"].to_bytes())
     assert_safe(model)
     return model
 
@@ -111,8 +111,8 @@ def test_the_file_has_what_ml_agents_looks_for(path: Path) -> None:
 def test_the_bytes_are_the_same_every_time_and_carry_the_contract(path: Path) -> None:
     contract = json.dumps({"name": "Größe", "inputs": []})
     (data,), (again,) = (write(p, WriteOptions(contract)).values() for p in (policies(path)[0], policies(path)[0]))
-    data = data.joined()
-    assert data == again.joined()
+    data = data.to_bytes()
+    assert data == again.to_bytes()
     assert parse(data).metadata(EMBEDDED) == contract
     # What a loader of a version-16 file reads after the weights ends before the contract.
     assert data.index(b"export-model") < data.index(EMBEDDED.encode())

@@ -72,7 +72,7 @@ def test_every_policy_acts_alike(source: Path, tmp_path: Path, here: RuntimePool
 def test_the_same_policy_gives_the_same_bytes(name: str) -> None:
     def written() -> list[bytes]:
         artefacts = [WRITTEN["c"].artifact(p, WriteOptions("{}")) for p in read_source(path(name)).policies()]
-        return [data.joined() for a in artefacts for data in a.files.values()]
+        return [data.to_bytes() for a in artefacts for data in a.files.values()]
 
     assert written() == written()
 

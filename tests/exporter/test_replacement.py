@@ -256,7 +256,7 @@ def test_without_locks_a_folder_is_swept_a_day_later(locks: bool, out: Path, mon
     killed("write:1", out)
     (left,) = [p for p in out.iterdir() if p.name.startswith(".")]
     if not locks:
-        monkeypatch.setattr(folders, "_held", lambda path: None)
+        monkeypatch.setattr(folders, "_lock_folder", lambda path: None)
     assert exported(out).status == 0
     assert left.is_dir() is not locks
     if not locks:
@@ -395,7 +395,7 @@ def test_what_is_swept_is_held_meanwhile(tmp_path: Path, monkeypatch: pytest.Mon
     seen: list[bool | None] = []
 
     def look(path: Path, **more: object) -> None:
-        with folders.taken(path) as ours:
+        with folders.try_lock(path) as ours:
             seen.append(ours)
 
     monkeypatch.setattr(folders.shutil, "rmtree", look)

@@ -96,7 +96,7 @@ def flattening(*, joined: bool) -> Graph:
 @pytest.mark.parametrize("joined", [True, False])
 def test_fold_gives_a_reshape_its_open_axis(joined: bool) -> None:
     before = flattening(joined=joined)
-    made = fold(before).pruned(["y"])
+    made = fold(before).prune(["y"])
     assert ops(made) == ["Reshape", "Neg"]
     target = made.constant(made["flat"].inputs[1])
     assert target is not None

@@ -48,7 +48,7 @@ def test_the_batch_size_is_taken_from_an_observation(shape: Sequence[int | None]
     made = sized(shape, vector=vector)
     assert batch_size_rank(made, made["batch_size"]) == vector
     after = settle_inputs(made, ROLES)
-    assert "batch_size" not in {n.name for n in after.pruned(["y"]).nodes}
+    assert "batch_size" not in {n.name for n in after.prune(["y"]).nodes}
     for batch in (1, 3):
         x = floats(batch, 2)
         size = np.array([batch] if vector else batch, np.int32)

@@ -58,7 +58,7 @@ def test_an_action_without_noise_stands_beside_the_noisy_one(in_graph: bool) -> 
     np.testing.assert_allclose(value(made, {"x": x}, still), mean(x), rtol=1e-6)
     same_values(before, made, {"x": x, "epsilon": epsilon}, {"action": "action"})
     # the mean itself: neither a product with zero nor a sum with it
-    assert ops(made.pruned([still])) == ["MatMul", "Tanh"]
+    assert ops(made.prune([still])) == ["MatMul", "Tanh"]
 
 
 def test_an_overflowing_deviation_does_not_reach_the_quiet_action() -> None:

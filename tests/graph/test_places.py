@@ -38,7 +38,7 @@ def agrees(nodes: list[NodeDef], feeds: dict[str, Array], fetches: list[str], ru
     results = run_graph(made, feeds, [p.name for p in pins])
     problems = {f: difference(e, results[p.name]) for f, p, e in zip(fetches, pins, expected, strict=True)}
     assert {f: p for f, p in problems.items() if p} == {}
-    return sorted({n.op for n in made.pruned([p.name for p in pins]).nodes})
+    return sorted({n.op for n in made.prune([p.name for p in pins]).nodes})
 
 
 # ------------------------------------------------------------------ equations

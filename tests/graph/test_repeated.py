@@ -64,7 +64,7 @@ def test_a_choice_is_a_sum_of_products_that_outlives_what_is_not_chosen() -> Non
     state = np.array([[0, 1, 2], [-3, 500, 1.5]], np.float32)
     graph = Graph(tuple(nodes))
     files = write(policy_of(graph, ["action"]), profile("barracuda-1.0").write_options('{"tool": {"version": "test"}}'))
-    model = onnx.ModelProto.FromString(next(iter(files.values())).joined())
+    model = onnx.ModelProto.FromString(next(iter(files.values())).to_bytes())
     assert not {"Where", "Shape", "Expand"}.intersection(n.op_type for n in model.graph.node)
     import onnxruntime
 

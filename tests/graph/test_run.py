@@ -121,7 +121,7 @@ def test_what_rounding_moves_it_moves_by_units_in_the_last_place(dtype: str, ulp
             up = np.random.default_rng(3).random(array.shape) >= 0.5
             moved = np.where(up, array + step, array - step)
         expected = np.where((array == 0) | ~np.isfinite(array), array, moved)
-        np.testing.assert_array_equal(Jitter(3)._moved(array, ulps, absolute), expected)
+        np.testing.assert_array_equal(Jitter(3)._perturb(array, ulps, absolute), expected)
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
@@ -138,7 +138,7 @@ def test_what_is_moved_piece_by_piece_is_moved_as_the_whole_is(
 
     def moved() -> list[bytes]:
         jitter = Jitter(7)
-        made = [jitter._moved(a, *how) for a in (array, array.T) for how in ((), (2.37, 1e-6))]
+        made = [jitter._perturb(a, *how) for a in (array, array.T) for how in ((), (2.37, 1e-6))]
         return [m.tobytes() for m in (*made, *jitter.results(entry, each, [left, right], [left @ right]))]
 
     pieces = moved()

@@ -119,7 +119,7 @@ def test_an_op_that_rounds_rounds(op: str) -> None:
 def test_what_moves_elements_makes_none(op: str) -> None:
     for sample in (s for s in SAMPLES if s.op == op):
         node = sample.graph["op"]
-        moved = list(TABLE[op].moved(node.inputs))
+        moved = list(TABLE[op].data_operands(node.inputs))
         values = run_graph(sample.graph, sample.feeds, [*moved, *sample.fetches])
         elements = np.concatenate([values[r].reshape(-1) for r in moved])
         for name in sample.fetches:

@@ -33,7 +33,7 @@ def straight(nodes: Sequence[Any], *outputs: str) -> Graph:
     """Read, normalised and unrolled, only what the outputs need; the outputs are called ``out:…``."""
     read = from_graph_def(handmade.graph_def(nodes, producer=24))
     pins = [Node(f"out:{name}", "Identity", (name,)) for name in outputs]
-    made = unroll(normalise(Graph((*read.nodes, *pins)).pruned([p.name for p in pins])))
+    made = unroll(normalise(Graph((*read.nodes, *pins)).prune([p.name for p in pins])))
     assert not {n.op for n in made.nodes} & CONTROL_FLOW.keys()
     return made
 
@@ -55,7 +55,7 @@ OUTPUTS = ("action", "action_probs", "recurrent_out")
 
 def recurrent(steps: int) -> Graph:
     """The fixture's LSTM for sequences of ``steps``, unrolled."""
-    source = read_graph(path("recurrent").read_bytes()).pruned(OUTPUTS)
+    source = read_graph(path("recurrent").read_bytes()).prune(OUTPUTS)
     return unroll(normalise(set_values(source, {"sequence_length": steps})))
 
 

@@ -24,7 +24,7 @@ from tests.hostile.zoo import onnx_policy
 
 def inside(number: int, *content: bytes) -> bytes:
     """A field that holds others."""
-    return field(number, Pieces(*content)).joined()
+    return field(number, Pieces(*content)).to_bytes()
 
 
 def attribute(value: bytes) -> bytes:

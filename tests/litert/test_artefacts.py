@@ -135,7 +135,7 @@ def test_there_is_one_buffer_for_a_constant_and_no_operator_that_a_fused_one_doe
         layers.append(node(f"r{i}", "Relu", f"a{i}"))
         last = f"r{i}"
     (data,) = WRITTEN["litert"].artifact(policy_of(graph(*layers), [last]), WriteOptions("{}")).files.values()
-    model = decoded(data.joined())
+    model = decoded(data.to_bytes())
     (subgraph,) = model["subgraphs"]
     # the last is the copy that gives the output its name
     names = [model["operator_codes"][o.get("opcode_index", 0)]["builtin_code"] for o in subgraph["operators"]]
@@ -147,7 +147,7 @@ def test_there_is_one_buffer_for_a_constant_and_no_operator_that_a_fused_one_doe
 def test_signatures_of_the_same_tensors_share_a_function() -> None:
     (policy,) = read_source(path("recurrent")).policies()
     (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
-    model = decoded(data.joined())
+    model = decoded(data.to_bytes())
     assert len(model["signature_defs"]) == 2
     assert len(model["subgraphs"]) == 1
 
@@ -198,7 +198,7 @@ def test_a_bundle_is_verified_again_and_a_changed_weight_is_found(here: RuntimeP
     array = np.frombuffer(bytes(weights["data"]), np.float32).copy()
     array[7] += 0.5
     weights["data"] = array
-    data = encoded(model).joined()
+    data = encoded(model).to_bytes()
     report = compare_artefacts(path("continuous"), _file(tmp_path / "theirs.tflite", data), runtimes=list(LITERT))
     assert not report.passed
     assert any("kernel" in str(f.bisection) for f in report.failures if f.bisection is not None)
@@ -212,11 +212,11 @@ def _file(place: Path, data: bytes) -> Path:
 def test_a_stranger_s_operator_is_not_handed_to_the_runtime(tmp_path: Path) -> None:
     (policy,) = read_source(path("continuous")).policies()
     (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
-    model = decoded(data.joined())
+    model = decoded(data.to_bytes())
     custom = {"builtin_code": 32, "deprecated_builtin_code": 32, "custom_code": "FlexReadFile"}
     for code, name in ((custom, "FlexReadFile"), ({"builtin_code": 129}, "operator 129")):
         changed = {**model, "operator_codes": [*model["operator_codes"], code]}
-        file = _file(tmp_path / "theirs.tflite", encoded(changed).joined())
+        file = _file(tmp_path / "theirs.tflite", encoded(changed).to_bytes())
         with pytest.raises(UnsupportedOpError, match=name):
             vetted(file, [], tmp_path)
 
@@ -225,9 +225,9 @@ def test_a_file_without_signatures_is_called_by_its_tensors(here: RuntimePool, t
     """As ``tf.lite`` of 2019 wrote them."""
     made = graph(placeholder("x", (None, 3)), node("y", "Tanh", "x"))
     (data,) = WRITTEN["litert"].artifact(policy_of(made, ["y"]), WriteOptions("{}")).files.values()
-    model = decoded(data.joined())
+    model = decoded(data.to_bytes())
     del model["signature_defs"]
-    file = _file(tmp_path / "old.tflite", encoded(model).joined())
+    file = _file(tmp_path / "old.tflite", encoded(model).to_bytes())
     ports = WRITTEN["litert"].ports
     assert ports is not None
     found = ports(file)

@@ -26,7 +26,7 @@ def written(name: str) -> bytes:
     """A fixture's file."""
     policy = read_source(path(name)).policies()[0]
     (pieces,) = WRITTEN["litert"].artifact(policy, WriteOptions(json.dumps({"name": name}))).files.values()
-    return pieces.joined()
+    return pieces.to_bytes()
 
 
 def theirs(name: str) -> str:
@@ -69,7 +69,7 @@ def test_litert_reads_the_tables_that_were_written(name: str) -> None:
     model = decoded(data)
     same(model, generated.ModelT.InitFromPackedBuf(data, 0), "Model")
     assert written(name) == data
-    assert encoded(model).joined() == data
+    assert encoded(model).to_bytes() == data
 
 
 def test_weights_begin_where_vector_instructions_ask_for() -> None:
@@ -123,7 +123,7 @@ def test_large_numbers_and_all_kinds_of_fields_come_back() -> None:
     quantised = {"scale": [0.5, 0.25], "zero_point": [-(2**40), 3], "quantized_dimension": 1}
     tensor = {"name": "größe", "shape": [3, 2], "buffer": 1, "quantization": quantised, "is_variable": 1}
     model = {"version": 3, "buffers": buffers, "subgraphs": [{"tensors": [tensor, tensor]}]}
-    data = encoded(model).joined()
+    data = encoded(model).to_bytes()
     found = decoded(data)
     same(found, generated.ModelT.InitFromPackedBuf(data, 0), "Model")
     assert found["buffers"][2] == {"size": 2**40, "offset": 7}
@@ -139,7 +139,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     source.write_bytes(graph_bytes(continuous_policy()))
     (policy,) = read_source(source).policies()
     (pieces,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
-    return pieces.joined()
+    return pieces.to_bytes()
 
 
 def test_every_beginning_of_a_file_is_refused_or_read(small: bytes) -> None:
@@ -182,7 +182,7 @@ def test_what_many_lead_to_is_not_read_for_each_of_them() -> None:
     """Five hundred functions whose operators are one vector of five thousand: a few kilobytes, 2.5 million to read."""
     many = [{"name": str(i), "operators": [{"opcode_index": i + 1}]} for i in range(500)]
     last = {"operators": [{"opcode_index": 7}] * 5000}
-    data = bytearray(encoded({"version": 3, "subgraphs": [*many, last]}).joined())
+    data = bytearray(encoded({"version": 3, "subgraphs": [*many, last]}).to_bytes())
     _, *subgraphs = entries(data, number(data, "I", 0), 2)
     shared = entries(data, subgraphs[-1], 3)[0]
     vector = shared + number(data, "I", shared)
@@ -195,6 +195,6 @@ def test_what_many_lead_to_is_not_read_for_each_of_them() -> None:
 
 def test_equal_operators_stand_once_in_a_file() -> None:
     model = {"version": 3, "subgraphs": [{"operators": [{"opcode_index": 7}] * 9}] * 9}
-    data = encoded(model).joined()
+    data = encoded(model).to_bytes()
     assert decoded(data)["subgraphs"][8]["operators"][8] == {"opcode_index": 7}
     assert len(data) < 9 * 9 * 4 + 9 * 40 + 100

@@ -169,7 +169,7 @@ class Bench:
         """What TensorFlow makes of the imported graph."""
         found, graph, names = imported_graph(path, outputs)
         file = path.with_suffix(".pb")
-        file.write_bytes(schema.serialise(encode(graph.pruned([*names, *found.inputs.values()]))))
+        file.write_bytes(schema.serialise(encode(graph.prune([*names, *found.inputs.values()]))))
         loaded = self.pool.process("tensorflow").load(str(file), kind="graph")
         results = loaded.run(fed(found, feeds), names)
         loaded.unload()

@@ -29,7 +29,7 @@ from exporter.verify import original
 from signatures.contract import parse_source_map
 from signatures.errors import SignatureError
 from signatures.fields import Field
-from signatures.memories import SourcePart, divided, joined
+from signatures.memories import SourcePart, join_memory, split_memory
 from signatures.roles import Role
 from signatures.spec import Memory
 from tests.onnx_reader.models import Array, Bench, floats, model, node, save
@@ -197,7 +197,7 @@ def test_a_source_that_is_run_with_its_states_mixed_up_disagrees(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = save(recurrent(layers=2), tmp_path, "actor.onnx")
-    monkeypatch.setattr(original, "divided", lambda parts, memory: divided(parts[::-1], memory))
+    monkeypatch.setattr(original, "split_memory", lambda parts, memory: split_memory(parts[::-1], memory))
     (result,) = export([path], ExportOptions(tmp_path, verify=("onnxruntime",)), pool=bench.pool)
     assert result.report is not None
     assert result.report.passed is False
@@ -398,8 +398,8 @@ def parts_and_memory(draw: st.DrawFn) -> tuple[tuple[SourcePart, ...], Array]:
 @given(parts_and_memory())
 def test_what_is_divided_is_joined_again(case: tuple[Sequence[Any], Array]) -> None:
     parts, memory = case
-    fed = divided(parts, memory)
-    np.testing.assert_array_equal(joined(parts, fed), memory)
+    fed = split_memory(parts, memory)
+    np.testing.assert_array_equal(join_memory(parts, fed), memory)
     begin = 0
     for part in parts:
         array = fed[part.tensor]

@@ -189,7 +189,7 @@ def test_passwords_and_signatures_are_told_and_written_nowhere(serving: Any, tmp
     ],
 )
 def test_an_address_is_told_in_its_own_spelling(address: str, told: str) -> None:
-    assert fetch.shown(Path(address)) == told
+    assert fetch.path_text(Path(address)) == told
     text = f"403, message='Forbidden', url='{address}'"
     with pytest.raises(SourceError) as raised, asking(address):
         raise ValueError(text)

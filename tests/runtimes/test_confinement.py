@@ -15,7 +15,7 @@ from converters.files.children import memory_limits as memory
 from converters.files.children.confinement import in_force
 from converters.files.children.memory_limits import FREE
 from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.files.children.python import child_command, confined
+from converters.files.children.python import child_command, confined_command
 from converters.formats.registry import WRITTEN
 from converters.runtimes.javascript.node import _program
 from converters.runtimes.pool import RuntimePool
@@ -65,7 +65,7 @@ def tried(code: str, scratch: Path, way: str = OURS) -> subprocess.CompletedProc
     if way == OURS:
         *start, program = child_command("x")
         command = [*start, program.partition("import runpy")[0] + code]
-    done = confined(command, str(scratch))
+    done = confined_command(command, str(scratch))
     assert any("confinement.py" in part for part in done) == (way == OTHERS)
     return subprocess.run(done, capture_output=True, check=False)
 

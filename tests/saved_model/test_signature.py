@@ -240,6 +240,6 @@ def test_an_input_of_which_only_the_length_is_read_is_none() -> None:
     outputs = {"action": Tensor("action:0"), "zeros": Tensor("zeros:0"), "other": Tensor("looked_at:0")}
     left = without_counted(message, ModelSignature(inputs, outputs))
     assert sorted(left.inputs) == ["0/observation", "0/other"]
-    made = normalise(from_graph_def(message).pruned(["zeros"]))
+    made = normalise(from_graph_def(message).prune(["zeros"]))
     zeros = run_graph(made, {"vector_observation": np.ones((5, 3), np.float32)}, ["zeros"])["zeros"]
     assert zeros.shape == (5,)

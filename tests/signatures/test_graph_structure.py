@@ -96,7 +96,7 @@ def test_what_is_upstream_is_kept() -> None:
     g = graph(*CHAIN)
     assert g.ancestors(["b"]) == {"x", "one", "a", "b"}
     assert g.ancestors(["b"], stop=frozenset(("a",))) == {"a", "b"}
-    assert [n.name for n in g.pruned(["c"]).nodes] == ["x", "c"]
+    assert [n.name for n in g.prune(["c"]).nodes] == ["x", "c"]
 
 
 def test_inputs_come_before_their_readers() -> None:

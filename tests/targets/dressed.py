@@ -62,7 +62,7 @@ class Plain:
     @cached_property
     def run(self) -> Callable[[Mapping[str, Any]], Feeds]:
         plain = written("onnx").artifact(self.policy, WriteOptions(CONTRACT))
-        return runner_of(onnx.ModelProto.FromString(plain.files[plain.main].joined()))
+        return runner_of(onnx.ModelProto.FromString(plain.files[plain.main].to_bytes()))
 
 
 @dataclass
@@ -90,7 +90,7 @@ class Pair:
         if profile.importers:
             importable(profile, artifact.files, policy.name)
             playable(profile, artifact.files, policy.name)
-        data = artifact.files[artifact.main].joined()
+        data = artifact.files[artifact.main].to_bytes()
         made = onnx.ModelProto.FromString(data if form == "onnx" else b"")
         return cls(policy, profile, dressed, plain or Plain(policy), made, data, form)
 

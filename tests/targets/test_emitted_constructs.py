@@ -60,7 +60,7 @@ def emitted(policies: Iterable[Policy]) -> Iterator[Model]:
     """What the ONNX of each policy is made of."""
     for policy in policies:
         (data,) = write(policy, WriteOptions('{"tool": {"version": "test"}}')).values()
-        yield constructs(onnx.ModelProto.FromString(data.joined()))
+        yield constructs(onnx.ModelProto.FromString(data.to_bytes()))
 
 
 # ------------------------------------------------------------------ ours

@@ -32,7 +32,7 @@ def for_any_number(graph: Graph, outputs: Sequence[str]) -> tuple[Graph, int] | 
 
     ``outputs`` are nodes, and keep their names; of what they do not need constants are left.
     """
-    upstream = graph.pruned(outputs)
+    upstream = graph.prune(outputs)
     fed = {n.name: n.dims for n in upstream.nodes if is_fed(n)}
     if not fed or any(not dims or None in dims for dims in fed.values()):
         return None

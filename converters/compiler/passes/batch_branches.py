@@ -79,7 +79,7 @@ def _flat(graph: Graph, outputs: frozenset[str]) -> Graph:
             if inner:
                 node = node.with_inputs((*parts[node.name], node.inputs[-1]))
         editor.keep(node)
-    return editor.pruned(outputs)
+    return editor.prune(outputs)
 
 
 class _Joining:
@@ -115,7 +115,7 @@ class _Joining:
         readers = self.graph.consumers()
         for group, value in list(self.groups.items()):
             self._hand_out(group, value, [r for part in group for r in readers[node_of(part)]], swallowed)
-        return self.editor.pruned(self.outputs)
+        return self.editor.prune(self.outputs)
 
     def _instead(self, root: Node, parts: tuple[str, ...]) -> bool:
         """Whether another tensor takes the place of the concatenation."""
@@ -307,7 +307,9 @@ class _Joining:
             return True
         if depth == _FURTHEST or not (entry.moves or entry.finite):
             return False
-        return all(self._is_number(r, depth + 1) for r in (entry.moved(node.inputs) if entry.moves else node.inputs))
+        return all(
+            self._is_number(r, depth + 1) for r in (entry.data_operands(node.inputs) if entry.moves else node.inputs)
+        )
 
     def _one_hot(self, nodes: Sequence[Node]) -> str | None:
         """Columns of one tensor of whole numbers, each one hot: those columns, repeated, compared with the numbers."""

@@ -30,7 +30,7 @@ def broadcast_rows(graph: Graph, fetches: Iterable[str]) -> Graph:
         elif len(node.inputs) == 2 and op_of(node).elementwise:
             node = _broadcast(node, rows, types, names, nodes)
         nodes.append(node)
-    return Graph(tuple(nodes)).pruned(fetches) if rows else graph
+    return Graph(tuple(nodes)).prune(fetches) if rows else graph
 
 
 def _row(node: Node, rows: Mapping[str, np.ndarray], types: Types, allowance: Allowance) -> np.ndarray | None:

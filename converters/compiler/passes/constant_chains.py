@@ -44,7 +44,7 @@ def share(graph: Graph, roots: Iterable[str]) -> Graph:
         else:
             for reference in {r for reader in readers[node.name] for r in reader.inputs if node_of(r) == node.name}:
                 editor.redirect(reference, ref(same, split_ref(reference)[1]))
-    return editor.pruned(outputs)
+    return editor.prune(outputs)
 
 
 def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
@@ -73,7 +73,7 @@ def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
         else:
             operand = editor.const(number.astype(FLOAT32), f"{node.name}/constant")
             editor.keep(Node(node.name, kind, (value, operand), origin=node.origin))
-    return editor.pruned(outputs)
+    return editor.prune(outputs)
 
 
 def square_differences(graph: Graph, roots: Iterable[str]) -> Graph:
@@ -86,7 +86,7 @@ def square_differences(graph: Graph, roots: Iterable[str]) -> Graph:
             editor.keep(node)
         else:
             editor.keep(Node(node.name, "SquaredDifference", inner.inputs, origin=node.origin))
-    return editor.pruned(outputs)
+    return editor.prune(outputs)
 
 
 def _operand(graph: Graph, node: Node) -> tuple[str, str, np.ndarray] | None:

@@ -34,7 +34,7 @@ def multiply_products(graph: Graph, roots: Collection[str] = ()) -> Graph:
                 steps[node.name] = narrow, scale
         elif len(node.inputs) > 1 and node.inputs[1] in steps:
             narrow, scale = steps[node.inputs[1]]
-            product = editor.append(node.moved(editor.add_name(f"{node.name}/product"), (node.inputs[0], narrow)))
+            product = editor.append(node.rewire(editor.add_name(f"{node.name}/product"), (node.inputs[0], narrow)))
             editor.keep(Node(node.name, "Mul", (product, scale), origin=node.origin))
         else:
             editor.keep(node)
@@ -60,7 +60,7 @@ def join_products(graph: Graph) -> Graph:
         product = graph.producer(node.inputs[0]) if node.op == "Mul" and len(node.inputs) == 2 else node
         plain = product.op == "MatMul" and len(product.inputs) == 2 and not _is_turned(product)
         matrix = whole.get((product.inputs[1], node.inputs[1])) if product is not node and plain else None
-        editor.keep(node if matrix is None else product.moved(node.name, (product.inputs[0], matrix)))
+        editor.keep(node if matrix is None else product.rewire(node.name, (product.inputs[0], matrix)))
     return editor.graph()
 
 

@@ -66,7 +66,7 @@ def name_tensors(
         if node.name in wanted and renamed.get(node.name) is None:
             renamed[node.name] = names.fresh(f"{node.name}/inner")
 
-    nodes = [*graph.renamed(renamed).nodes]
+    nodes = [*graph.rename(renamed).nodes]
     for name, reference in identities:
         origin = graph.producer(reference).origin if split_ref(reference)[1] == 0 else None
         nodes.append(Node(name, "Identity", (renamed_ref(reference, renamed),), origin=origin))

@@ -195,7 +195,7 @@ def without_noise(
         name = editor.add_name(f"{prefix}/{node.name}")
         editor.nodes.append(Node(name, node.op, tuple(inputs), node.attrs, node.value))
         copies[node.name] = name
-        made_of = inputs if node.op == "Add" else op_of(node).moved(inputs) if traits(node).moves else ()
+        made_of = inputs if node.op == "Add" else op_of(node).data_operands(inputs) if traits(node).moves else ()
         if made_of and all(i in zeros or graph.is_full_of(i, 0) for i in made_of):
             zeros.add(name)
     return editor.graph(), [_moved(r, copies) for r in references]

@@ -17,7 +17,7 @@ from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.base import MISFIT, REQUIRED, Attr, AttrKind, misfit
 from converters.graph.ops.older import TO_NCHW, TO_NHWC
-from converters.graph.ops.table import CONTROL_FLOW, SPELLINGS, TABLE, op_of, unsupported
+from converters.graph.ops.table import CONTROL_FLOW, SPELLINGS, TABLE, op_of, unsupported_error
 from converters.graph.types import FLOAT32, INT64
 from signatures.errors import GraphError, UnsupportedOpError
 
@@ -29,7 +29,7 @@ def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:
     renamed = [replace(n, op=SPELLINGS[n.op]) if n.op in SPELLINGS else n for n in graph.nodes]
     unknown = [n for n in renamed if n.op not in TABLE and n.op not in CONTROL_FLOW]
     if unknown:
-        raise unsupported(unknown)
+        raise unsupported_error(unknown)
     editor = Editor(graph)
     for node, given in zip(renamed, graph.nodes, strict=True):
         if node.op in CONTROL_FLOW:

@@ -167,7 +167,7 @@ def _check_memories(c: Compilation) -> None:
     named = {normal_ref(n) for n in c.options.outputs} | {r for _, role, r in c.brain.outputs if role is not Role.OTHER}
     for name in (n for n, role in c.facts.outputs.items() if role is None and len(fed) > 1 and n not in named):
         try:
-            graph = normalise(c.original.pruned([name]), [name])
+            graph = normalise(c.original.prune([name]), [name])
             types = infer_types(graph, partial=True)
         except (UnsupportedOpError, GraphError):  # it cannot be converted at all
             continue

@@ -27,7 +27,7 @@ def drop_identities(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, di
         else:
             editor.keep(node)
     moved = {name: editor.resolve(reference) for name, reference in fetches.items()}
-    return editor.graph().pruned(moved.values()), moved
+    return editor.graph().prune(moved.values()), moved
 
 
 def collapse_views(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
@@ -54,7 +54,7 @@ def collapse_views(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dic
             del base[node.name]
             editor.keep(node)
     moved = {name: editor.resolve(reference) for name, reference in fetches.items()}
-    return editor.graph().pruned(moved.values()), moved
+    return editor.graph().prune(moved.values()), moved
 
 
 def _is_view(node: Node, types: Types) -> bool:
@@ -63,7 +63,7 @@ def _is_view(node: Node, types: Types) -> bool:
     if entry.moves == "view":
         return types[node.inputs[0]].shape is not None and types[node.name].shape is not None
     if entry.moves == "join":
-        return len(entry.moved(node.inputs)) == 1 and types[node.name].shape is not None
+        return len(entry.data_operands(node.inputs)) == 1 and types[node.name].shape is not None
     before = types[node.inputs[0]].shape if node.inputs else None
     if before is None:
         return False

@@ -31,7 +31,7 @@ def parts_for_slices(graph: Graph, roots: Iterable[str]) -> Graph:
             editor.redirect(node.name, editor.resolve(part))
     made = editor.graph()
     inputs = [n.name for n in graph.nodes if n.op == "Placeholder"]  # those that nothing reads stay
-    return graph if made is graph else made.pruned([*outputs, *inputs])
+    return graph if made is graph else made.prune([*outputs, *inputs])
 
 
 def _part(graph: Graph, types: Types, node: Node) -> str | None:

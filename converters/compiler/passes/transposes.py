@@ -29,7 +29,7 @@ def cancel_transposes(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, 
         return graph, dict(fetches)
     sinking = _Sinking(graph)
     moved = sinking.run(fetches)
-    result = sinking.editor.graph().pruned(moved.values())
+    result = sinking.editor.graph().prune(moved.values())
     if sum(1 for n in result.nodes if n.op == "Transpose") >= before:
         return graph, dict(fetches)
     return result, moved

@@ -20,7 +20,7 @@ import numpy as np
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, ref, split_ref
-from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported
+from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported_error
 from converters.graph.shapes import Types, add_types, infer_types
 from converters.graph.size_limits import Allowance
 from converters.graph.types import INT32, Symbols, of_array
@@ -125,7 +125,7 @@ class _Unroller:
     def plain(self, reference: str, turn: int | None) -> str:
         value = self.tensor(reference, turn)
         if not isinstance(value, str):
-            raise unsupported([self.graph.producer(reference)])
+            raise unsupported_error([self.graph.producer(reference)])
         return value
 
     def _copy(self, node: Node, turn: int | None) -> str | None:
@@ -188,7 +188,7 @@ class _Unroller:
         if frame not in self.turns:
             condition = self.predicates.get(frame)
             if condition is None:
-                raise unsupported([n for n in self.graph.nodes if self.frames.get(n.name) == frame][:1])
+                raise unsupported_error([n for n in self.graph.nodes if self.frames.get(n.name) == frame][:1])
             variables = self._variables(frame)
             for turn in range(MAX_TURNS + 1):
                 for variable in variables:  # turn by turn: no chain of calls is longer than a body
@@ -216,7 +216,7 @@ class _Unroller:
     def _flow(self, reference: str, turn: int | None) -> _Flow:
         flow = self.tensor(reference, turn)
         if not isinstance(flow, _Flow):
-            raise unsupported([self.graph.producer(reference)])
+            raise unsupported_error([self.graph.producer(reference)])
         return flow
 
     def _number(self, node: Node, reference: str, turn: int | None) -> int | None:

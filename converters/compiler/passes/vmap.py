@@ -31,7 +31,7 @@ def for_every_row(
     place of a first axis of length 1 where an input's was one. Raises UnsupportedOpError where an op has no such form,
     or a shape is not known.
     """
-    return _Turned(fold(normalise(graph.pruned(outputs), outputs)), inputs, ends or {}).run(outputs)
+    return _Turned(fold(normalise(graph.prune(outputs), outputs)), inputs, ends or {}).run(outputs)
 
 
 class _Turned(Rows):

@@ -27,7 +27,7 @@ def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
     """Raise SignatureError that names the first output which is wrong for more rows than one, or the first draw that
     rows share. What is drawn is the same, row by row, in all runs, so that what is behind it is judged, too.
     """
-    graph = normalise(graph.pruned(outputs), outputs).pruned(outputs)
+    graph = normalise(graph.prune(outputs), outputs).prune(outputs)
     types = infer_types(graph)
     axes = {name: _free(kind) for name, kind in types.items()}
     feeds = {n.name: _rows(n.attrs["shape"], n.attrs["dtype"]) for n in graph.nodes if n.op == "Placeholder"}

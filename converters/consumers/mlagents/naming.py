@@ -118,8 +118,8 @@ class Dressing:
 
     def finished(self, memory: Memory | None, beside: Sequence[Node] = ()) -> Policy:
         """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up."""
-        graph = self.builder.graph().pruned(self.fetches.values())
-        work, fetches = drop_identities(fold(graph).pruned(self.fetches.values()), self.fetches)
+        graph = self.builder.graph().prune(self.fetches.values())
+        work, fetches = drop_identities(fold(graph).prune(self.fetches.values()), self.fetches)
         work, fetches = cancel_transposes(*collapse_views(work, fetches))
         feeds = {name: node for name, node in self.feeds.items() if node in work}
         work = name_tensors(work, feeds, fetches, (*self.constants, *(n.name for n in beside)))

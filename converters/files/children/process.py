@@ -17,8 +17,8 @@ import numpy as np
 
 from converters.files.children.frames import FramingError, Tensors, read_frame, write_frame
 from converters.files.children.memory_limits import Memory
-from converters.files.children.python import confined
-from converters.files.children.time_limits import allowed, computed
+from converters.files.children.python import confined_command
+from converters.files.children.time_limits import processor_time, time_limit
 from converters.files.folders import OwnFolder, scratch_folder, size_of
 from signatures.errors import ExportModelError, RuntimeUnavailableError
 
@@ -83,7 +83,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         # What is not confined (a browser) has its own folders where the user's are, and sweeps them by itself.
         places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(self._scratch.path)) if self.confined else {}
         try:
-            command = confined(self.command, str(self._scratch.path)) if self.confined else self.command
+            command = confined_command(self.command, str(self._scratch.path)) if self.confined else self.command
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
@@ -150,8 +150,8 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
     def first(self, path: str, size: int) -> Iterator[None]:
         """What is asked inside has little processor time (patience.py): a model is loaded, or answers once."""
         process = self._process
-        before = None if process is None or self._endless is None else computed(process.pid)
-        self._first = None if before is None else (path, before + allowed(size), allowed(size))
+        before = None if process is None or self._endless is None else processor_time(process.pid)
+        self._first = None if before is None else (path, before + time_limit(size), time_limit(size))
         try:
             yield
         finally:
@@ -193,7 +193,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             answer, results = read_frame(back)
             self._busy = False
         except (OSError, EOFError, FramingError) as error:
-            status = _ended(process)
+            status = _wait_or_kill(process)
             said = self._last_errors()
             self.close()
             if self._first is not None and self._first[0] in (self._endless or ()):
@@ -219,7 +219,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             if not self._busy:
                 continue
             first, endless = self._first, self._endless
-            if first is not None and endless is not None and (computed(process.pid) or 0) > first[1]:
+            if first is not None and endless is not None and (processor_time(process.pid) or 0) > first[1]:
                 endless.add(first[0])
                 process.kill()
                 return
@@ -251,7 +251,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
                 process.terminate()  # not kill: one that has started a browser ends that first
             if process.stdout is not None:
                 process.stdout.close()
-            _ended(process, 10 if self.confined else 60)  # what is not confined has a browser to end
+            _wait_or_kill(process, 10 if self.confined else 60)  # what is not confined has a browser to end
         if self._errors is not None:
             self._errors.close()
             self._errors = None
@@ -279,7 +279,7 @@ def _requests(inputs: Sequence[Mapping[str, np.ndarray]], *, alone: bool) -> Ite
         yield first, len(inputs)
 
 
-def _ended(process: subprocess.Popen[bytes], patience: float = 5) -> int:
+def _wait_or_kill(process: subprocess.Popen[bytes], patience: float = 5) -> int:
     """The status of a process that should be ending; one that lives on after ``patience`` seconds is killed."""
     try:
         return process.wait(patience)
@@ -319,10 +319,10 @@ class LoadedModel(AbstractContextManager["LoadedModel"]):
         return self._run_all(inputs, [{}] * len(inputs), outputs)
 
     def _run(self, header: Mapping[str, Any], feeds: Mapping[str, np.ndarray], fetch: Sequence[str]) -> Tensors:
-        _, results = self._asked({"cmd": "run", "id": self._identity, **header}, dict(feeds))
-        return self._checked(results, fetch)
+        _, results = self._request({"cmd": "run", "id": self._identity, **header}, dict(feeds))
+        return self._require_outputs(results, fetch)
 
-    def _asked(self, header: Mapping[str, Any], tensors: Tensors) -> tuple[dict[str, Any], Tensors]:
+    def _request(self, header: Mapping[str, Any], tensors: Tensors) -> tuple[dict[str, Any], Tensors]:
         if self._answered:
             return self._process.request(header, tensors)
         with self._process.first(self._path, self._size):
@@ -342,15 +342,15 @@ class LoadedModel(AbstractContextManager["LoadedModel"]):
                 for array in feeds.values():
                     tensors[keys.setdefault(id(array), str(len(keys)))] = array
                 runs.append({**header, "feeds": {name: keys[id(array)] for name, array in feeds.items()}})
-            _, results = self._asked({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
+            _, results = self._request({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
             answers: list[Tensors] = [{} for _ in runs]
             for key, array in results.items():
                 number, _, name = key.partition("/")
                 answers[int(number)][name] = array
-            found += [self._checked(each, fetch) for each in answers]
+            found += [self._require_outputs(each, fetch) for each in answers]
         return found
 
-    def _checked(self, results: Tensors, fetch: Sequence[str]) -> Tensors:
+    def _require_outputs(self, results: Tensors, fetch: Sequence[str]) -> Tensors:
         missing = [name for name in fetch if name not in results]
         if missing:
             raise RunFailedError(f"{self._process.name} gave no output {missing[0]!r}")

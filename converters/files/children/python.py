@@ -24,7 +24,7 @@ def child_command(module: str, *arguments: str) -> list[str]:
     return [*_PYTHON, f"{_PATH}import runpy; runpy.run_module({module!r}, run_name='__main__')", *arguments]
 
 
-def confined(command: Sequence[str], scratch: str) -> list[str]:
+def confined_command(command: Sequence[str], scratch: str) -> list[str]:
     """A command whose process may write below ``scratch`` only, and reach no network, as far as the system offers it.
 
     Raises FileNotFoundError where there is no such program.

@@ -16,12 +16,12 @@ FIRST = 8.0
 PER_BYTE = 1 / (4 << 20)
 
 
-def allowed(size: int) -> float:
+def time_limit(size: int) -> float:
     """Seconds of processor time for a model of ``size`` bytes."""
     return FIRST + size * PER_BYTE
 
 
-def computed(pid: int) -> float | None:
+def processor_time(pid: int) -> float | None:
     """Seconds of processor time that a process has taken, all its threads; None where the system does not say."""
     if sys.platform != "linux":
         return None

@@ -9,7 +9,7 @@ import numpy as np
 from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value
 from converters.formats.barracuda.vocabulary import LayerType
 from converters.graph.nn import linear
-from converters.graph.nn.activations import scaled
+from converters.graph.nn.activations import scale_and_shift
 from converters.graph.types import FLOAT32, INT32, INT64
 
 
@@ -127,7 +127,7 @@ def random(b: LayerBuilder, args: Sequence[Value]) -> Value:
         drawn = b.add("RandomStandardNormal", [size], origin=b.layer.name, dtype=FLOAT32)
     else:
         drawn = b.add("RandomUniform", [size], dtype=FLOAT32)
-    return Value(scaled(b, drawn, b.layer.alpha, b.layer.beta), shape)
+    return Value(scale_and_shift(b, drawn, b.layer.alpha, b.layer.beta), shape)
 
 
 def multinomial(b: LayerBuilder, args: Sequence[Value]) -> Value:

@@ -317,7 +317,9 @@ def _scores_behind(graph: Graph, reference: str, b: NnBuilder) -> list[str]:
     if passes_on(node) or node.op == "Cast":
         return _scores_behind(graph, node.inputs[0], b)
     if traits(node).moves == "join":
-        return [scores for branch in traits(node).moved(node.inputs) for scores in _scores_behind(graph, branch, b)]
+        return [
+            scores for branch in traits(node).data_operands(node.inputs) for scores in _scores_behind(graph, branch, b)
+        ]
     if node.op == "ArgMax" and len(b.type_of(node.inputs[0]).shape or ()) == 2:
         return [node.inputs[0]]
     b.node = node

@@ -13,7 +13,7 @@ from converters.formats.barracuda import lower_elementwise as elementwise
 from converters.formats.barracuda import lower_linear as linear
 from converters.formats.barracuda.lower_base import NnBuilder
 from converters.formats.barracuda.lower_values import Value
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, reached, ref
+from converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
 from converters.graph.ops.base import MISFIT, misfit
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel
@@ -123,7 +123,7 @@ def _needed(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict[str, 
             raise _unknown(b, node)
         return makers(map(normal_ref, node.inputs[_OPS[node.op][1]]))
 
-    return reached(makers(wanted), ahead)
+    return reachable(makers(wanted), ahead)
 
 
 def _unknown(b: NnBuilder, node: Node) -> UnsupportedOpError:

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from converters.formats.barracuda.format import Layer, NnModel
 from converters.formats.barracuda.vocabulary import Activation, LayerType
-from converters.graph.nodes import reached
+from converters.graph.nodes import reachable
 
 _MASKS = "action_masks"
 
@@ -69,7 +69,7 @@ def _parts(layers: Mapping[str, Layer]) -> Sequence[str]:
 
 def upstream(names: Iterable[str], layers: Mapping[str, Layer]) -> set[str]:
     """Tensors and all that they are computed from."""
-    return reached(names, lambda name: layers[name].inputs if name in layers else ())
+    return reachable(names, lambda name: layers[name].inputs if name in layers else ())
 
 
 def _widths(layers: Mapping[str, Layer], joined: Sequence[str], total: int) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from converters.files.folders import LeftoverWarning, OwnFolder, left_in, sweep, taken
+from converters.files.folders import LeftoverWarning, OwnFolder, left_in, sweep, try_lock
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _PREFIX = ".export-model-"
@@ -63,7 +63,7 @@ def recover(place: Path) -> None:
         return
     with _looking("recover", place.parent) as due:
         for left in left_in(place.parent, _PREFIX) if due else ():
-            with contextlib.suppress(FileNotFoundError), taken(left) as ours:  # another process is done with its own
+            with contextlib.suppress(FileNotFoundError), try_lock(left) as ours:  # another process is done with its own
                 if ours is not False and (left / "old" / place.name).is_dir() and not place.exists():
                     (left / "old" / place.name).rename(place)
                     shutil.rmtree(left, ignore_errors=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from converters.graph.nodes import NameScope
 from converters.graph.ops.loops.base import Applied, Counter, Drawn, Element, Expression, Number, Reduced, Tensor
-from converters.graph.program import Place, Program, Stage, arena_of, children, every, parted
+from converters.graph.program import Place, Program, Stage, arena_of, children, every, split_loop
 from converters.graph.types import FLOAT32, INT64
 
 #: What C calls a dtype; a truth is an int, as C's comparisons are.
@@ -142,7 +142,7 @@ class Printer:
 
     def _part(self, stage: Stage, body: Expression, bounds: dict[str, tuple[int, int]]) -> None:
         """The loops of a stage, or of the part of it in which its counters are within ``bounds``."""
-        if found := parted(stage, body):
+        if found := split_loop(stage, body):
             counter, end, before, after = found
             first, last = bounds.get(counter.name, (0, counter.length))
             for low, high, each in ((first, min(end, last), before), (max(end, first), last, after)):

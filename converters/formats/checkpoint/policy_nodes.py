@@ -36,7 +36,7 @@ def policy_nodes(graph: Graph) -> tuple[Graph, tuple[str, ...]]:
         for base, _, reference in brain.outputs
         if _is_inner(graph, brain.scope, base, brain.constants) and (name := node_of(reference))
     ]
-    return graph.renamed({name: f"{name}/not_exported" for name in hidden}), notes
+    return graph.rename({name: f"{name}/not_exported" for name in hidden}), notes
 
 
 def _with_action(graph: Graph) -> tuple[Graph, tuple[str, ...]]:

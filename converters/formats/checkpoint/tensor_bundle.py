@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from converters.files import tensorflow_messages as schema
-from converters.files.fetch import MAX_WEIGHTS, opened, read_bytes
+from converters.files.fetch import MAX_WEIGHTS, open_regular_file, read_bytes
 from converters.formats.checkpoint.crc32c import crc32c, masked
 from converters.formats.checkpoint.table import read_table
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
@@ -177,7 +177,7 @@ class Checkpoint:
                 why="the values of a checkpoint lie in its .data files, the .index only says where",
                 fix="put the .data file beside the .index, or take a checkpoint that has both: --step N",
             )
-        with opened(shard, MAX_WEIGHTS) as file:
+        with open_regular_file(shard, MAX_WEIGHTS) as file:
             held = os.fstat(file.fileno()).st_size
             if entry.offset < 0 or entry.size < 0 or entry.offset + entry.size > held:
                 raise DamagedFileError(

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from converters.files import tensorflow_messages as schema
-from converters.graph.nodes import Node, node_of, reached
-from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, ORDERING, SPELLINGS, TABLE, unsupported
+from converters.graph.nodes import Node, node_of, reachable
+from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, ORDERING, SPELLINGS, TABLE, unsupported_error
 from signatures.errors import GraphError
 
 #: Ops that compute a value from their inputs (or draw one) and do nothing else.
@@ -43,7 +43,7 @@ def subgraph(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) 
     """
     nodes, roots = _checked(graph_def, fetches, feeds)
     looping = any(n.op in CONTROL_FLOW for n in graph_def.node)
-    kept = reached(roots, lambda n: (node_of(i.removeprefix("^")) for i in _inputs(nodes, nodes[n], looping)))
+    kept = reachable(roots, lambda n: (node_of(i.removeprefix("^")) for i in _inputs(nodes, nodes[n], looping)))
     part = schema.GraphDef()
     part.versions.CopyFrom(graph_def.versions)
     for node in graph_def.node:
@@ -75,7 +75,7 @@ def _check(nodes: Mapping[str, Any], roots: Iterable[str]) -> None:
         stack.extend((node_of(i.removeprefix("^")), ordered or i.startswith("^")) for i in node.input)
     if refused:
         refused.sort(key=lambda n: n.name)
-        raise unsupported(Node(n.name, n.op) for n in refused)
+        raise unsupported_error(Node(n.name, n.op) for n in refused)
 
 
 def _inputs(nodes: Mapping[str, Any], node: Any, looping: bool) -> list[str]:

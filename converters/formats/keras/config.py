@@ -15,7 +15,7 @@ from typing import Any
 
 from converters.files.fetch import read_bytes
 from converters.files.file_probe import json_in
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 #: Bytes of a configuration; Keras' largest models have one of 2 MB.
@@ -51,7 +51,7 @@ _VALUES = frozenset(("__keras_tensor__", "__tensor__", "__numpy__", "__tuple__",
 def config_of(path: Path, name: str = "config.json") -> Any:
     """The configuration in a ``.keras`` file (a zip), or another part of it in JSON. Raises DamagedFileError."""
     try:
-        with opened(read_bytes(path)) as archive:
+        with open_archive(read_bytes(path)) as archive:
             return json_in(entry_of(archive, name, MAX_CONFIG))
     except (*ZIP_ERRORS, RecursionError) as error:
         raise DamagedFileError(

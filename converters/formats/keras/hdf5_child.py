@@ -22,7 +22,7 @@ import numpy as np
 
 from converters.files.children.child import claim_stdout, serve
 from converters.files.children.frames import Tensors
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
 from converters.formats.keras.config import MAX_CONFIG
 from signatures.errors import DamagedFileError, ExportModelError
 
@@ -39,7 +39,7 @@ def _opened(path: str) -> tuple[io.BytesIO, int, bool]:
     data = Path(path).read_bytes()
     if not data.startswith(b"PK"):
         return io.BytesIO(data), len(data), False
-    with opened(data) as archive:
+    with open_archive(data) as archive:
         content = entry_of(archive, WEIGHTS, _MAX_RATIO * len(data) + _FREE)
     return io.BytesIO(content), len(content), True
 

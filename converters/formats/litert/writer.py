@@ -61,7 +61,7 @@ def _function(
 ) -> tuple[Table, Table, Mapping[str, View]]:
     """The subgraph of a signature, what the signature says of it, and which tensors have their axes otherwise."""
     fetches = [policy.fetches[s.name] for s in outputs]
-    part = graph.pruned(fetches)
+    part = graph.prune(fetches)
     made = Subgraph(part, fetches, shared, options)
     fed = {s.name: made.input(s, policy.feeds[s.name]) for s in inputs if policy.feeds[s.name] in graph}
     for node in part.nodes:

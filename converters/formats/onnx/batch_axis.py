@@ -126,7 +126,7 @@ def _alone(
     for value in declared:
         node, axis = importer.values[value.name], axes.get(value.name, 0 if leading else None)
         shape = importer.type_of(node).shape or ()
-        if importer.known(node) is None and (shape or (len(declared) == 1 and importer.dtype(node).kind in "iu")):
+        if importer.constant_of(node) is None and (shape or (len(declared) == 1 and importer.dtype(node).kind in "iu")):
             inputs[node] = axis if axis is not None and shape[axis : axis + 1] == (1,) else None
     last = {importer.values[name]: axis for name, axis in ends.items() if name in made}
     graph = for_every_row(importer.graph(), [importer.values[name] for name in made], inputs, last)

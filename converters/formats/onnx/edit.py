@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from converters.formats.onnx import messages
-from converters.graph.nodes import reached
+from converters.graph.nodes import reachable
 from converters.graph.types import FLOAT32
 
 _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
@@ -72,7 +72,7 @@ def cut(model: Any, fetch: Sequence[str]) -> Any:
     part.CopyFrom(model)
     graph = part.graph
     makers = {output: index for index, node in enumerate(graph.node) for output in node.output if output}
-    needed = reached(fetch, lambda name: _reads(graph.node[makers[name]]) if name in makers else ())
+    needed = reachable(fetch, lambda name: _reads(graph.node[makers[name]]) if name in makers else ())
     kept = {makers[name] for name in needed if name in makers}
     nodes = [n for i, n in enumerate(graph.node) if i in kept]
     inputs = [v for v in graph.input if v.name in needed]

@@ -139,7 +139,7 @@ def _with_rows_first(model: OnnxModel) -> tuple[Graph, list[str]]:
         if value != "recurrent_out" and model.batch != 1:
             continue
         inner, target = names.fresh(f"{name}/time_first"), names.fresh(f"{name}/shape")
-        graph = graph.renamed({name: inner})
+        graph = graph.rename({name: inner})
         rows = Node(target, "Const", value=np.array([-1, 1, int(shape[2])], np.int32))
         turned = Node(name, "Reshape", (inner, target), origin=graph[inner].origin)
         graph = Graph(topological([*graph.nodes, rows, turned]))
@@ -166,7 +166,7 @@ def _with_spreads(model: OnnxModel, graph: Graph, roles: Mapping[str, Role | Non
         if role not in (Role.STD, Role.LOG_STD) or action is None or (shape and isinstance(shape[0], str)):
             continue
         inner, zero, rows = (names.fresh(f"{node}/{word}") for word in ("constant", "zero", "rows"))
-        graph = graph.renamed({node: inner})
+        graph = graph.rename({node: inner})
         made = (
             Node(zero, "Const", value=np.zeros((), np.float32)),
             Node(rows, "Mul", (action, zero)),

@@ -24,7 +24,7 @@ from converters.formats.onnx.messages import files_of
 from converters.formats.onnx.peephole import pooled_first, shortened
 from converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.graph.nodes import Graph, NameScope, Node, ref
-from converters.graph.ops.table import op_of, unsupported
+from converters.graph.ops.table import op_of, unsupported_error
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import FLOAT32, TensorType
 from converters.policy.policy import Policy
@@ -188,7 +188,7 @@ class _Builder:
             return
         entry = op_of(node)
         if entry.onnx is None:
-            raise unsupported([node])
+            raise unsupported_error([node])
         before = len(self.nodes)
         result = entry.onnx(node, self)
         made = {name for n in self.nodes[before:] for name in n.output}

@@ -14,8 +14,8 @@ from typing import Any
 
 from converters.files import tensorflow_messages as schema
 from converters.formats.frozen_graph.subgraph import COMPUTING, is_pivot
-from converters.graph.nodes import NameScope, Node, normal_ref, reached, ref, renamed_ref, split_ref
-from converters.graph.ops.table import CALLING, EFFECTS, IFS, ORDERING, READS, RESULTS, WHILES, unsupported
+from converters.graph.nodes import NameScope, Node, normal_ref, reachable, ref, renamed_ref, split_ref
+from converters.graph.ops.table import CALLING, EFFECTS, IFS, ORDERING, READS, RESULTS, WHILES, unsupported_error
 from signatures.errors import DamagedFileError, NotAPolicyError
 
 _ALLOWED = COMPUTING | READS | ORDERING | CALLING
@@ -115,7 +115,7 @@ class _Flattening:
                     why="it keeps a memory in itself, which a frozen graph does not have",
                     fix="save it with the memory as an input and an output; or without what counts or learns",
                 )
-            raise unsupported(Node(n.name, n.op) for n in refused)
+            raise unsupported_error(Node(n.name, n.op) for n in refused)
 
     def _resolved(self, reference: str) -> str:
         """The tensor behind the results of calls, which is noted for all that were passed on the way."""
@@ -306,7 +306,7 @@ def _upstream(nodes: Mapping[str, Any], roots: Iterable[str], given: Collection[
             raise _damaged(f"{name!r} is read and is not in the graph")
         return (i.removeprefix("^").partition(":")[0] for i in nodes[name].input)
 
-    seen = reached((r.removeprefix("^").partition(":")[0] for r in roots), inputs)
+    seen = reachable((r.removeprefix("^").partition(":")[0] for r in roots), inputs)
     return [n for n in nodes.values() if n.name in seen and n.name not in given]
 
 

@@ -14,7 +14,7 @@ from converters.compiler.options import MAX_PORTS
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
 from converters.formats.saved_model.signature import ModelSignature, Tensor
-from converters.graph.nodes import TensorShape, node_of, reached
+from converters.graph.nodes import TensorShape, node_of, reachable
 from converters.graph.ops.table import CALLING
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.records import dataclass
@@ -88,4 +88,4 @@ def _calls_functions(graph_def: Any, signature: ModelSignature) -> bool:
     if not calling or not signature.outputs:
         return bool(calling)
     inputs = {n.name: [node_of(i) for i in n.input if not i.startswith("^")] for n in graph_def.node}
-    return not calling.isdisjoint(reached(map(node_of, signature.roots), lambda name: inputs.get(name, ())))
+    return not calling.isdisjoint(reachable(map(node_of, signature.roots), lambda name: inputs.get(name, ())))

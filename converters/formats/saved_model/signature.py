@@ -116,7 +116,7 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
             )
     keep = [n.name for n in graph.nodes if n.name in (*CONSTANT_NAMES, EMBEDDED)]
     graph = _with_placeholders(graph, signature)
-    graph = graph.pruned([*signature.roots, *keep])
+    graph = graph.prune([*signature.roots, *keep])
     names = output_names(signature)
     taken = {n.name for n in graph.nodes}
     scope = NameScope((*taken, *names.values(), *_actions(signature)))
@@ -135,7 +135,7 @@ def expose(graph: Graph, signature: ModelSignature) -> tuple[Graph, dict[str, Ro
     joined = [action for action, keys in _actions(signature).items() if len(keys) > 1]
     moved.update({action: scope.fresh(f"{action}/inner") for action in joined if action in taken})
     pins += _several_actions(signature, scope)
-    nodes = [*graph.renamed(moved).nodes, *(p.with_inputs(renamed_ref(r, moved) for r in p.inputs) for p in pins)]
+    nodes = [*graph.rename(moved).nodes, *(p.with_inputs(renamed_ref(r, moved) for r in p.inputs) for p in pins)]
     return Graph(topological(nodes)), {moved.get(n, n): role for n, role in roles.items()}
 
 

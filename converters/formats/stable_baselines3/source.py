@@ -12,7 +12,7 @@ from typing import Any
 from converters.files.fetch import Fetched
 from converters.files.file_probe import json_in
 from converters.files.torch_archive import Archive
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, opened
+from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
 from converters.formats.source import ReadOptions, SourceModel
 from converters.trainers.registry import rebuild
 from converters.trainers.trainer import Saved
@@ -48,7 +48,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
 def _entries(data: bytes) -> list[bytes]:
     """``data`` and ``policy.pth`` of an archive. Raises DamagedFileError."""
     try:
-        with opened(data) as archive:
+        with open_archive(data) as archive:
             most = min(_MOST * len(data), len(data) + _MOST_ADDED)
             return [entry_of(archive, name, most) for name in (_DATA, _POLICY)]
     except ZIP_ERRORS as error:

@@ -21,7 +21,7 @@ from converters.formats.frozen_graph.subgraph import COMPUTING
 from converters.formats.intermediate_tensors import InnerTensors, Loaded, own_names
 from converters.formats.tfjs.reader import MODEL, read_signature, shard
 from converters.graph.nodes import Node
-from converters.graph.ops.table import CALLING, ORDERING, unsupported
+from converters.graph.ops.table import CALLING, ORDERING, unsupported_error
 from signatures.errors import DamagedFileError
 
 
@@ -78,7 +78,7 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
             "model.json is not in TensorFlow.js's form", why=f"{type(error).__name__}: {error}"[:200], fix=_FIX
         ) from error
     if refused:
-        raise unsupported(refused)
+        raise unsupported_error(refused)
     copy = folder / (path.resolve().name or "model")
     copy.mkdir()
     graph = {key: model["modelTopology"][key] for key in _GRAPH if key in model["modelTopology"]}

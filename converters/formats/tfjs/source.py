@@ -56,7 +56,7 @@ def _retyped(graph: Graph, contract: Contract) -> Graph:
     scope = NameScope(n.name for n in graph.nodes)
     names = [s.name for s in (*contract.signature.inputs, *contract.signature.outputs) if s.dtype not in _NARROW]
     inner = {name: scope.fresh(f"{name}/narrow") for name in names if name in graph}
-    nodes = {n.name: n for n in graph.renamed(inner).nodes}
+    nodes = {n.name: n for n in graph.rename(inner).nodes}
     for spec in contract.signature.inputs:
         if spec.name in inner:
             node = nodes[inner[spec.name]]

@@ -28,7 +28,7 @@ def clip(b: Builder, x: str, low: float | str | None, high: float | str | None) 
     return x
 
 
-def scaled(b: Builder, x: str, factor: float, shift: float = 0.0) -> str:
+def scale_and_shift(b: Builder, x: str, factor: float, shift: float = 0.0) -> str:
     """factor·x + shift; a factor of 1 and a shift of 0 are left out."""
     if factor != 1:
         x = b.add("Mul", [x, b.number(x, factor, "scale")])
@@ -75,22 +75,22 @@ def hard_swish(b: Builder, x: str) -> str:
 
 def elu(b: Builder, x: str, alpha: float = 1.0) -> str:
     """Where x is below 0 alpha·(eˣ − 1), else x."""
-    return b.add("Elu", [x]) if alpha == 1 else _bent(b, x, alpha, 1)
+    return b.add("Elu", [x]) if alpha == 1 else _elu(b, x, alpha, 1)
 
 
 def celu(b: Builder, x: str, alpha: float = 1.0) -> str:
     """Where x is below 0 alpha·(e^(x/alpha) − 1), else x."""
-    return b.add("Elu", [x]) if alpha == 1 else _bent(b, x, alpha, alpha)
+    return b.add("Elu", [x]) if alpha == 1 else _elu(b, x, alpha, alpha)
 
 
 def selu(b: Builder, x: str, alpha: float = SELU_ALPHA, gamma: float = SELU_GAMMA) -> str:
     """gamma·elu(x, alpha)."""
     if abs(alpha - SELU_ALPHA) < _CLOSE and abs(gamma - SELU_GAMMA) < _CLOSE:
         return b.add("Selu", [x])
-    return b.add("Mul", [b.number(x, gamma), _bent(b, x, alpha, 1)])
+    return b.add("Mul", [b.number(x, gamma), _elu(b, x, alpha, 1)])
 
 
-def _bent(b: Builder, x: str, alpha: float, inner: float) -> str:
+def _elu(b: Builder, x: str, alpha: float, inner: float) -> str:
     """max(x, 0) + alpha·(exp(min(x, 0)/inner) − 1): one of the two is 0."""
     low = b.add("Minimum", [x, b.number(x, 0)])
     if inner != 1:

@@ -31,7 +31,7 @@ def top_k(b: Builder, x: str, k: int, *, largest: bool = True) -> tuple[str, str
         best = b.reduce("Max" if largest else "Min", x, [rank - 1], keep=True)
         place = b.add("ArgMax" if largest else "ArgMin", [x, b.ints(rank - 1, "axis")], output_type=INT64)
         return best, b.expand_dims(place, rank - 1)
-    _bounded(length, length)
+    _check_table_size(length, length)
     b.room(length * length)
     mine, other = b.expand_dims(x, rank), b.expand_dims(x, rank - 1)
     better = b.add("Greater" if largest else "Less", [other, mine])
@@ -41,13 +41,13 @@ def top_k(b: Builder, x: str, k: int, *, largest: bool = True) -> tuple[str, str
     places = b.const(np.arange(k, dtype=FLOAT32)[:, None], "places")
     chosen = b.add("Equal", [b.expand_dims(place, rank - 1), places])  # […, k, length]
     index = b.add("ArgMax", [b.cast(chosen, FLOAT32), b.ints(rank, "axis")], output_type=INT64)
-    return _summed(b, chosen, other, rank), index
+    return _sum_chosen(b, chosen, other, rank), index
 
 
-def cumulated(b: Builder, x: str, *, exclusive: bool = False, reverse: bool = False, product: bool = False) -> str:
+def cumulate(b: Builder, x: str, *, exclusive: bool = False, reverse: bool = False, product: bool = False) -> str:
     """The sums (or products) of the last axis up to each element, or from it on."""
     length, rank = b.length(x, -1), b.rank(x)
-    _bounded(length, length)
+    _check_table_size(length, length)
     b.room(length * length)
     whole = np.ones((length, length), bool)
     mask = np.triu(whole, int(exclusive)) if reverse else np.tril(whole, -int(exclusive))
@@ -56,13 +56,13 @@ def cumulated(b: Builder, x: str, *, exclusive: bool = False, reverse: bool = Fa
     return b.reduce("Prod" if product else "Sum", kept, [rank], keep=False)
 
 
-def picked(b: Builder, x: str, indices: str) -> str:
+def gather_elements(b: Builder, x: str, indices: str) -> str:
     """``y[…, j] = x[…, indices[…, j]]``; the other axes are equal, negative indices count from the end."""
     chosen = _table(b, indices, b.length(x, -1))
-    return _summed(b, chosen, b.expand_dims(x, b.rank(x) - 1), b.rank(x))
+    return _sum_chosen(b, chosen, b.expand_dims(x, b.rank(x) - 1), b.rank(x))
 
 
-def scattered(b: Builder, x: str, indices: str, updates: str, combined: Combined = "none") -> str:
+def scatter_elements(b: Builder, x: str, indices: str, updates: str, combined: Combined = "none") -> str:
     """``y[…, indices[…, j]] = updates[…, j]`` in a copy of x, or combined with what is there; other axes are equal."""
     rank = b.rank(x)
     hit = _table(b, indices, b.length(x, -1))  # […, j, place]
@@ -95,17 +95,17 @@ def moved_back(b: Builder, x: str, axis: int) -> str:
 def _table(b: Builder, indices: str, length: int) -> str:
     """Booleans […, j, place]: whether the j-th index means the place."""
     count = b.shape(indices)[-1]
-    _bounded(count if isinstance(count, int) else 1, length)
+    _check_table_size(count if isinstance(count, int) else 1, length)
     index = b.add("FloorMod", [b.cast(indices, INT32), b.ints(length, "length")])
     return b.add("Equal", [b.expand_dims(index, b.rank(indices)), b.const(np.arange(length, dtype=INT32), "places")])
 
 
-def _summed(b: Builder, chosen: str, candidates: str, axis: int) -> str:
+def _sum_chosen(b: Builder, chosen: str, candidates: str, axis: int) -> str:
     """The one candidate along an axis where ``chosen`` is true."""
     return b.reduce("Sum", b.where(chosen, candidates, b.number(candidates, 0, "nothing")), [axis], keep=False)
 
 
-def _bounded(*lengths: int) -> None:
+def _check_table_size(*lengths: int) -> None:
     if np.prod(lengths) > MAX_TABLE:
         raise UnsupportedOpError(
             f"it compares {' with '.join(map(str, lengths))} elements",

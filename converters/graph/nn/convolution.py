@@ -58,7 +58,7 @@ class Window:
         return height, width
 
 
-def framed(b: Builder, image: str, window: Window, fill: float = 0.0) -> tuple[str, str]:
+def pad_image(b: Builder, image: str, window: Window, fill: float = 0.0) -> tuple[str, str]:
     """(the image, TensorFlow's padding): padded with ``fill`` by a node of its own unless it is SAME or VALID."""
     if window.same:
         return image, "SAME"
@@ -75,7 +75,7 @@ def conv2d(b: Builder, image: str, kernel: str | np.ndarray, window: Window, gro
 
     ``kernel`` is a tensor, or an array that becomes one.
     """
-    data, padding = framed(b, image, window)
+    data, padding = pad_image(b, image, window)
     attrs: dict[str, Any] = {
         "strides": (1, *window.strides, 1),
         "dilations": (1, *window.dilations, 1),

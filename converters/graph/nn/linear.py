@@ -26,5 +26,5 @@ def _product(b: Builder, x: str, y: str) -> str:
     if len(right) == 2:
         rows = b.reshape(x, (-1, b.length(x, -1)))
         return b.reshape(b.add("MatMul", [rows, y]), (*left[:-1], right[-1]))
-    batch = b.joined([left[:-2], right[:-2]])
+    batch = b.common_shape([left[:-2], right[:-2]])
     return b.add("BatchMatMul", [b.broadcast(t, (*batch, *s[-2:])) for t, s in ((x, left), (y, right))])

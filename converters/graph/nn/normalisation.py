@@ -34,7 +34,7 @@ def batch(
     return b.add("Add", [b.add("Mul", [b.add("Sub", [x, centre]), width]), shift])
 
 
-def standardised(b: Builder, x: str, axes: Sequence[int], epsilon: float) -> tuple[str, str, str]:
+def standardise(b: Builder, x: str, axes: Sequence[int], epsilon: float) -> tuple[str, str, str]:
     """((x − mean)/√(variance + ε), mean, 1/√(variance + ε)), the statistics taken over ``axes``, which stay as 1."""
     mean = b.reduce("Mean", x, axes, keep=True)
     centred = b.add("Sub", [x, mean])
@@ -45,7 +45,7 @@ def standardised(b: Builder, x: str, axes: Sequence[int], epsilon: float) -> tup
 
 def layer(b: Builder, x: str, axis: int, scale: str, bias: str | None, epsilon: float = 1e-5) -> tuple[str, str, str]:
     """Over the axes from ``axis`` on, times a scale that broadcasts to x, plus a bias; with mean and 1/deviation."""
-    value, mean, inverse = standardised(b, x, range(axis, b.rank(x)), epsilon)
+    value, mean, inverse = standardise(b, x, range(axis, b.rank(x)), epsilon)
     value = b.add("Mul", [value, scale])
     return value if bias is None else b.add("Add", [value, bias]), mean, inverse
 
@@ -60,7 +60,7 @@ def rms(b: Builder, x: str, axis: int, scale: str, epsilon: float = 1e-5) -> str
 def instance(b: Builder, x: str, scale: str, bias: str, epsilon: float = 1e-5, *, channels: int = 1) -> str:
     """Each channel of each row over its own pixels; scale and bias are [C], as is the axis ``channels`` of x."""
     rank = b.rank(x)
-    value, _, _ = standardised(b, x, [i for i in range(1, rank) if i != channels], epsilon)
+    value, _, _ = standardise(b, x, [i for i in range(1, rank) if i != channels], epsilon)
     shape = [-1 if i == channels else 1 for i in range(rank)]
     factor, shift = (b.reshape(r, shape) if channels < rank - 1 else r for r in (scale, bias))
     return b.add("Add", [b.add("Mul", [value, factor]), shift])
@@ -71,7 +71,7 @@ def group(b: Builder, x: str, groups: int, scale: str, bias: str, epsilon: float
     dims, channels = b.shape(x), b.length(x, 1)
     if groups < 1 or channels % groups:
         raise UnsupportedOpError(f"it has {groups} groups for {channels} channels", why="the model is damaged")
-    value, _, _ = standardised(b, b.reshape(x, (dims[0], groups, -1)), [2], epsilon)
+    value, _, _ = standardise(b, b.reshape(x, (dims[0], groups, -1)), [2], epsilon)
     per_group = b.length(scale, 0) != channels
     shape = (1, groups, 1) if per_group else (1, -1, *(1,) * (len(dims) - 2))
     factor, shift = (b.reshape(r, shape) for r in (scale, bias))

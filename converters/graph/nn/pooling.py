@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.nn.convolution import Pair, Window, framed
+from converters.graph.nn.convolution import Pair, Window, pad_image
 from converters.graph.types import FLOAT32
 from signatures.errors import UnsupportedOpError
 
@@ -25,7 +25,7 @@ def max_pool(b: Builder, image: str, window: Window, lowest: float = -np.inf) ->
         for part in rest:
             value = b.add("Maximum", [value, part])
         return value
-    data, padding = framed(b, image, window, lowest)
+    data, padding = pad_image(b, image, window, lowest)
     return b.add("MaxPool", [data], **_attrs(window, padding))
 
 

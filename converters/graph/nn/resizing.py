@@ -38,7 +38,7 @@ class Resampling:
     region: tuple[float, float] = (0.0, 1.0)
 
 
-def resampled(b: Builder, x: str, axis: int, length: int, scale: float, how: Resampling) -> str:
+def resample(b: Builder, x: str, axis: int, length: int, scale: float, how: Resampling) -> str:
     """``x`` with ``length`` elements on an axis, ``scale`` times as many as it has."""
     before = b.length(x, axis)
     if length < 1 or before < 1 or before * length > _MAX_WEIGHTS:

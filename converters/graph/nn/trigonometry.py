@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from converters.graph.builder import Builder
-from converters.graph.nn.activations import clip, scaled
+from converters.graph.nn.activations import clip, scale_and_shift
 
 
 def sinh(b: Builder, x: str) -> str:
@@ -19,7 +19,7 @@ def cosh(b: Builder, x: str) -> str:
 
 
 def _hyperbolic(b: Builder, op: str, x: str) -> str:
-    return scaled(b, b.add(op, [b.add("Exp", [x]), b.add("Exp", [b.add("Neg", [x])])]), 0.5)
+    return scale_and_shift(b, b.add(op, [b.add("Exp", [x]), b.add("Exp", [b.add("Neg", [x])])]), 0.5)
 
 
 def asinh(b: Builder, x: str) -> str:
@@ -38,7 +38,7 @@ def acosh(b: Builder, x: str) -> str:
 def atanh(b: Builder, x: str) -> str:
     """½·ln((1 + x) / (1 − x))."""
     one = b.number(x, 1, "one")
-    return scaled(b, b.add("Log", [b.add("RealDiv", [b.add("Add", [one, x]), b.add("Sub", [one, x])])]), 0.5)
+    return scale_and_shift(b, b.add("Log", [b.add("RealDiv", [b.add("Add", [one, x]), b.add("Sub", [one, x])])]), 0.5)
 
 
 def atan(b: Builder, x: str) -> str:
@@ -59,7 +59,7 @@ def atan(b: Builder, x: str) -> str:
     for power in (7, 5, 3, 1):
         sign = 1 if power in (5, 1) else -1
         series = b.add("Add", [b.add("Mul", [series, square]), b.number(x, sign / power, f"c{power}")])
-    y = scaled(b, b.add("Mul", [series, t]), 4)
+    y = scale_and_shift(b, b.add("Mul", [series, t]), 4)
     off = b.add("Sub", [b.add("Sin", [y]), b.add("Mul", [x, b.add("Cos", [y])])])
     return b.add("Sub", [y, b.add("RealDiv", [off, cosine])])
 

@@ -19,14 +19,14 @@ from converters.graph.ops.base import (
     by_shape,
     constant_input,
     direct,
-    inserted,
+    emit_squeeze,
+    emit_unsqueeze,
+    insert_axis,
     not_constant,
     require_constant,
     same_as,
     shape_error,
-    squeezed,
     type_attr,
-    unsqueezed,
 )
 from converters.graph.ops.litert import arrays as litert
 from converters.graph.ops.litert.base import LitertBuilder, Value, same, without
@@ -177,7 +177,7 @@ def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
     assert shape is not None
     axes = _squeeze_axes(node, shape)
     kept = [d for i, d in enumerate(shape) if i not in axes]
-    return squeezed(builder, builder.value(node.inputs[0]), axes, kept)
+    return emit_squeeze(builder, builder.value(node.inputs[0]), axes, kept)
 
 
 def _litert_squeeze(node: Node, builder: LitertBuilder) -> Value:
@@ -191,13 +191,13 @@ def _litert_squeeze(node: Node, builder: LitertBuilder) -> Value:
 def _infer_expand_dims(
     node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols
 ) -> Sequence[Dim]:
-    return inserted(shape, int(require_constant(node, args, 1, "an axis").reshape(()))) or ()
+    return insert_axis(shape, int(require_constant(node, args, 1, "an axis").reshape(()))) or ()
 
 
 def _lower_expand_dims(node: Node, builder: OnnxBuilder) -> Any:
     axis = int(constant_input(node, builder, 1, "an axis").reshape(()))
-    result = inserted(builder.type_of(node.inputs[0]).shape, axis)
-    return unsqueezed(builder, builder.value(node.inputs[0]), [axis], result)
+    result = insert_axis(builder.type_of(node.inputs[0]).shape, axis)
+    return emit_unsqueeze(builder, builder.value(node.inputs[0]), [axis], result)
 
 
 def _transpose(node: Node, x: np.ndarray, permutation: np.ndarray) -> np.ndarray:

@@ -216,7 +216,7 @@ class OpDef:
     #: The op that computes this one, a bias and an activation in one.
     fused: str = ""
 
-    def moved(self, operands: Sequence[Any]) -> Sequence[Any]:
+    def data_operands(self, operands: Sequence[Any]) -> Sequence[Any]:
         """Those of ``operands`` whose elements are moved."""
         return operands[slice(*self.data)]
 
@@ -389,7 +389,7 @@ def chain(*steps: tuple[str, float | None]) -> Lower:
     return lower
 
 
-def bounded(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
+def clip_to_finite(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
     """A float that is finite, so that its product with 0 is 0; ``kind`` is what is known of it."""
     if kind.constant is not None:
         return value
@@ -398,17 +398,17 @@ def bounded(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
     return builder.emit("Clip", [value, low, high])
 
 
-def squeezed(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
+def emit_squeeze(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
     """``value`` without ``axes`` of length 1; ``result`` is the shape that comes of it."""
-    return value if not axes else reshaped(builder, value, result) or _with_axes(builder, "Squeeze", value, axes)
+    return value if not axes else emit_reshape(builder, value, result) or _with_axes(builder, "Squeeze", value, axes)
 
 
-def unsqueezed(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
+def emit_unsqueeze(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:
     """``value`` with ``axes`` of length 1 put in; ``result`` is the shape that comes of it."""
-    return value if not axes else reshaped(builder, value, result) or _with_axes(builder, "Unsqueeze", value, axes)
+    return value if not axes else emit_reshape(builder, value, result) or _with_axes(builder, "Unsqueeze", value, axes)
 
 
-def reshaped(builder: OnnxBuilder, value: str, result: Shape) -> str:
+def emit_reshape(builder: OnnxBuilder, value: str, result: Shape) -> str:
     """A Reshape to ``result``, or nothing where that shape is not known well enough for one.
 
     Barracuda reads it in every version. The axes of Squeeze and Unsqueeze are an input since opset 13, which it reads
@@ -441,7 +441,7 @@ def axes_within(axes: Iterable[int], rank: int) -> tuple[int, ...]:
     return tuple(sorted({axis_within(int(axis), rank) for axis in axes}))
 
 
-def inserted(shape: Shape, axis: int, length: Dim = 1) -> tuple[Dim, ...] | None:
+def insert_axis(shape: Shape, axis: int, length: Dim = 1) -> tuple[Dim, ...] | None:
     """A shape with one axis more at ``axis``, which may be counted from the end of the result. Raises IndexError."""
     if shape is None:
         return None

@@ -48,16 +48,16 @@ class Rows:
         """An operand that must be the same for all agents."""
         value = self.types[node.inputs[position]].constant
         if value is None:
-            raise refused(node, "an operand that says how it works is computed while the graph runs")
+            raise batching_error(node, "an operand that says how it works is computed while the graph runs")
         return value
 
     def common(self, node: Node, position: int) -> str:
         """An operand that is the same for all agents; raises UnsupportedOpError where each has its own."""
         if node.inputs[position] in self.own:
-            raise refused(node, "an operand that says how it works is computed while the graph runs")
+            raise batching_error(node, "an operand that says how it works is computed while the graph runs")
         return self.at[node.inputs[position]]
 
-    def rowed(self, reference: str, rank: int | None = None) -> str:
+    def batched_tensor(self, reference: str, rank: int | None = None) -> str:
         """A tensor with the agents' axis, repeated for each where it is the same for all, with axes up to ``rank``."""
         dims = self.shape(reference)
         wide = (*(1,) * ((rank or 0) - len(dims)), *dims)
@@ -65,16 +65,16 @@ class Rows:
             return self.b.broadcast(self.b.reshape(self.at[reference], (1, *wide)), (BATCH, *wide))
         return self.at[reference] if wide == dims else self.b.reshape(self.at[reference], (BATCH, *wide))
 
-    def aligned(self, references: Sequence[str]) -> list[str]:
+    def align_ranks(self, references: Sequence[str]) -> list[str]:
         """Operands that broadcast: those of the agents with as many axes as the longest."""
         rank = max(self.rank(r) for r in references)
-        return [self.rowed(r, rank) if r in self.own else self.at[r] for r in references]
+        return [self.batched_tensor(r, rank) if r in self.own else self.at[r] for r in references]
 
 
 Rule = Callable[[Rows, Node], str | Sequence[str]]
 
 
-def refused(node: Node, why: str) -> UnsupportedOpError:
+def batching_error(node: Node, why: str) -> UnsupportedOpError:
     """The error that a node cannot be computed for several agents."""
     return UnsupportedOpError(
         f"cannot convert {node.op} (node {node.name!r}) of a model for one agent",
@@ -85,14 +85,14 @@ def refused(node: Node, why: str) -> UnsupportedOpError:
 
 
 def _first(rows: Rows, node: Node) -> str:
-    return rows.rowed(node.inputs[0])
+    return rows.batched_tensor(node.inputs[0])
 
 
 # ------------------------------------------------------------------ each element by itself
 
 
 def _elementwise(rows: Rows, node: Node) -> str:
-    operands = rows.aligned(node.inputs)
+    operands = rows.align_ranks(node.inputs)
     if node.op != "AddN":
         return rows.b.add(node.op, operands, **node.attrs)
     total = operands[0]
@@ -109,7 +109,7 @@ def _select(rows: Rows, node: Node) -> str:
     """A condition with one axis chooses whole rows of the tensors."""
     rank = rows.rank(node.inputs[1])
     dims = rows.shape(node.inputs[0])
-    condition, a, b = (rows.rowed(r, None) for r in node.inputs)
+    condition, a, b = (rows.batched_tensor(r, None) for r in node.inputs)
     if len(dims) < rank:
         condition = rows.b.reshape(condition, (BATCH, *dims, *(1,) * (rank - len(dims))))
         condition = rows.b.broadcast(rows.b.cast(condition, INT32), (BATCH, *rows.shape(node.inputs[1])))
@@ -119,7 +119,7 @@ def _select(rows: Rows, node: Node) -> str:
 
 def _bias(rows: Rows, node: Node) -> str:
     if node.inputs[1] in rows.own:
-        return rows.b.add("Add", rows.aligned(node.inputs))
+        return rows.b.add("Add", rows.align_ranks(node.inputs))
     return rows.b.add("BiasAdd", [_first(rows, node), rows.at[node.inputs[1]]])
 
 
@@ -138,19 +138,19 @@ def _transpose(rows: Rows, node: Node) -> str:
 def _concat(rows: Rows, node: Node) -> str:
     parts = node.inputs[:-1]
     at = int(rows.constant(node, len(parts))) % rows.rank(parts[0])
-    return rows.b.concat([rows.rowed(p) for p in parts], at + 1)
+    return rows.b.concat([rows.batched_tensor(p) for p in parts], at + 1)
 
 
 def _pack(rows: Rows, node: Node) -> str:
     at = int(node.attrs["axis"]) % len(rows.shape(node.name))
-    return rows.b.add("Pack", [rows.rowed(p) for p in node.inputs], axis=at + 1)
+    return rows.b.add("Pack", [rows.batched_tensor(p) for p in node.inputs], axis=at + 1)
 
 
 def _split(rows: Rows, node: Node) -> Sequence[str]:
     """Split (axis, value), SplitV (value, sizes, axis)."""
     value, axis = (1, 0) if node.op == "Split" else (0, 2)
     at = rows.b.ints(int(rows.constant(node, axis)) % rows.rank(node.inputs[value]) + 1, "axis")
-    x = rows.rowed(node.inputs[value])
+    x = rows.batched_tensor(node.inputs[value])
     operands = [at, x] if node.op == "Split" else [x, rows.common(node, 1), at]
     return _several(rows, node, operands, dict(node.attrs))
 
@@ -258,16 +258,16 @@ def _product(rows: Rows, node: Node) -> str:
     return matmul(b, operands[0], operands[1])
 
 
-def _windowed(rows: Rows, node: Node) -> str:
+def _batch_window(rows: Rows, node: Node) -> str:
     """An image of each agent as one of as many images; the kernel is the same for all."""
     n, *image = rows.shape(node.inputs[0])
-    x = rows.b.reshape(_first(rows, node), _joined(n, image))
+    x = rows.b.reshape(_first(rows, node), _merge_batch(n, image))
     kernel = [rows.common(node, i) for i in range(1, len(node.inputs))]
     made = rows.b.add(node.op, [x, *kernel], **node.attrs)
     return rows.b.reshape(made, (BATCH, *rows.shape(node.name)))
 
 
-def _joined(count: int, rest: Sequence[int]) -> list[Dim]:
+def _merge_batch(count: int, rest: Sequence[int]) -> list[Dim]:
     """The agents' axis and the next one, of ``count``, as one."""
     return [BATCH if count == 1 else -1, *rest]
 
@@ -285,7 +285,7 @@ def _draw(rows: Rows, node: Node) -> str:
 
 def _multinomial(rows: Rows, node: Node) -> str:
     count, classes = rows.shape(node.inputs[0])
-    logits = rows.b.reshape(_first(rows, node), _joined(count, [classes]))
+    logits = rows.b.reshape(_first(rows, node), _merge_batch(count, [classes]))
     drawn = rows.b.add("Multinomial", [logits, rows.common(node, 1)], origin=node.origin, **node.attrs)
     return rows.b.reshape(drawn, (BATCH, *rows.shape(node.name)))
 
@@ -310,7 +310,7 @@ _RULES: Mapping[str, Rule] = {
     **dict.fromkeys(("Softmax", "LogSoftmax"), _softmax),
     "OneHot": _one_hot,
     **dict.fromkeys(("MatMul", "BatchMatMul"), _product),
-    **dict.fromkeys(("Conv2D", "DepthwiseConv2dNative", "MaxPool", "AvgPool"), _windowed),
+    **dict.fromkeys(("Conv2D", "DepthwiseConv2dNative", "MaxPool", "AvgPool"), _batch_window),
     **dict.fromkeys(("RandomStandardNormal", "RandomUniform", "TruncatedNormal"), _draw),
     "Multinomial": _multinomial,
 }
@@ -320,5 +320,5 @@ def rule_of(node: Node) -> Rule:
     """How a node is done for many agents; raises UnsupportedOpError."""
     rule = _RULES.get(node.op) or (_elementwise if op_of(node).elementwise else None)
     if rule is None:
-        raise refused(node, "it has no form for several agents")
+        raise batching_error(node, "it has no form for several agents")
     return rule

@@ -23,7 +23,7 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.linear import FUSED, activated, lower_activated
+from converters.graph.ops.linear import FUSED, apply_activations, lower_activated
 from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.litert.layers import conv2d, depthwise, pad, pool
 from converters.graph.ops.loops import arrays
@@ -65,7 +65,7 @@ def _conv2d(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def _fused_conv2d(node: Node, x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    return activated(node, np.asarray(_conv2d(node, x, kernel) + bias))
+    return apply_activations(node, np.asarray(_conv2d(node, x, kernel) + bias))
 
 
 def _depthwise(node: Node, x: np.ndarray, kernel: np.ndarray) -> np.ndarray:

@@ -48,8 +48,8 @@ def einsum(
             tensors[i] = b.add("Sum", [tensors[i], axes], f"{name}/sum", keep_dims=False)
             terms[i] = "".join(c for c in terms[i] if c not in labels)
     if len(terms) == 1:
-        return _turned(b, tensors[0], terms[0], result, name)
-    return _contracted(b, tensors, terms, result, name)
+        return _transpose(b, tensors[0], terms[0], result, name)
+    return _contract(b, tensors, terms, result, name)
 
 
 def _dots(term: str) -> int:
@@ -97,7 +97,7 @@ def _written_out(
     return written, made, result.replace("...", "".join(labels))
 
 
-def _contracted(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], result: str, name: str) -> str:
+def _contract(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], result: str, name: str) -> str:
     """Two operands as matrix products: [batch…, rows, inner] × [batch…, inner, columns]."""
     first, second = terms
     batch = [c for c in first if c in second and c in result]
@@ -122,7 +122,7 @@ def _contracted(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], re
 
     matrices = []
     for tensor, term, sides in zip(tensors, terms, ((rows, inner), (inner, columns)), strict=True):
-        value = _turned(b, tensor, term, "".join([*batch, *sides[0], *sides[1]]), name)
+        value = _transpose(b, tensor, term, "".join([*batch, *sides[0], *sides[1]]), name)
         if [len(s) for s in sides] != [1, 1]:
             dims = [*map(length, batch), *(side(s, known=s is inner) for s in sides)]
             value = b.add("Reshape", [value, b.add("Pack", dims, f"{name}/dims", axis=0)], f"{name}/matrix")
@@ -133,10 +133,10 @@ def _contracted(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], re
         dims = [length(c) for c in order]
         shape = b.add("Pack", dims, f"{name}/dims", axis=0) if dims else b.const(np.zeros(0, INT32), f"{name}/dims")
         value = b.add("Reshape", [value, shape], f"{name}/whole")
-    return _turned(b, value, "".join(order), result, name)
+    return _transpose(b, value, "".join(order), result, name)
 
 
-def _turned(b: NodeBuilder, tensor: str, term: str, result: str, name: str) -> str:
+def _transpose(b: NodeBuilder, tensor: str, term: str, result: str, name: str) -> str:
     if term == result:
         return tensor
     order = b.const(np.array([term.index(c) for c in result], INT32), f"{name}/order")

@@ -15,17 +15,17 @@ from converters.graph.ops.base import (
     GraphBuilder,
     OnnxBuilder,
     OpDef,
-    bounded,
     by_shape,
+    clip_to_finite,
     constant_input,
     direct,
-    inserted,
+    emit_unsqueeze,
+    insert_axis,
     not_constant,
     require_constant,
     same_as,
     shape_error,
     type_attr,
-    unsqueezed,
 )
 from converters.graph.ops.litert import arrays as litert
 from converters.graph.ops.litert.base import builtin
@@ -90,7 +90,7 @@ def _infer_one_hot(node: Node, args: Sequence[TensorType], symbols: Symbols) -> 
     depth, axis = int(require_constant(node, args, 1, "a depth")), int(node.attrs["axis"])
     if axis < -1:  # TensorFlow counts none from the end but the last
         raise shape_error(node, args, f"its axis must be from -1 to {len(shape)}, and is {axis}")
-    return [TensorType(args[2].dtype, inserted(shape, axis, depth))]
+    return [TensorType(args[2].dtype, insert_axis(shape, axis, depth))]
 
 
 def _depth(node: Node, args: Sequence[TensorType]) -> int | None:
@@ -107,7 +107,7 @@ def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
     axis = int(node.attrs["axis"])
     axis = kind.rank if axis < 0 else axis
     classes = np.arange(depth, dtype=kind.dtype).reshape([depth if i == axis else 1 for i in range(kind.rank + 1)])
-    index = unsqueezed(builder, builder.value(node.inputs[0]), [axis], inserted(kind.shape, axis))
+    index = emit_unsqueeze(builder, builder.value(node.inputs[0]), [axis], insert_axis(kind.shape, axis))
     hot = builder.emit("Equal", [index, builder.const(classes, "classes")])
     on, off = (builder.type_of(r).constant for r in node.inputs[2:])
     if on is not None and off is not None and on.size == off.size == 1 and (on.item(), off.item()) == (1, 0):
@@ -151,7 +151,7 @@ def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
     kind = builder.type_of(node.inputs[0])
     zero = builder.const(np.zeros((), kind.dtype), "zero")
     if not builder.reads("Expand") and kind.dtype == FLOAT32:
-        return builder.emit("Mul", [bounded(builder, builder.value(node.inputs[0]), kind), zero])
+        return builder.emit("Mul", [clip_to_finite(builder, builder.value(node.inputs[0]), kind), zero])
     shape = builder.emit("Shape", [builder.value(node.inputs[0])])
     return builder.emit("Expand", [zero, shape])
 

@@ -18,12 +18,12 @@ from converters.graph.ops.base import (
     OpDef,
     axis_within,
     constant_input,
-    inserted,
+    emit_unsqueeze,
+    insert_axis,
     not_constant,
     require_constant,
     shape_error,
     type_attr,
-    unsqueezed,
 )
 from converters.graph.ops.litert import arrays as litert
 from converters.graph.ops.loops import arrays as loops
@@ -78,13 +78,14 @@ def _pack(node: Node, *arrays: np.ndarray) -> np.ndarray:
 def _infer_pack(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     # Scalars of unknown rank (an old sequence_length) packed with known scalars never get here.
     shape = next((a.shape for a in args if a.shape is not None), None)
-    return [TensorType(args[0].dtype, inserted(shape, node.attrs["axis"], len(args)))]
+    return [TensorType(args[0].dtype, insert_axis(shape, node.attrs["axis"], len(args)))]
 
 
 def _lower_pack(node: Node, builder: OnnxBuilder) -> Any:
     axis = node.attrs["axis"]
     parts = [
-        unsqueezed(builder, builder.value(r), [axis], inserted(builder.type_of(r).shape, axis)) for r in node.inputs
+        emit_unsqueeze(builder, builder.value(r), [axis], insert_axis(builder.type_of(r).shape, axis))
+        for r in node.inputs
     ]
     return builder.emit("Concat", parts, axis=axis)
 

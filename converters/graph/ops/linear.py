@@ -22,11 +22,11 @@ from converters.graph.ops.base import (
     by_shape,
     constant_input,
     direct,
+    emit_squeeze,
     plain,
     require_constant,
     same_as,
     shape_error,
-    squeezed,
     type_attr,
 )
 from converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, refused
@@ -129,7 +129,7 @@ def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) ->
 FUSED = (Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001))
 
 
-def activated(node: Node, x: np.ndarray) -> np.ndarray:
+def apply_activations(node: Node, x: np.ndarray) -> np.ndarray:
     """A product and its bias, then the activations that the fused op carries."""
     for name in node.attrs["fused_ops"][1:]:
         kernel = next(op.kernel for op in elementwise.OPS if op.name == name)
@@ -139,7 +139,7 @@ def activated(node: Node, x: np.ndarray) -> np.ndarray:
 
 
 def lower_activated(node: Node, value: str, builder: OnnxBuilder) -> str:
-    """``activated`` in ONNX, which calls the activations as TensorFlow does but has no Relu6."""
+    """``apply_activations`` in ONNX, which calls the activations as TensorFlow does but has no Relu6."""
     for name in node.attrs.get("fused_ops", ())[1:]:
         if name == "Relu6":
             low, high = (builder.const(np.array(bound, np.float32), "bound") for bound in (0, 6))
@@ -151,7 +151,7 @@ def lower_activated(node: Node, value: str, builder: OnnxBuilder) -> str:
 
 def _fused_matmul(node: Node, a: np.ndarray, b: np.ndarray, bias: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
-        return activated(node, matmul(node, a, b) + bias)
+        return apply_activations(node, matmul(node, a, b) + bias)
 
 
 def _lower_fused_matmul(node: Node, builder: OnnxBuilder) -> Any:
@@ -209,8 +209,8 @@ def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
         keep = bool(node.attrs["keep_dims"])
         if kind.dtype == BOOL:  # ONNX does not reduce booleans
             value = builder.emit("Cast", [value], to=INT32)
-            return builder.emit("Cast", [_reduced(builder, onnx_op, value, kind, axes, keep)], to=BOOL)
-        return _reduced(builder, onnx_op, value, kind, axes, keep)
+            return builder.emit("Cast", [_emit_reduction(builder, onnx_op, value, kind, axes, keep)], to=BOOL)
+        return _emit_reduction(builder, onnx_op, value, kind, axes, keep)
 
     return lower
 
@@ -381,7 +381,7 @@ OPS = (
 )
 
 
-def _reduced(
+def _emit_reduction(
     builder: OnnxBuilder, onnx_op: str, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool
 ) -> str:
     """``value``, of type ``kind``, reduced by ``onnx_op`` over ``axes`` (sorted, counted from the front), in forms that
@@ -395,27 +395,27 @@ def _reduced(
     if not axes:
         return value
     if onnx_op == "ReduceSum":
-        return _summed(builder, value, kind, axes, keepdims)
+        return _emit_sum(builder, value, kind, axes, keepdims)
     if builder.opset >= 18:
         return builder.emit(onnx_op, [value, builder.const(np.array(axes, np.int64), "axes")], keepdims=int(keepdims))
     return builder.emit(onnx_op, [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
 
 
-def _summed(builder: OnnxBuilder, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool) -> str:
+def _emit_sum(builder: OnnxBuilder, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool) -> str:
     assert kind.shape is not None
     if builder.opset < 13:
         return builder.emit("ReduceSum", [value], axes=[int(a) for a in axes], keepdims=int(keepdims))
     shape, last = list(kind.shape), len(kind.shape) - 1
     lengths = [n for n in (shape[a] for a in axes) if isinstance(n, int)]
     if list(axes) != [last] and kind.dtype.kind == "f" and len(lengths) == len(axes) and builder.opset < 18:
-        mean = _reduced(builder, "ReduceMean", value, kind, axes, keepdims)
+        mean = _emit_reduction(builder, "ReduceMean", value, kind, axes, keepdims)
         return builder.emit("Mul", [mean, builder.const(np.array(math.prod(lengths), kind.dtype), "count")])
     for axis in axes:
         value = _column(builder, value, shape, axis, kind.dtype)
         shape[axis] = 1
     if keepdims:
         return value
-    return squeezed(builder, value, axes, [d for i, d in enumerate(shape) if i not in axes])
+    return emit_squeeze(builder, value, axes, [d for i, d in enumerate(shape) if i not in axes])
 
 
 def _column(builder: OnnxBuilder, value: str, shape: Sequence[Dim], axis: int, dtype: np.dtype) -> str:

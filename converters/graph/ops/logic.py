@@ -14,14 +14,14 @@ from converters.graph.ops.base import (
     Lower,
     OnnxBuilder,
     OpDef,
-    bounded,
     broadcast_of,
     chain,
+    clip_to_finite,
     direct,
+    emit_unsqueeze,
     plain,
     same_as,
     type_attr,
-    unsqueezed,
 )
 from converters.graph.ops.litert.base import Litert, builtin
 from converters.graph.ops.litert.elementwise import select
@@ -63,7 +63,7 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
     condition, a, b = (builder.value(r) for r in node.inputs)
     shape, wide = builder.type_of(node.inputs[0]).shape, builder.type_of(node.inputs[1]).rank
     if shape is not None and len(shape) == 1 and wide is not None and wide > 1:
-        condition = unsqueezed(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
+        condition = emit_unsqueeze(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
     choices = [builder.type_of(r) for r in node.inputs[1:]]
     infinite = any(k.constant is not None and not np.isfinite(k.constant).all() for k in choices)
     if builder.reads("Where") or infinite or choices[0].dtype != FLOAT32:
@@ -71,7 +71,7 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
     holds = builder.emit("Cast", [condition], to=FLOAT32)
     negative = builder.emit("Mul", [holds, builder.const(np.array(-1, np.float32), "minus")])
     other = builder.emit("Add", [negative, builder.const(np.array(1, np.float32), "one")])
-    first, second = (bounded(builder, v, k) for v, k in zip((a, b), choices, strict=True))
+    first, second = (clip_to_finite(builder, v, k) for v, k in zip((a, b), choices, strict=True))
     return builder.emit("Add", [builder.emit("Mul", [first, holds]), builder.emit("Mul", [second, other])])
 
 

@@ -233,7 +233,7 @@ def _top_k(builder: GraphBuilder, node: Node) -> str:
     return best
 
 
-def _reversed(builder: GraphBuilder, node: Node) -> str:
+def _reverse(builder: GraphBuilder, node: Node) -> str:
     """ReverseV2 of given axes, which no ONNX op is: a StridedSlice that goes backwards."""
     tensor, operand = node.inputs
     constant = builder.constant_of(operand)
@@ -283,24 +283,24 @@ def _uniform_int(builder: GraphBuilder, node: Node) -> str:
     )
 
 
-def _spelt(name: str, older: Older, *spellings: str) -> OpDef:
+def _op_written_older(name: str, older: Older, *spellings: str) -> OpDef:
     return OpDef(name, written_as_older, older=older, spellings=spellings)
 
 
 OPS = (
-    _spelt("DivNoNan", _div_no_nan),
-    _spelt("FusedBatchNorm", _batch_norm, "FusedBatchNormV2", "FusedBatchNormV3"),
-    _spelt("Concat", _concat_v1, "ConcatV1"),
-    _spelt("IdentityN", _identity_n),
-    _spelt("Einsum", _einsum),
-    _spelt("Erfc", _erfc),
-    _spelt("IsNan", _is_nan),
-    _spelt("IsFinite", _compared_with_largest("LessEqual")),
-    _spelt("IsInf", _compared_with_largest("Greater")),
-    _spelt("TopKV2", _top_k, "TopK"),
-    _spelt("ReverseV2", _reversed),
-    _spelt("BroadcastArgs", _broadcast_args),
-    _spelt("RandomUniformInt", _uniform_int),
+    _op_written_older("DivNoNan", _div_no_nan),
+    _op_written_older("FusedBatchNorm", _batch_norm, "FusedBatchNormV2", "FusedBatchNormV3"),
+    _op_written_older("Concat", _concat_v1, "ConcatV1"),
+    _op_written_older("IdentityN", _identity_n),
+    _op_written_older("Einsum", _einsum),
+    _op_written_older("Erfc", _erfc),
+    _op_written_older("IsNan", _is_nan),
+    _op_written_older("IsFinite", _compared_with_largest("LessEqual")),
+    _op_written_older("IsInf", _compared_with_largest("Greater")),
+    _op_written_older("TopKV2", _top_k, "TopK"),
+    _op_written_older("ReverseV2", _reverse),
+    _op_written_older("BroadcastArgs", _broadcast_args),
+    _op_written_older("RandomUniformInt", _uniform_int),
     OpDef(
         "PlaceholderWithDefault",
         written_as_older,

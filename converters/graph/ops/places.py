@@ -69,7 +69,7 @@ def _lower_sparse_to_dense(node: Node, builder: OnnxBuilder) -> Any:
     shape = as_int64(node, builder, 1)
     one_axis = kinds[0].rank < 2 or kinds[1].shape == (1,)
     if not one_axis:  # a place has a number for each axis
-        places = builder.emit("GatherND", [_numbered(node, builder, kinds[1], shape), places])
+        places = builder.emit("GatherND", [_element_numbers(node, builder, kinds[1], shape), places])
     flat = builder.emit("Reshape", [places, line])
     values = builder.emit("Expand", [builder.value(node.inputs[2]), builder.emit("Shape", [flat])])
     base = builder.emit("Expand", [builder.value(node.inputs[3]), shape])
@@ -79,7 +79,7 @@ def _lower_sparse_to_dense(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Reshape", [builder.emit("ScatterElements", [base, flat, values]), shape])
 
 
-def _numbered(node: Node, builder: OnnxBuilder, kind: TensorType, shape: str) -> str:
+def _element_numbers(node: Node, builder: OnnxBuilder, kind: TensorType, shape: str) -> str:
     """A tensor of the result's shape that says of each element which it is, row by row."""
     if kind.constant is not None:
         sizes = [int(n) for n in kind.constant.reshape(-1)]

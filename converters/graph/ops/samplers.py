@@ -70,7 +70,7 @@ def _uniform(node: Node, shape: np.ndarray) -> np.ndarray:
     return _stream.generator.random([int(d) for d in shape]).astype(node.attrs["dtype"])
 
 
-def _truncated(node: Node, shape: np.ndarray) -> np.ndarray:
+def _truncated_normal(node: Node, shape: np.ndarray) -> np.ndarray:
     draws = _stream.generator.standard_normal([int(d) for d in shape])
     while (outside := np.abs(draws) > 2).any():
         draws[outside] = _stream.generator.standard_normal(int(outside.sum()))
@@ -133,7 +133,7 @@ OPS = (
         random("RANDOM_STANDARD_NORMAL"),
         loops.normal,
     ),
-    _of_shape("TruncatedNormal", _truncated, None, "truncated normal", loops=loops.truncated_normal),
+    _of_shape("TruncatedNormal", _truncated_normal, None, "truncated normal", loops=loops.truncated_normal),
     _of_shape(
         "RandomUniform",
         _uniform,

@@ -16,14 +16,14 @@ from converters.graph.ops.base import (
     axis_within,
     by_shape,
     constant_input,
-    inserted,
+    emit_reshape,
+    emit_squeeze,
+    emit_unsqueeze,
+    insert_axis,
     not_constant,
     require_constant,
-    reshaped,
     shape_error,
-    squeezed,
     type_attr,
-    unsqueezed,
 )
 from converters.graph.ops.litert.arrays import gather
 from converters.graph.ops.litert.base import LitertBuilder, Value, as_int32, ints, with_axis
@@ -172,7 +172,9 @@ def _lower_strided_slice(node: Node, builder: OnnxBuilder) -> Any:
     if not (drop or insert):
         return value
     result = builder.type_of(node.name).shape
-    return reshaped(builder, value, result) or unsqueezed(builder, squeezed(builder, value, drop, None), insert, None)
+    return emit_reshape(builder, value, result) or emit_unsqueeze(
+        builder, emit_squeeze(builder, value, drop, None), insert, None
+    )
 
 
 #: An end that is behind the last element of any axis.
@@ -265,7 +267,7 @@ def _litert_strided_slice(node: Node, builder: LitertBuilder) -> Value:
         value = builder.emit("STRIDED_SLICE", [value, *vectors], TensorType(kind.dtype, dims), **masks)
     for count, axis in enumerate(new, 1):
         last = count == len(new) or dims is None
-        dims = inserted(dims, axis)
+        dims = insert_axis(dims, axis)
         value = with_axis(builder, value, result if last else TensorType(kind.dtype, dims), axis)
     return value
 

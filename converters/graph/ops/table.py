@@ -142,11 +142,11 @@ def op_of(node: Node) -> OpDef:
     """The entry for a node's op; raises UnsupportedOpError."""
     entry = _BY_NAME.get(node.op)
     if entry is None:
-        raise unsupported([node])
+        raise unsupported_error([node])
     return entry
 
 
-def unsupported(nodes: Iterable[Node]) -> UnsupportedOpError:
+def unsupported_error(nodes: Iterable[Node]) -> UnsupportedOpError:
     """The error that names every node whose op is not in the table."""
     issues = [(n.name, n.op) for n in nodes]
     shown = ", ".join(f"{op} (node {name!r})" for name, op in issues[:5])

@@ -59,7 +59,7 @@ def main() -> None:
             alone = shape.is_fully_defined() and shape.rank != array.ndim and shape.num_elements() == array.size
             return array.reshape(shape.as_list()) if alone else array
 
-    def imported(definition: Any) -> Any:
+    def import_graph(definition: Any) -> Any:
         for node in definition.node:
             node.device = ""
         graph = tf.Graph()
@@ -67,12 +67,12 @@ def main() -> None:
             tf.import_graph_def(definition, name="")
         return graph
 
-    def frozen(path: str, *, source: bool) -> InSession:
-        return InSession(imported(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())), source=source)
+    def load_frozen(path: str, *, source: bool) -> InSession:
+        return InSession(import_graph(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())), source=source)
 
-    def given(path: str, archive: str, names: Sequence[str]) -> InSession:
+    def load_with_values(path: str, archive: str, names: Sequence[str]) -> InSession:
         """A training graph with values that were read from a session; variables are told by their nodes' names."""
-        model = frozen(path, source=True)
+        model = load_frozen(path, source=True)
         with np.load(archive, allow_pickle=False) as kept:
             values = {name: kept[f"arr_{i}"] for i, name in enumerate(names)}
         graph = model.session.graph
@@ -101,7 +101,7 @@ def main() -> None:
         if kind == "saved_model":
             return Saved(path, header.get("signature", "serving_default"))
         if kind == "values":
-            return given(path, header["archive"], header["names"])
+            return load_with_values(path, header["archive"], header["names"])
         if kind == "keras":
             from converters.formats.keras.config import config_inside, refuse_code
 
@@ -109,8 +109,8 @@ def main() -> None:
             return _Frozen(frozen_function(path, "keras"))
         if kind == "function":
             definition = frozen_function(path, header["form"], header.get("signature")).graph_def
-            return InSession(imported(definition), source=True)
-        return frozen(path, source=header.get("source", False))
+            return InSession(import_graph(definition), source=True)
+        return load_frozen(path, source=header.get("source", False))
 
     faults = (tf.errors.OpError, AttributeError, RuntimeError, ImportError, ExportModelError)
     serve("tensorflow", tf.__version__, load, faults, out)

@@ -97,7 +97,7 @@ def library_version(library: ctypes.CDLL) -> str:
 
 
 @contextmanager
-def _checked(library: ctypes.CDLL) -> Iterator[int]:
+def _status(library: ctypes.CDLL) -> Iterator[int]:
     """A TF_Status; at the end it is freed, and raised as LegacyError unless it is OK."""
     status = library.TF_NewStatus()
     try:
@@ -128,7 +128,7 @@ class LegacySession:
         options = library.TF_NewImportGraphDefOptions()
         buffer = library.TF_NewBufferFromString(graph, len(graph))
         try:
-            with _checked(library) as status:
+            with _status(library) as status:
                 library.TF_GraphImportGraphDef(self._graph, buffer, options, status)
         finally:
             library.TF_DeleteBuffer(buffer)
@@ -140,9 +140,9 @@ class LegacySession:
         config = bytes([2 << 3, 1, 5 << 3, 1])
         options = library.TF_NewSessionOptions()
         try:
-            with _checked(library) as status:
+            with _status(library) as status:
                 library.TF_SetConfig(options, config, len(config), status)
-            with _checked(library) as status:
+            with _status(library) as status:
                 session: int = library.TF_NewSession(self._graph, options, status)
         finally:
             library.TF_DeleteSessionOptions(options)
@@ -156,7 +156,7 @@ class LegacySession:
         try:
             for i, array in enumerate(feeds.values()):
                 given[i] = self._tensor(array)
-            with _checked(self._library) as status:
+            with _status(self._library) as status:
                 self._library.TF_SessionRun(
                     *(self._session, None),
                     *(inputs, given, len(feeds)),
@@ -197,8 +197,8 @@ class LegacySession:
 
 
 def _close(library: ctypes.CDLL, session: int, graph: int) -> None:
-    with _checked(library) as status:
+    with _status(library) as status:
         library.TF_CloseSession(session, status)
-    with _checked(library) as status:
+    with _status(library) as status:
         library.TF_DeleteSession(session, status)
     library.TF_DeleteGraph(graph)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from converters.graph.nn.activations import swish
 from converters.graph.nn.linear import matmul
-from converters.graph.nn.normalisation import standardised
+from converters.graph.nn.normalisation import standardise
 from converters.graph.nn.reduction import over_last_axis
 from converters.graph.types import FLOAT32
 from converters.trainers.pytorch.network import TINY, Network
@@ -49,7 +49,7 @@ def attended(net: Network, own: str | None, entities: Sequence[tuple[str, str]],
 def _self_attention(net: Network, x: str, mask: str, module: str) -> str:
     """``ResidualSelfAttention``: x is [B, n, embedding], the mask [B, n] 1 where there is no entity."""
     net.at(module)
-    x, _, _ = standardised(net, x, [2], _LAYER_NORM)
+    x, _, _ = standardise(net, x, [2], _LAYER_NORM)
     count, size = net.length(x, 1), net.width(x)
     if size % HEADS:
         raise net.state.damaged(f"its attention has {size} numbers for {HEADS} heads", "ML-Agents cannot run it")
@@ -69,7 +69,7 @@ def _self_attention(net: Network, x: str, mask: str, module: str) -> str:
     mixed = net.transpose(matmul(net, over_last_axis(net, "Softmax", scores), value), (0, 2, 1, 3))
     result = net.add("Add", [net.linear(net.reshape(mixed, (batch, count, size)), f"{module}.fc_out", size), x])
     net.at(f"{module}.residual_norm")
-    result, _, _ = standardised(net, result, [2], _LAYER_NORM)
+    result, _, _ = standardise(net, result, [2], _LAYER_NORM)
     shown = net.add("Mul", [result, net.reshape(present, (-1, count, 1))])
     number = net.add("Add", [net.reduce("Sum", present, [1], keep=True), net.floats(TINY)])
     return net.add("RealDiv", [net.reduce("Sum", shown, [1], keep=False), number])
@@ -118,7 +118,7 @@ def _conditioned(net: Network, x: str, goal: str, module: str) -> str:
     for index in inner:
         goal = swish(net, net.linear(goal, f"{module}.hypernet.{index}"))
     net.at(module)
-    goal, _, _ = standardised(net, goal, [1], _LAYER_NORM)
+    goal, _, _ = standardise(net, goal, [1], _LAYER_NORM)
     bias = net.state.array(f"{module}.bias", None)
     rows, columns = net.width(x), len(bias)
     weights = net.linear(goal, f"{module}.hypernet.{last}", rows * columns)

@@ -115,7 +115,7 @@ def test_hard_sigmoid_and_scaled(x: Array, alpha: float, beta: float) -> None:
         run_one(lambda b, r: nn.hard_sigmoid(b, r, alpha, beta), x), np.clip(line, 0, 1), **TOLERANCE
     )
     np.testing.assert_allclose(
-        run_one(lambda b, r: b.add("Identity", [nn.scaled(b, r, alpha, beta)]), x), line, **TOLERANCE
+        run_one(lambda b, r: b.add("Identity", [nn.scale_and_shift(b, r, alpha, beta)]), x), line, **TOLERANCE
     )
 
 

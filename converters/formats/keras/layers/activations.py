@@ -23,7 +23,7 @@ def _softmax(op: str) -> Activation:
 
 def _squareplus(b: Builder, x: str) -> str:
     root = b.add("Sqrt", [b.add("Add", [b.add("Square", [x]), b.number(x, 4)])])
-    return nn.scaled(b, b.add("Add", [x, root]), 0.5)
+    return nn.scale_and_shift(b, b.add("Add", [x, root]), 0.5)
 
 
 def _outside(b: Builder, x: str, inside: Callable[[str], str]) -> str:
@@ -92,7 +92,7 @@ def _relu(step: Step) -> str:
     top, slope, threshold = (float(_scalar(step.get(k)) or 0) for k in ("max_value", "negative_slope", "threshold"))
     if threshold:
         over = b.add("Greater", [x, b.number(x, threshold)])
-        below = nn.scaled(b, x, slope, -slope * threshold) if slope else b.add("ZerosLike", [x])
+        below = nn.scale_and_shift(b, x, slope, -slope * threshold) if slope else b.add("ZerosLike", [x])
         value = b.add("Select", [over, x, below])
     else:
         value = nn.leaky_relu(b, x, slope) if slope else b.add("Relu", [x])

@@ -28,7 +28,7 @@ def _batch(step: Step) -> str:
 def _layer(step: Step) -> str:
     step.refuse_unless("rms_scaling", False)
     b, axes = step.net, _axes(step)
-    value, _, _ = nn.standardised(b, step.x, axes, float(step.get("epsilon", 1e-3)))
+    value, _, _ = nn.standardise(b, step.x, axes, float(step.get("epsilon", 1e-3)))
     sizes = [b.length(step.x, a) for a in axes]
     shape = [b.length(step.x, i) if i in axes else 1 for i in range(b.rank(step.x))]
     for key, op in (("scale", "Mul"), ("center", "Add")):

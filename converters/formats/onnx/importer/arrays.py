@@ -49,7 +49,7 @@ def _eye_like(op: Op, net: Importer) -> str:
 
 def _range(op: Op, net: Importer) -> str:
     operands = [op.need(i) for i in range(3)]
-    values = [net.known(o) for o in operands]
+    values = [net.constant_of(o) for o in operands]
     if all(v is not None and v.size == 1 for v in values):
         start, limit, delta = (float(v.reshape(())) for v in values if v is not None)
         if delta == 0 or (limit - start) / delta > MAX_ELEMENTS:
@@ -163,7 +163,7 @@ def _expand(op: Op, net: Importer) -> str:
     if value is None or net.type_of(x).shape is None:
         raise op.refused("its shape is computed from the values of an input", "it must follow from shapes alone")
     dims = [d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist()]
-    return net.broadcast(x, net.joined([net.shape(x), tuple(dims)]))
+    return net.broadcast(x, net.common_shape([net.shape(x), tuple(dims)]))
 
 
 def _tile(op: Op, net: Importer) -> str:

@@ -30,7 +30,7 @@ def _cumulated(op: Op, net: Importer) -> str:
     axis = net.axis(x, int(net.needed_constant(op.need(1), "the axis").reshape(-1)[0]))
     exclusive, reverse = bool(op.integer("exclusive", 0)), bool(op.integer("reverse", 0))
     turned = nn.last(net, x, axis)
-    value = nn.cumulated(net, turned, exclusive=exclusive, reverse=reverse, product=op.kind == "CumProd")
+    value = nn.cumulate(net, turned, exclusive=exclusive, reverse=reverse, product=op.kind == "CumProd")
     return nn.moved_back(net, value, axis)
 
 
@@ -49,7 +49,7 @@ def _gather_elements(op: Op, net: Importer) -> str:
             if not isinstance(want, int) or (isinstance(have, int) and want > have):
                 raise op.refused("its indices leave out rows")
             x = net.slice(x, i, None, want)
-    value = nn.picked(net, nn.last(net, x, axis), nn.last(net, indices, axis))
+    value = nn.gather_elements(net, nn.last(net, x, axis), nn.last(net, indices, axis))
     return nn.moved_back(net, value, axis)
 
 
@@ -62,7 +62,7 @@ def _scatter_elements(op: Op, net: Importer) -> str:
         raise op.refused("its indices leave out rows")
     table, places, given = (nn.last(net, r, axis) for r in (x, indices, updates))
     _check_apart(op, net, places)
-    return nn.moved_back(net, nn.scattered(net, table, places, given, _combined(op)), axis)
+    return nn.moved_back(net, nn.scatter_elements(net, table, places, given, _combined(op)), axis)
 
 
 def _combined(op: Op) -> nn.Combined:
@@ -99,7 +99,7 @@ def _gather_nd(op: Op, net: Importer) -> str:
             raise op.refused("it gathers parts of each row by indices of its own")
         table = net.reshape(x, (*dims[:batch], int(np.prod(lengths))))
         chosen = net.reshape(flat, (*places[:batch], int(np.prod([_number(op, d) for d in places[batch:-1]] or [1]))))
-        return net.reshape(nn.picked(net, table, chosen), (*places[:-1],))
+        return net.reshape(nn.gather_elements(net, table, chosen), (*places[:-1],))
     flat = _flat(net, indices, inner)
     table = net.reshape(x, (-1, *rest)) if count > 1 else x
     return net.add("GatherV2", [table, flat, net.ints(0, "axis")])
@@ -147,7 +147,7 @@ def _scatter_nd(op: Op, net: Importer) -> str:
     columns = int(np.prod(rest or [1]))
     table = net.transpose(net.reshape(x, (int(np.prod(lengths)), columns)), (1, 0))
     given = net.transpose(net.reshape(updates, (places, columns)), (1, 0))
-    value = nn.scattered(net, table, flat, given, _combined(op))
+    value = nn.scatter_elements(net, table, flat, given, _combined(op))
     return net.reshape(net.transpose(value, (1, 0)), dims)
 
 

@@ -9,7 +9,7 @@ from converters.formats.onnx.importer.node import Op, Translate
 
 
 def _if(op: Op, net: Importer) -> list[str | None]:
-    condition = net.known(op.need(0))
+    condition = net.constant_of(op.need(0))
     if condition is None:
         raise op.refused(
             "its condition is not known before the graph runs",

@@ -155,7 +155,7 @@ def _dropout(op: Op, net: Importer) -> list[str | None]:
     """Inference: the input itself. From opset 12 on training is an input; a policy that drops at random is none."""
     mode = op.get(2)
     if mode is not None:
-        value = net.known(mode)
+        value = net.constant_of(mode)
         if value is None or bool(value.reshape(-1)[0]):
             raise op.refused(
                 "it is in training mode", "its output would be random", "call model.eval() before the export"

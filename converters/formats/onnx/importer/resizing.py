@@ -8,7 +8,7 @@ import numpy as np
 
 from converters.formats.onnx.importer.importer import Importer
 from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn.resizing import Resampling, resampled
+from converters.graph.nn.resizing import Resampling, resample
 from converters.graph.types import Dim
 
 _IMAGE = 4
@@ -61,7 +61,7 @@ def _resize(op: Op, net: Importer) -> str:
             op.number("extrapolation_value", 0.0),
             (0.0, 1.0) if region is None else (region[i], region[i + len(axes)]),
         )
-        x = resampled(net, x, axis, int(numbers[i]), float(scale), how)
+        x = resample(net, x, axis, int(numbers[i]), float(scale), how)
     return x
 
 
@@ -84,7 +84,7 @@ def _upsample(op: Op, net: Importer) -> str:
     how = Resampling(op.text("mode", "nearest"), "asymmetric", "floor")
     for axis, scale in enumerate(scales):
         if scale != 1:
-            x = resampled(net, x, axis, int(_scaled(net.length(x, axis), scale)), float(scale), how)
+            x = resample(net, x, axis, int(_scaled(net.length(x, axis), scale)), float(scale), how)
     return x
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from converters.formats.onnx.importer.importer import Importer
 from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn.activations import scaled
+from converters.graph.nn.activations import scale_and_shift
 from converters.graph.types import BATCH, FLOAT32, INT32
 
 
@@ -35,14 +35,14 @@ def _normal(op: Op, net: Importer) -> str:
     """N(mean, scale²) as a draw of N(0, 1), which is what is lifted under the value's name."""
     _float(op)
     draw = net.draw("RandomStandardNormal", [_shape(op, net)], op.outputs[0])
-    return scaled(net, draw, op.number("scale", 1.0), op.number("mean", 0.0))
+    return scale_and_shift(net, draw, op.number("scale", 1.0), op.number("mean", 0.0))
 
 
 def _uniform(op: Op, net: Importer) -> str:
     _float(op)
     low, high = op.number("low", 0.0), op.number("high", 1.0)
     draw = net.add("RandomUniform", [_shape(op, net)], dtype=FLOAT32)
-    return scaled(net, draw, high - low, low)
+    return scale_and_shift(net, draw, high - low, low)
 
 
 def _multinomial(op: Op, net: Importer) -> str:
