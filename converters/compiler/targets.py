@@ -54,17 +54,18 @@ _LOWER_FOR_TFJS: tuple[Step, ...] = (_on_roots(lower_for_tfjs), _on_roots(clip_b
 
 TFJS = (*FEWER_OPS, *_LOWER_FOR_TFJS, _FUSE_ACTIVATIONS)
 TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_ACTIVATIONS)
-ONNX = (*FEWER_OPS, _FUSE)
+ONNX = (*FEWER_OPS, _FUSE, lambda graph, outputs: lower_for_importers(graph))
 LITERT = (*FEWER_OPS, _FUSE)
 C = (*FEWER_OPS, _FUSE)
-#: Models for one consumer stay as they were tried in it.
+#: Models for one consumer stay as they were tried in it: without a Split, whether it reads one or not.
 CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)
+_UNTRIED = frozenset({"Split"})
 BARRACUDA = (_FUSE, _on_roots(lower_for_nn))
 
 
 def consumer_onnx(misread: Collection[str]) -> tuple[Step, ...]:
     """Return the steps for importers that lack or misread some ONNX ops."""
-    return (*CONSUMER_ONNX, lambda graph, outputs: lower_for_importers(graph, misread))
+    return (*CONSUMER_ONNX, lambda graph, outputs: lower_for_importers(graph, _UNTRIED.union(misread)))
 
 
 _OF_BRANCHES = (Role.SAMPLED, Role.DETERMINISTIC, Role.LOG_PROBS, Role.PROBS)

@@ -21,11 +21,16 @@ def lower_for_nn(graph: Graph, roots: Collection[str] = ()) -> Graph:
     return _lower(graph, lambda e: e.barracuda.write if e.barracuda is not None and e.barracuda.nn else None)
 
 
-def lower_for_importers(graph: Graph, misread: Collection[str]) -> Graph:
-    """Return the graph without what becomes one of the ONNX ops ``misread``, where an op's entry says how."""
-    return _lower(
-        graph, lambda e: e.barracuda.write if e.barracuda is not None and e.barracuda.onnx in misread else None
-    )
+def lower_for_importers(graph: Graph, misread: Collection[str] = ()) -> Graph:
+    """Return the graph without what becomes one of the ONNX ops ``misread``, or one that no importer of Unity's reads
+    rightly, where an op's entry says how.
+    """
+
+    def rewrite_of(entry: OpDef) -> Tfjs | None:
+        how = entry.barracuda
+        return how.write if how is not None and (how.everywhere or how.onnx in misread) else None
+
+    return _lower(graph, rewrite_of)
 
 
 def _lower(graph: Graph, rewrite_of: Callable[[OpDef], Tfjs | None]) -> Graph:

@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.formats.barracuda.lower_base import NnBuilder
 from converters.formats.barracuda.lower_values import Axes, Value, rows_first, usual_axes
-from converters.formats.barracuda.vocabulary import Activation, C, H, LayerType, N, W
+from converters.formats.barracuda.vocabulary import C, H, LayerType, N, W
 from converters.graph.nodes import ref
 from converters.graph.ops.slicing import strided_steps
 from converters.graph.types import BATCH, Dim
@@ -283,7 +283,7 @@ def chosen(b: NnBuilder, value: Value, axis: int, indices: Sequence[int]) -> Val
 
 
 def gather(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """Elements of an axis by constant indices, or rows of a constant table by a number per agent."""
+    """Elements of an axis by constant indices."""
     value, indices = args
     axis = 0 if len(b.node.inputs) < 3 else int(b.known(2, "the axis"))
     if indices.array is not None and value.array is None:
@@ -295,46 +295,7 @@ def gather(b: NnBuilder, args: Sequence[Value]) -> Value:
         flat = [int(i) % length for i in indices.array.reshape(-1)]
         result = chosen(b, value, axis, flat)
         return _dropped(result, [axis]) if indices.array.ndim == 0 else result
-    if value.array is not None and value.array.ndim == 2 and axis % 2 == 0 and indices.size == 1:
-        hot = _hot(b, b.rows(indices), value.array.shape[0], 1.0, 0.0)
-        name = b.dense(hot, value.array.astype(np.float32), np.zeros(value.array.shape[1]), "row")
-        return b.result(name)
     raise b.refused("its indices are computed", "rows of a constant table by one number per agent can be written")
-
-
-def one_hot(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """A row of numbers per index: the on-value at the index, the off-value elsewhere.
-
-    Not by Barracuda's OneHot, which gives another shape at batch 1 in 3.0.0 (and an error behind it).
-    """
-    value = args[0]
-    depth = int(b.known(1, "the depth").reshape(()))
-    on, off = (float(b.known(i, "a value").reshape(())) for i in (2, 3))
-    shape = b.shape_of(b.node.name)
-    axis = int(b.node.attrs["axis"]) % len(shape)
-    columns = value.size
-    if BATCH not in value.shape or axis != len(shape) - 1:
-        raise b.refused(
-            f"indices of shape {list(value.shape)}, axis {axis}", "it takes a row per agent, and the last axis"
-        )
-    hot = _hot(b, b.rows(value), depth, on, off, columns)
-    flat = b.made(hot, (BATCH, columns * depth), (N, C))
-    return reshaped(b, flat, shape)
-
-
-def _hot(b: NnBuilder, x: str, depth: int, on: float, off: float, columns: int = 1) -> str:
-    """``on`` where an index of ``x`` [N, 1, 1, columns] is the class, else ``off``: ``depth`` classes of each column.
-
-    1 − (index − class)² is 1 there, and at most 0 for every other whole number.
-    """
-    b.table(columns, columns * depth)
-    classes = np.tile(np.arange(depth, dtype=np.float32), columns)
-    spread = np.kron(np.eye(columns), np.ones((1, depth)))
-    distance = b.dense(x, spread, -classes, "distance")
-    near = b.shifted(b.scaled(b.two(LayerType.MUL, distance, distance, "square"), -1, "negative"), 1, "near")
-    hot = b.activation(Activation.RELU, near, label="hot")
-    hot = hot if on - off == 1 else b.scaled(hot, on - off, "on")
-    return hot if off == 0 else b.shifted(hot, off, "off")
 
 
 # ------------------------------------------------------------------ repeating, filling

@@ -9,7 +9,6 @@ what it does not know, so the op's entry decomposes it (``graph/ops/barracuda``)
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,10 +17,6 @@ from converters.formats.barracuda.lower_base import NnBuilder
 from converters.formats.barracuda.lower_values import Axes, Value, usual_axes
 from converters.formats.barracuda.vocabulary import COMPARISONS, ONE_OP, Activation, C, H, LayerType, W
 from converters.graph.types import Dim
-
-#: Times this, every difference that float32 tells apart from 0 near 1 is beyond ±1.
-_STEEP = 1e30
-_LARGEST = float(np.finfo(np.float32).max)
 
 #: Those that a Barracuda of 1.0 lacks, or rounds another way.
 _YOUNG = frozenset(
@@ -68,13 +63,6 @@ def _mapped(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Value:
     return b.made(make(b.stored(value)), value.shape, value.axes)
 
 
-def _truncated(b: NnBuilder, x: str) -> str:
-    """Towards 0: the parts above and below, one of which is 0."""
-    above = b.at_least(b.activation(Activation.FLOOR, x, label="floor"), 0)
-    below = b.at_most(b.activation(Activation.CEIL, x, label="ceil"), 0)
-    return b.two(LayerType.ADD, above, below, "truncated")
-
-
 def _leaky_relu(b: NnBuilder, x: str) -> str:
     """Barracuda takes the larger of x and alpha·x, which is another function beyond 1."""
     alpha = float(b.node.attrs["alpha"])
@@ -85,7 +73,6 @@ def _leaky_relu(b: NnBuilder, x: str) -> str:
 
 _FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
     "Square": lambda b, x: b.two(LayerType.MUL, x, x),
-    "LogicalNot": lambda b, x: b.shifted(b.scaled(x, -1), 1),
     "LeakyRelu": _leaky_relu,
     "Selu": lambda b, x: b.activation(Activation.SELU, x, alpha=1.6732632423543772, beta=1.0507009873554805),
 }
@@ -94,16 +81,6 @@ _FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
 def formula(b: NnBuilder, args: Sequence[Value]) -> Value:
     """An op that is spelled out."""
     return _mapped(b, args[0], lambda x: _FORMULAS[b.node.op](b, x))
-
-
-def cast(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """All numbers of a ``.nn`` are floats: only what drops digits does something."""
-    source, wanted = b.type_of(b.node.inputs[0]).dtype, np.dtype(b.node.attrs["DstT"])
-    if wanted.kind == "b" and source.kind != "b":
-        return _mapped(b, args[0], lambda x: b.at_most(b.scaled(b.activation(Activation.ABS, x), _STEEP), 1))
-    if wanted.kind in "iu" and source.kind == "f":
-        return _mapped(b, args[0], lambda x: _truncated(b, x))
-    return args[0]
 
 
 # ------------------------------------------------------------------ two operands
@@ -238,15 +215,12 @@ def power(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 
 def floor_divide(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """The whole part of a / b, and for FloorMod what is left of a."""
+    """The whole part of a / b."""
     pair = _pair(b, args)
     if not pair.full(0) or pair.arrays[0] is not None:
         raise b.refused("its first operand is a constant or is repeated", "early versions of Barracuda swap them")
     first, second = pair.names
-    whole = b.activation(Activation.FLOOR, b.two(LayerType.DIV, first, second, "quotient"), label="whole")
-    if b.node.op == "FloorDiv":
-        return pair.made(whole)
-    return pair.made(b.two(LayerType.SUB, first, b.two(LayerType.MUL, whole, second, "taken")))
+    return pair.made(b.activation(Activation.FLOOR, b.two(LayerType.DIV, first, second, "quotient")))
 
 
 def squared_difference(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -263,41 +237,6 @@ def compare(b: NnBuilder, args: Sequence[Value]) -> Value:
         first, second, kind = second, first, _MIRRORED[kind]
     name = _two(b, pair, kind, first, second)
     return pair.made(b.shifted(b.scaled(name, -1), 1) if b.node.op == "NotEqual" else name)
-
-
-def select(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """A where the condition holds, else b: condition·a + (1 − condition)·b. Barracuda has no choice before 1.4.
-
-    What is computed is bounded first: infinity times 0 would be no number.
-    """
-    condition, *choices = args
-    shape = b.shape_of(b.node.name)
-    if any(v.array is not None and not np.isfinite(v.array).all() for v in choices):
-        raise b.refused("it chooses an infinite number", "Barracuda before 1.4 has no choice, only products and sums")
-    if b.node.op == "Select" and len(condition.shape) == 1 < len(shape):
-        condition = _as_rows(b, condition, len(shape))
-    first, second = (_bounded(b, v) for v in choices)
-    if condition.array is not None:
-        holds = condition.array.astype(np.float32)
-        condition, other = replace(condition, array=holds), replace(condition, array=1 - holds)
-    else:
-        other = _mapped(b, condition, lambda x: b.shifted(b.scaled(x, -1, "negative"), 1, "other"))
-    chosen = [_combined(b, LayerType.MUL, v, c, shape) for v, c in ((first, condition), (second, other))]
-    return _combined(b, LayerType.ADD, chosen[0], chosen[1], shape)
-
-
-def _bounded(b: NnBuilder, value: Value) -> Value:
-    if value.array is not None:
-        return replace(value, array=value.array.astype(np.float32))
-    return _mapped(b, value, lambda x: b.at_least(b.at_most(x, _LARGEST), -_LARGEST))
-
-
-def _as_rows(b: NnBuilder, condition: Value, rank: int) -> Value:
-    """TF 1's Select takes whole rows where the condition is a vector."""
-    shape = (*condition.shape, *[1] * (rank - 1))
-    if condition.array is not None:
-        return Value(shape, array=condition.array.reshape(-1, *[1] * (rank - 1)))
-    return replace(condition, shape=shape, axes=(*condition.axes, *[None] * (rank - 1)))
 
 
 def _combined(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape: tuple[Dim, ...]) -> Value:

@@ -23,6 +23,12 @@ from signatures.errors import UnsupportedOpError
 #: Takes (builder, the op's data inputs) and gives its output, or all of them.
 Lower = Callable[[NnBuilder, Sequence[Value]], "Value | tuple[Value, ...]"]
 
+
+def _layerless(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """Raise UnsupportedOpError: an op that is decomposed, in a form that cannot be."""
+    raise _unknown(b, b.node)
+
+
 _FIRST = slice(0, 1)
 _ALL = slice(None)
 
@@ -36,15 +42,11 @@ _OPS: Mapping[str, tuple[Lower, slice]] = {
     "RealDiv": (elementwise.divide, _ALL),
     "Pow": (elementwise.power, _ALL),
     "FloorDiv": (elementwise.floor_divide, _ALL),
-    "FloorMod": (elementwise.floor_divide, _ALL),
     "SquaredDifference": (elementwise.squared_difference, _ALL),
     "ClipByValue": (elementwise.clip, _ALL),
     "AddN": (elementwise.add_n, _ALL),
-    "Cast": (elementwise.cast, _ALL),
-    "Select": (elementwise.select, _ALL),
-    "SelectV2": (elementwise.select, _ALL),
     **dict.fromkeys(
-        ("Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"), (arrays.same, _FIRST)
+        ("Cast", "Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"), (arrays.same, _FIRST)
     ),
     **dict.fromkeys(("Reshape", "Squeeze", "ExpandDims"), (arrays.reshape, _FIRST)),
     "Transpose": (arrays.transpose, _FIRST),
@@ -57,7 +59,8 @@ _OPS: Mapping[str, tuple[Lower, slice]] = {
     "StridedSlice": (arrays.strided_slice, _FIRST),
     "Gather": (arrays.gather, slice(0, 2)),
     "GatherV2": (arrays.gather, slice(0, 2)),
-    "OneHot": (arrays.one_hot, _FIRST),
+    "OneHot": (_layerless, _FIRST),
+    **dict.fromkeys(("Select", "SelectV2"), (_layerless, _ALL)),
     "Tile": (arrays.tile, _FIRST),
     "BroadcastTo": (arrays.broadcast_to, _FIRST),
     **dict.fromkeys(("Fill", "ZerosLike", "OnesLike"), (arrays.filled, slice(0, 0))),
@@ -76,6 +79,8 @@ _OPS: Mapping[str, tuple[Lower, slice]] = {
 
 _WHY: Mapping[str, str] = {
     "Multinomial": "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
+    "OneHot": "it takes a row of indices per agent, and gives the classes on the last axis",
+    **dict.fromkeys(("Select", "SelectV2"), "it chooses an infinite number, and infinity times 0 is no number"),
 }
 
 

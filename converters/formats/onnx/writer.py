@@ -36,8 +36,6 @@ from signatures.spec import TensorSpec
 IR_VERSIONS = {11: 6, 12: 7, 13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
 #: What people may ask for; profiles of old importers ask for less.
 ASKED_FOR = range(13, 22)
-#: What a model for one consumer does without, whether that reads it or not: it stays as it was tried in it.
-_SLICED = frozenset({"Split"})
 #: What works element by element, so that a Transpose may as well come behind it.
 _ELEMENTWISE = frozenset(
     (
@@ -51,9 +49,8 @@ PRODUCER = "export-model"
 class _Builder:
     """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
 
-    def __init__(self, graph: Graph, opset: int, outputs: Collection[str], misread: Collection[str] = ()) -> None:
+    def __init__(self, graph: Graph, opset: int, outputs: Collection[str]) -> None:
         self.opset = opset
-        self._misread = misread
         self._transposed: dict[str, tuple[str, tuple[int, ...]]] = {}
         self._scalars: set[str] = set()
         self.types: Types = infer_types(graph)
@@ -67,9 +64,6 @@ class _Builder:
         self.detached = Detached.of(graph.values())
         self._names = NameScope(())
         self._prefix = ""
-
-    def reads(self, onnx_op: str) -> bool:
-        return onnx_op not in self._misread
 
     def value(self, reference: str) -> str:
         return self._values[reference]
@@ -271,8 +265,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
             fix="leave --opset out: 15 is what onnxruntime, onnxruntime-web and Unity take",
         )
     graph = prepare(policy, consumer_onnx(options.misread) if options.profile else ONNX)
-    misread = options.misread | _SLICED if options.profile else ()
-    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs], misread)
+    builder = _Builder(graph, options.opset, [s.name for s in policy.signature.outputs])
     for spec in policy.signature.inputs:
         builder.bind(spec.name, spec.name)
     for node in graph.nodes:

@@ -35,9 +35,6 @@ class OnnxBuilder(Protocol):
 
     opset: int
 
-    def reads(self, onnx_op: str) -> bool:
-        """Return whether every importer that is written for reads an ONNX op rightly, in all its forms."""
-
     def value(self, reference: str) -> str:
         """The ONNX value of a tensor of the graph."""
 
@@ -111,12 +108,14 @@ class Decomposition:
     """A node in ops that every Barracuda computes rightly: ``write`` adds nodes and returns the one in its place.
 
     ``onnx`` is the ONNX op that the node becomes otherwise: decomposed for importers that lack or misread it (``""``:
-    in ONNX the op has a formula anyway). ``nn``: decomposed in every ``.nn``, which Barracuda 1.0 shall run.
+    in ONNX the op has a formula anyway), ``everywhere``: in every ONNX. ``nn``: decomposed in every ``.nn``, which
+    Barracuda 1.0 shall run.
     """
 
     onnx: str
     write: Tfjs
     nn: bool = True
+    everywhere: bool = False
 
 
 #: How a result is rounded: not at all; once, as IEEE says; by an approximation of each runtime's own (Eigen's tanh is 3
@@ -387,15 +386,6 @@ def chain(*steps: tuple[str, float | None]) -> Lower:
         return values[0]
 
     return lower
-
-
-def clip_to_finite(builder: OnnxBuilder, value: str, kind: TensorType) -> str:
-    """A float that is finite, so that its product with 0 is 0; ``kind`` is what is known of it."""
-    if kind.constant is not None:
-        return value
-    largest = np.finfo(np.float32).max
-    low, high = (builder.const(np.array(s * largest, np.float32), w) for s, w in ((-1, "lowest"), (1, "highest")))
-    return builder.emit("Clip", [value, low, high])
 
 
 def emit_squeeze(builder: OnnxBuilder, value: str, axes: Sequence[int], result: Shape) -> str:

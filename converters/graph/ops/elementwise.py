@@ -138,9 +138,6 @@ def _lower_floor_mod(node: Node, builder: OnnxBuilder) -> Any:
     a, b = (builder.value(r) for r in node.inputs)
     if builder.type_of(node.inputs[0]).dtype.kind != "f":
         return builder.emit("Mod", [a, b])
-    if builder.opset < 10:
-        whole = builder.emit("Floor", [builder.emit("Div", [a, b])])
-        return builder.emit("Sub", [a, builder.emit("Mul", [whole, b])])
     # What C's fmod leaves has the dividend's sign, and is exact; a divisor more where that is not the divisor's.
     zero = scalar(builder, node, 0.0)
     rest = builder.emit("Mod", [a, b], fmod=1)
@@ -166,18 +163,7 @@ def _infer_cast(node: Node, args: Sequence[TensorType], symbols: Symbols) -> lis
 
 
 def _lower_cast(node: Node, builder: OnnxBuilder) -> Any:
-    """Unity's importers keep the value of a float that is cast: fractions are taken off before a cast to an integer,
-    and a cast to bool is a comparison (Cast_01 to _03; Sentis and the Inference Engine keep it for bool too).
-    """
-    value, source = builder.value(node.inputs[0]), builder.type_of(node.inputs[0]).dtype
-    target = node.attrs["DstT"]
-    if target == BOOL and source != BOOL:
-        return builder.emit("Not", [builder.emit("Equal", [value, scalar(builder, node, 0.0)])])
-    if source.kind == "f" and target.kind in "iu":
-        zero = scalar(builder, node, 0.0)
-        above = builder.emit("Floor", [builder.emit("Max", [value, zero])])
-        value = builder.emit("Add", [above, builder.emit("Ceil", [builder.emit("Min", [value, zero])])])
-    return builder.emit("Cast", [value], to=target)
+    return builder.emit("Cast", [builder.value(node.inputs[0])], to=node.attrs["DstT"])
 
 
 def _add_n(node: Node, *arrays: np.ndarray) -> np.ndarray:
@@ -192,14 +178,6 @@ def _lower_add_n(node: Node, builder: OnnxBuilder) -> Any:
     for reference in node.inputs[1:]:
         value = builder.emit("Add", [value, builder.value(reference)])
     return value
-
-
-def _tfjs_softsign(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
-    """TensorFlow.js 4.22 has no Softsign."""
-    size = builder.add("Abs", [node.inputs[0]], f"{node.name}/abs")
-    one = builder.const(np.ones((), types[node.name].dtype), f"{node.name}/one")
-    below = builder.add("Add", [size, one], f"{node.name}/below")
-    return Node(node.name, "RealDiv", (node.inputs[0], below), origin=node.origin)
 
 
 def _tfjs_cast(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
@@ -314,7 +292,7 @@ UNARY = (
         "Softsign",
         _wide(lambda x: x / (1 + np.abs(x))),
         "Softsign",
-        tfjs=_tfjs_softsign,
+        tfjs=barracuda.SOFTSIGN.write,  # TensorFlow.js 4.22 has none
         activation="softsign",
         barracuda=barracuda.SOFTSIGN,
         loops=elementwise(loops.softsign),
@@ -340,6 +318,7 @@ UNARY = (
             Attr("Truncate", "bool", False, since="1.14", supported=False),
         ),
         tfjs=_tfjs_cast,
+        barracuda=barracuda.CAST,
         loops=loops.cast,
         litert=litert.cast,
         precision="exact",
@@ -388,7 +367,14 @@ BINARY = (
         litert=builtin("DIV"),
     ),
     _binary("FloorDiv", _floor_div, _lower_floor_div, loops=elementwise(loops.floor_div), litert=litert.floor_div),
-    _binary("FloorMod", np.mod, _lower_floor_mod, loops=simple("mod"), litert=builtin("FLOOR_MOD")),
+    _binary(
+        "FloorMod",
+        np.mod,
+        _lower_floor_mod,
+        barracuda=barracuda.FLOOR_MOD,
+        loops=simple("mod"),
+        litert=builtin("FLOOR_MOD"),
+    ),
     _binary(
         "Maximum",
         np.maximum,
@@ -431,7 +417,8 @@ BINARY = (
         "ClipByValue",
         broadcast_of(),
         plain(lambda x, low, high: np.maximum(np.minimum(x, high), low)),
-        attrs=(T,),
+        direct("Clip"),
+        (T,),
         older=clip,
         precision="exact",
         elementwise=True,

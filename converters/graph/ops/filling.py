@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
+from converters.graph.ops import barracuda
 from converters.graph.ops.arrays import target_dims
 from converters.graph.ops.base import (
     Attr,
@@ -16,7 +17,6 @@ from converters.graph.ops.base import (
     OnnxBuilder,
     OpDef,
     by_shape,
-    clip_to_finite,
     constant_input,
     direct,
     emit_unsqueeze,
@@ -33,7 +33,7 @@ from converters.graph.ops.litert.elementwise import full_like
 from converters.graph.ops.loops import arrays as loops
 from converters.graph.ops.loops.elementwise import full_of
 from converters.graph.ops.older import broadcast_to
-from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast, product
+from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
 
 T = type_attr()
 
@@ -148,12 +148,9 @@ def _tfjs_one_hot(builder: GraphBuilder, node: Node, types: Mapping[str, TensorT
 
 
 def _lower_zeros_like(node: Node, builder: OnnxBuilder) -> Any:
-    kind = builder.type_of(node.inputs[0])
-    zero = builder.const(np.zeros((), kind.dtype), "zero")
-    if not builder.reads("Expand") and kind.dtype == FLOAT32:
-        return builder.emit("Mul", [clip_to_finite(builder, builder.value(node.inputs[0]), kind), zero])
+    dtype = builder.type_of(node.inputs[0]).dtype
     shape = builder.emit("Shape", [builder.value(node.inputs[0])])
-    return builder.emit("Expand", [zero, shape])
+    return builder.emit("Expand", [builder.const(np.zeros((), dtype), "zero"), shape])
 
 
 def _lower_ones_like(node: Node, builder: OnnxBuilder) -> Any:
@@ -207,6 +204,7 @@ OPS = (
         _lower_one_hot,
         (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
         tfjs=_tfjs_one_hot,
+        barracuda=barracuda.ONE_HOT,
         litert=litert.one_hot,
         loops=loops.one_hot,
         precision="exact",
@@ -219,6 +217,7 @@ OPS = (
         lambda node, x: np.zeros_like(x),
         _lower_zeros_like,
         (T,),
+        barracuda=barracuda.ZEROS_LIKE,
         elementwise=True,
         precision="exact",
         full_of=0,

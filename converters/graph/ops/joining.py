@@ -5,13 +5,13 @@ Most kernels are structural: they also work on symbolic shape vectors.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from converters.graph.nodes import Node
+from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -157,9 +157,6 @@ def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
 
 
 def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
-    """For an importer of Unity's a Slice for each piece: Barracuda reads the sizes of a Split from its attribute alone,
-    which opset 13 has not.
-    """
     data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
     kind = builder.type_of(node.inputs[data_at])
     assert kind.shape is not None
@@ -170,13 +167,8 @@ def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     value = builder.value(node.inputs[data_at])
     if len(sizes) == 1:
         return (value,)
-    if builder.reads("Split"):
-        lengths = builder.const(np.array(sizes, np.int64), "sizes")
-        return builder.emit_several("Split", [value, lengths], len(sizes), axis=axis)
-    bounds = [0, *itertools.accumulate(int(s) for s in sizes)]
-    starts = [builder.const(np.array([b], np.int64), "bound") for b in bounds]
-    on = builder.const(np.array([axis], np.int64), "axis")
-    return tuple(builder.emit("Slice", [value, begin, end, on]) for begin, end in itertools.pairwise(starts))
+    lengths = builder.const(np.array(sizes, np.int64), "sizes")
+    return builder.emit_several("Split", [value, lengths], len(sizes), axis=axis)
 
 
 OPS = (
@@ -220,6 +212,7 @@ OPS = (
         _split,
         _lower_split,
         (Attr("num_split", "int"), type_attr("T", "in:1")),
+        barracuda=barracuda.SPLIT,
         litert=litert.split,
         loops=loops.split,
         outputs=-1,
@@ -232,6 +225,7 @@ OPS = (
         _split_v,
         _lower_split,
         (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
+        barracuda=barracuda.SPLIT,
         litert=litert.split_v,
         loops=loops.split,
         outputs=-1,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
+from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     Attr,
     GraphBuilder,
@@ -16,7 +17,6 @@ from converters.graph.ops.base import (
     OpDef,
     broadcast_of,
     chain,
-    clip_to_finite,
     direct,
     emit_unsqueeze,
     plain,
@@ -28,7 +28,7 @@ from converters.graph.ops.litert.elementwise import select
 from converters.graph.ops.loops import elementwise as loops
 from converters.graph.ops.loops.base import Loops, elementwise, simple
 from converters.graph.ops.older import select_v2
-from converters.graph.types import BOOL, FLOAT32, INT32, TensorType
+from converters.graph.types import BOOL, TensorType
 
 T = type_attr()
 
@@ -64,25 +64,13 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
     shape, wide = builder.type_of(node.inputs[0]).shape, builder.type_of(node.inputs[1]).rank
     if shape is not None and len(shape) == 1 and wide is not None and wide > 1:
         condition = emit_unsqueeze(builder, condition, list(range(1, wide)), [*shape, *[1] * (wide - 1)])
-    choices = [builder.type_of(r) for r in node.inputs[1:]]
-    infinite = any(k.constant is not None and not np.isfinite(k.constant).all() for k in choices)
-    if builder.reads("Where") or infinite or choices[0].dtype != FLOAT32:
-        return builder.emit("Where", [condition, a, b])
-    holds = builder.emit("Cast", [condition], to=FLOAT32)
-    negative = builder.emit("Mul", [holds, builder.const(np.array(-1, np.float32), "minus")])
-    other = builder.emit("Add", [negative, builder.const(np.array(1, np.float32), "one")])
-    first, second = (clip_to_finite(builder, v, k) for v, k in zip((a, b), choices, strict=True))
-    return builder.emit("Add", [builder.emit("Mul", [first, holds]), builder.emit("Mul", [second, other])])
+    return builder.emit("Where", [condition, a, b])
 
 
 def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
     """TensorFlow.js broadcasts a vector condition over the last axis, not the first: SelectV2 of a reshaped one."""
-    condition, a, b = node.inputs
-    rank, wide = types[condition].rank, types[a].rank
-    if rank == 1 and wide is not None and wide > 1:
-        shape = builder.const(np.array([-1] + [1] * (wide - 1), INT32), f"{node.name}/rows")
-        condition = builder.add("Reshape", [condition, shape], f"{node.name}/condition")
-    return Node(node.name, "SelectV2", (condition, a, b), origin=node.origin)
+    condition = barracuda.whole_rows(builder, node, types)
+    return Node(node.name, "SelectV2", (condition, *node.inputs[1:]), origin=node.origin)
 
 
 OPS = (
@@ -123,6 +111,7 @@ OPS = (
         same_as(0, count=1),
         plain(np.logical_not),
         direct("Not"),
+        barracuda=barracuda.LOGICAL_NOT,
         litert=builtin("LOGICAL_NOT"),
         loops=simple("not"),
         precision="exact",
@@ -137,6 +126,7 @@ OPS = (
         _lower_select,
         (type_attr("T", "in:1"),),
         tfjs=_tfjs_select,
+        barracuda=barracuda.SELECT,
         litert=select,
         loops=loops.select,
         precision="exact",
@@ -146,6 +136,7 @@ OPS = (
         lambda node, args, symbols: [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)],
         lambda node, c, a, b: np.where(c, a, b),
         attrs=(type_attr("T", "in:1"),),
+        barracuda=barracuda.SELECT,
         older=select_v2,
         since="1.14",
         precision="exact",

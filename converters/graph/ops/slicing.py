@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
+from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     Attr,
     GraphBuilder,
@@ -336,6 +337,7 @@ OPS = (
         _gather,
         _lower_gather,
         (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
+        barracuda=barracuda.GATHER,
         litert=gather,
         loops=loops.gather,
         moves="pick",
@@ -353,6 +355,7 @@ OPS = (
             type_attr("Taxis", "in:2"),
             Attr("batch_dims", "int", 0, since="1.14", supported=False),
         ),
+        barracuda=barracuda.GATHER,
         litert=gather,
         loops=loops.gather,
         moves="pick",
