@@ -19,13 +19,33 @@ from exporter.cli.terminal import say
     "Try it: export a trained policy, compare it, see it act.",
     ("export-model demo", "everything, and the page in your browser"),
     ("export-model demo --no-open", "without the page"),
+    ("export-model demo --files", "only files to try commands with"),
 )
-@click.option("-o", "--out", type=PATH, default=Path("demo"), help="Folder for it all.")
+@click.option("-o", "--out", type=PATH, help="Folder for it all (default: demo; with --files, this one).")
 @click.option("--no-open", is_flag=True, help="Do not open the page; exit once everything is written.")
-def demo_command(out: Path, no_open: bool) -> None:
+@click.option("--files", is_flag=True, help="Write policies to try: .bytes, .onnx, .nn, a run, memory.")
+def demo_command(out: Path | None, no_open: bool, files: bool) -> None:
     """Export a trained 3DBall that comes with the package, compare the formats in the installed runtimes, and open
     the page on which it acts.
     """
+    if files:
+        _write_files(out or Path())
+        return
+    _demonstrate(out or Path("demo"), no_open)
+
+
+def _write_files(out: Path) -> None:
+    from exporter.demo.files import FILES, write_files
+    from exporter.tables import typed
+
+    write_files(out)
+    width = max(map(len, FILES))
+    for name, what in FILES.items():
+        say(f"{out / name!s:{width + len(str(out / 'x')) - 1}}  {what}".rstrip())
+    say(f"next: {typed(out / '3DBall.onnx', '-o', out / 'exported')}")
+
+
+def _demonstrate(out: Path, no_open: bool) -> None:
     from converters.formats.bundle.bundle import writing
     from exporter.demo import BALL
     from signatures.errors import UsageError

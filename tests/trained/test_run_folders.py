@@ -13,7 +13,7 @@ import pytest
 from converters.formats.frozen_graph.reader import read_graph
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model, inspect_model
-from exporter.demo import BALL
+from exporter.demo import BALL, HALLWAY
 from exporter.play.environments import ENVIRONMENTS
 from fixtures import trained
 from fixtures.evaluate import play
@@ -133,5 +133,6 @@ def test_numpy_weights_and_the_exported_policy_decide_alike(stage: Stage, name: 
         observation, *_ = environment.step(got)
 
 
-def test_the_demo_is_the_policy_that_was_trained() -> None:
-    assert BALL.read_bytes() == (FOLDER / "3DBall" / "frozen_graph_def.pb").read_bytes()
+def test_the_demo_has_the_policies_that_were_trained() -> None:
+    for demo in (BALL, HALLWAY):
+        assert demo.read_bytes() == (FOLDER / demo.stem / "frozen_graph_def.pb").read_bytes()
