@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import pickletools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import IO, Any
 
 from signatures.errors import DamagedFileError, NotAPolicyError
@@ -27,8 +27,8 @@ MAX_AXES, MAX_LENGTH = 8, 1 << 31
 #: PyTorch's magic number has 77.
 _MAX_BITS = 1 << 10
 _FIX = "give a checkpoint as its trainer wrote it"
-_MARK = object()
-_KEYS = (str, int, float, bool, type(None))
+MARK = object()
+KEYS = (str, int, float, bool, type(None))
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class _Function:
+class Function:
     """An imported name that may be called; ``make`` gets the arguments and gives a value of this module."""
 
     name: str
@@ -76,26 +76,31 @@ def unpickle(stream: IO[bytes], storage: Callable[[tuple[Any, ...]], Any]) -> An
     ``storage`` makes what a persistent id stands for. Raises NotAPolicyError for a name that is not in the table,
     DamagedFileError for a pickle that breaks the rules of its own format.
     """
-    machine = _Machine(storage)
+    return carry_out(Machine(storage), stream)
+
+
+def carry_out(machine: Machine, stream: IO[bytes]) -> Any:
+    """Return the value of one pickle, its opcodes carried out by a machine. Raises what ``unpickle`` raises."""
     try:
         with warnings.catch_warnings():  # of escapes in a damaged name, by pickletools
             warnings.simplefilter("ignore")
             for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
                 if count > MAX_OPCODES:
-                    raise _damaged_error(f"its pickle has more than {MAX_OPCODES} opcodes")
+                    raise damaged_error(f"its pickle has more than {MAX_OPCODES} opcodes")
                 if opcode.name == "STOP":
                     return machine.pop()
                 machine.run(opcode.name, argument)
     except (ValueError, IndexError, KeyError, OverflowError, TypeError, AttributeError) as error:
         text = str(error).strip().splitlines()
-        raise _damaged_error(f"its pickle cannot be read: {text[0] if text else type(error).__name__}") from error
-    raise _damaged_error("its pickle has no end")
+        raise damaged_error(f"its pickle cannot be read: {text[0] if text else type(error).__name__}") from error
+    raise damaged_error("its pickle has no end")
 
 
-class _Machine:
-    """The stack and the memo of a pickle."""
+class Machine:
+    """The stack and the memo of a pickle; ``opcodes`` are those that it carries out."""
 
     def __init__(self, storage: Callable[[tuple[Any, ...]], Any]) -> None:
+        self.opcodes: Mapping[str, Callable[[Any, Any], object]] = OPCODES
         self.storage = storage
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
@@ -103,25 +108,25 @@ class _Machine:
 
     def run(self, name: str, argument: Any) -> None:
         """Carry out one opcode."""
-        if name not in _OPCODES:
+        if name not in self.opcodes:
             raise NotAPolicyError(
                 f"its pickle asks for what no checkpoint needs (opcode {name})",
                 why="only plain containers and tensors are built from a checkpoint; nothing in it is run",
                 fix=_FIX,
             )
-        _OPCODES[name](self, argument)
+        self.opcodes[name](self, argument)
 
     def push(self, value: Any) -> None:
         """Put a value on the stack."""
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:  # Python would not write it as text
-            raise _damaged_error(f"its pickle holds a number of {value.bit_length()} bits")
+            raise damaged_error(f"its pickle holds a number of {value.bit_length()} bits")
         self.stack.append(value)
 
     def pop(self) -> Any:
         """The top of the stack."""
         value = self.stack.pop()
-        if value is _MARK:
-            raise _damaged_error("its pickle takes a mark for a value")
+        if value is MARK:
+            raise damaged_error("its pickle takes a mark for a value")
         return value
 
     def last(self, count: int) -> tuple[Any, ...]:
@@ -131,16 +136,16 @@ class _Machine:
     def items(self) -> list[Any]:
         """What stands above the last mark, which goes too."""
         for at in range(len(self.stack) - 1, -1, -1):
-            if self.stack[at] is _MARK:
+            if self.stack[at] is MARK:
                 found = self.stack[at + 1 :]
                 del self.stack[at:]
                 return found
-        raise _damaged_error("its pickle asks for a mark that is not there")
+        raise damaged_error("its pickle asks for a mark that is not there")
 
     def top(self, kind: type) -> Any:
         """The container that is being filled."""
         if not isinstance(self.stack[-1], kind):
-            raise _damaged_error(f"its pickle fills something that is no {kind.__name__}")
+            raise damaged_error(f"its pickle fills something that is no {kind.__name__}")
         return self.stack[-1]
 
     def extend(self, values: Sequence[Any]) -> None:
@@ -151,8 +156,8 @@ class _Machine:
         """Put keys and values, by turns, into the dictionary that is at the top."""
         target = self.top(dict)
         for key, value in zip(items[::2], items[1::2], strict=True):
-            if not isinstance(key, _KEYS):
-                raise _damaged_error(f"a key in its pickle is a {type(key).__name__}")
+            if not isinstance(key, KEYS):
+                raise damaged_error(f"a key in its pickle is a {type(key).__name__}")
             target[key] = value
 
     def push_dict(self, items: Sequence[Any]) -> None:
@@ -164,17 +169,21 @@ class _Machine:
         """The name that two texts on the stack are."""
         module, name = self.last(2)
         if not isinstance(name, str) or not isinstance(module, str):
-            raise _damaged_error("its pickle imports something that has no name")
+            raise damaged_error("its pickle imports something that has no name")
+        return self.imported(module, name)
+
+    def imported(self, module: str, name: str) -> Any:
+        """Return what an imported name stands for. Raises NotAPolicyError where it is not in the table."""
         return _global(module, name)
 
     def reduce(self) -> Any:
         """What a call gives."""
         function, arguments = self.last(2)
-        if not isinstance(function, _Function) or not isinstance(arguments, tuple):
-            raise _damaged_error("its pickle calls something that is no function")
+        if not isinstance(function, Function) or not isinstance(arguments, tuple):
+            raise damaged_error("its pickle calls something that is no function")
         self.copied += sum(len(a) for a in arguments if isinstance(a, tuple | list | dict | str | bytes))
         if self.copied > MAX_COPIED:
-            raise _damaged_error(f"the calls of its pickle copy more than {MAX_COPIED} items")
+            raise damaged_error(f"the calls of its pickle copy more than {MAX_COPIED} items")
         return function.make(arguments)
 
     def build(self) -> None:
@@ -186,7 +195,7 @@ class _Machine:
         """What a persistent id stands for."""
         identity = self.pop()
         if not isinstance(identity, tuple):
-            raise _damaged_error("a persistent id in its pickle is no tuple")
+            raise damaged_error("a persistent id in its pickle is no tuple")
         return self.storage(identity)
 
 
@@ -195,10 +204,10 @@ _VALUES = (
     *("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
 )
 #: What each opcode does with the machine and its argument.
-_OPCODES: dict[str, Callable[[_Machine, Any], object]] = {
+OPCODES: dict[str, Callable[[Machine, Any], object]] = {
     **dict.fromkeys(("PROTO", "FRAME"), lambda m, _: None),
-    **dict.fromkeys(_VALUES, _Machine.push),
-    "MARK": lambda m, _: m.stack.append(_MARK),
+    **dict.fromkeys(_VALUES, Machine.push),
+    "MARK": lambda m, _: m.stack.append(MARK),
     "NONE": lambda m, _: m.stack.append(None),
     "NEWTRUE": lambda m, _: m.stack.append(True),
     "NEWFALSE": lambda m, _: m.stack.append(False),
@@ -221,7 +230,7 @@ _OPCODES: dict[str, Callable[[_Machine, Any], object]] = {
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), lambda m, index: m.memo.update({index: m.stack[-1]})),
     "MEMOIZE": lambda m, _: m.memo.update({len(m.memo): m.stack[-1]}),
     **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda m, index: m.stack.append(m.memo[index])),
-    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(_global(*name.partition(" ")[::2]))),
+    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(m.imported(*name.partition(" ")[::2]))),
     "STACK_GLOBAL": lambda m, _: m.stack.append(m.stack_global()),
     "REDUCE": lambda m, _: m.stack.append(m.reduce()),
     "BUILD": lambda m, _: m.build(),
@@ -237,8 +246,8 @@ def _ordered_dict(arguments: tuple[Any, ...]) -> dict[Any, Any]:
     made: dict[Any, Any] = {}
     for pair in arguments[0] if arguments else ():
         key, value = pair
-        if not isinstance(key, _KEYS):
-            raise _damaged_error(f"a key in its pickle is a {type(key).__name__}")
+        if not isinstance(key, KEYS):
+            raise damaged_error(f"a key in its pickle is a {type(key).__name__}")
         made[key] = value
     return made
 
@@ -247,9 +256,9 @@ def _tensor(arguments: tuple[Any, ...]) -> Tensor:
     """``_rebuild_tensor_v2(storage, storage_offset, size, stride, requires_grad, backward_hooks, metadata)``."""
     storage, offset, shape, strides = arguments[:4]
     if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) != len(strides):
-        raise _damaged_error("a tensor's shape and strides do not fit together")
+        raise damaged_error("a tensor's shape and strides do not fit together")
     if len(shape) > MAX_AXES or not all(_is_count(n) for n in (offset, *shape, *strides)):
-        raise _damaged_error("a tensor's shape or strides are none")
+        raise damaged_error("a tensor's shape or strides are none")
     return Tensor(storage, offset, shape, strides)
 
 
@@ -257,20 +266,27 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MAX_LENGTH
 
 
-_NAMES: dict[tuple[str, str], Any] = {
-    ("collections", "OrderedDict"): _Function("OrderedDict", _ordered_dict),
-    ("torch._utils", "_rebuild_tensor"): _Function("_rebuild_tensor", _tensor),
-    ("torch._utils", "_rebuild_tensor_v2"): _Function("_rebuild_tensor_v2", _tensor),
+NAMES: dict[tuple[str, str], Any] = {
+    ("collections", "OrderedDict"): Function("OrderedDict", _ordered_dict),
+    ("torch._utils", "_rebuild_tensor"): Function("_rebuild_tensor", _tensor),
+    ("torch._utils", "_rebuild_tensor_v2"): Function("_rebuild_tensor_v2", _tensor),
     # of its data, requires_grad, backward_hooks: the data
-    ("torch._utils", "_rebuild_parameter"): _Function("_rebuild_parameter", lambda arguments: arguments[0]),
-    ("torch", "Size"): _Function("Size", lambda arguments: tuple(arguments[0])),
+    ("torch._utils", "_rebuild_parameter"): Function("_rebuild_parameter", lambda arguments: arguments[0]),
+    ("torch", "Size"): Function("Size", lambda arguments: tuple(arguments[0])),
     **{("torch", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
     **{("torch.cuda", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
 }
 
 
+#: Modules whose functions act on the machine that loads a pickle: no object that is kept in one needs them.
+SYSTEM = frozenset(
+    (
+        *("os", "posix", "nt", "subprocess", "sys", "builtins", "__builtin__", "runpy", "socket", "shutil"),
+        *("importlib", "pty", "ctypes", "multiprocessing", "threading", "asyncio", "pickle", "webbrowser", "code"),
+    )
+)
 #: What the module of a name tells: (modules, why it is refused, what to do). The last row is for all others.
-_OTHERS: tuple[tuple[tuple[str, ...], str, str], ...] = (
+_OTHERS: tuple[tuple[Collection[str], str, str], ...] = (
     (
         ("torch.nn", "torch.optim", "torch.distributions"),
         "the module was saved whole, and its code is not in the file",
@@ -282,7 +298,7 @@ _OTHERS: tuple[tuple[tuple[str, ...], str, str], ...] = (
         "give the checkpoint with the weights; or save them alone: torch.save(policy.state_dict(), …)",
     ),
     (
-        ("os", "posix", "nt", "subprocess", "sys", "builtins", "__builtin__", "runpy", "socket", "shutil", "importlib"),
+        SYSTEM,
         "loading it as a pickle would run that, which no weights need",
         f"do not load it with torch.load or pickle; {_FIX}",
     ),
@@ -295,15 +311,21 @@ _OTHERS: tuple[tuple[tuple[str, ...], str, str], ...] = (
 
 
 def _global(module: str, name: str) -> Any:
-    found = _NAMES.get((module, name))
+    found = NAMES.get((module, name))
     if found is None:
-        parts = module[:100].split(".")
-        above = {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
-        _, why, fix = next(row for row in _OTHERS if not row[0] or not above.isdisjoint(row[0]))
-        built = "only tensors and plain containers are built from a checkpoint, and nothing in it is run"
-        raise NotAPolicyError(f"its pickle asks for {module[:100]}.{name[:100]}", why=f"{built}; {why}", fix=fix)
+        raise refusal(module, name)
     return found
 
 
-def _damaged_error(what: str) -> DamagedFileError:
+def refusal(module: str, name: str) -> NotAPolicyError:
+    """Return the refusal of a name that a pickle imports."""
+    parts = module[:100].split(".")
+    above = {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
+    _, why, fix = next(row for row in _OTHERS if not row[0] or not above.isdisjoint(row[0]))
+    built = "only tensors and plain containers are built from a checkpoint, and nothing in it is run"
+    return NotAPolicyError(f"its pickle asks for {module[:100]}.{name[:100]}", why=f"{built}; {why}", fix=fix)
+
+
+def damaged_error(what: str) -> DamagedFileError:
+    """Return the refusal of a pickle that breaks the rules of its own format."""
     return DamagedFileError(what, why="the file is cut off or damaged", fix="copy or download it again")

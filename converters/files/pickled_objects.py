@@ -1,0 +1,209 @@
+"""Pickled objects as data: the names of their classes, their attributes, numpy's arrays. Nothing is imported or called.
+
+``unpickle.py`` refuses objects: a checkpoint needs none. Some files are made of them (VecNormalize of
+Stable-Baselines3). Here an object is an ``Instance``: what its class is called, and what the pickle would give it. An
+object of any class may stand beside those that a reader asks for, and is left alone; a name that acts on the machine
+(``os.system``) is refused, though it would not be called either.
+
+Sources: CPython Lib/pickletools.py; numpy/_core/src/multiarray/methods.c (``array_reduce``: ``_reconstruct`` and the
+state (version, shape, dtype, Fortran order, bytes)), descriptor.c (``arraydescr_reduce``), numpy/_core/numeric.py
+(``_frombuffer``, of protocol 5); modules were called ``numpy.core`` before numpy 2.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+
+from converters.files.unpickle import KEYS, NAMES, OPCODES, SYSTEM, Function, Machine, carry_out, damaged_error, refusal
+from signatures.records import dataclass
+
+#: Types of Python that objects are pickled with.
+_PLAIN_TYPES = frozenset(
+    (
+        *("object", "set", "frozenset", "slice", "complex", "bytearray", "range"),
+        *("list", "tuple", "dict", "int", "float", "bool", "str", "bytes"),
+    )
+)
+#: What protocols 0 and 1 make an object of a class with (Lib/copyreg.py).
+_RECONSTRUCTORS = (("copy_reg", "_reconstructor"), ("copyreg", "_reconstructor"))
+_MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
+_NUMERIC = ("numpy.core.numeric", "numpy._core.numeric")
+#: What numpy calls a dtype of numbers in a pickle, and how it marks their byte order.
+_DTYPE = re.compile("f[248]|[iu][1248]|b1")
+_ORDERS: dict[str, Literal["<", ">", "="]] = {"<": "<", ">": ">", "|": "=", "=": "="}
+_MAX_AXES = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """An imported class or function, by its name alone."""
+
+    module: str
+    name: str
+
+
+@dataclass(slots=True)
+class Instance:
+    """An object: what made it (a class, or a function), what that was given, and the state that was set afterwards."""
+
+    maker: Name
+    arguments: tuple[Any, ...] = ()
+    state: Any = None
+
+    def attribute(self, name: str, default: Any = None) -> Any:
+        """Return an attribute; the default where the object has none of that name."""
+        state = self.state
+        if isinstance(state, tuple) and len(state) == 2:  # those of __dict__, those of __slots__
+            state = {k: v for part in state[::-1] if isinstance(part, dict) for k, v in part.items()}
+        return state.get(name, default) if isinstance(state, dict) else default
+
+
+def unpickle_objects(data: bytes, storage: Callable[[tuple[Any, ...]], Any] | None = None) -> Any:
+    """Return the value of a pickle that may hold objects. ``storage`` makes what a persistent id stands for.
+
+    Raises NotAPolicyError for a name that acts on the machine, DamagedFileError for what breaks the rules of pickles.
+    """
+    return carry_out(_Objects(storage or _no_storage, 4 * len(data) + (1 << 16)), io.BytesIO(data))
+
+
+def _no_storage(identity: tuple[Any, ...]) -> Any:
+    raise damaged_error("a tensor stands where none belongs")
+
+
+class _Objects(Machine):
+    """A machine for which every other class is a name."""
+
+    def __init__(self, storage: Callable[[tuple[Any, ...]], Any], most_copied: int) -> None:
+        super().__init__(storage)
+        self.opcodes = _OPCODES
+        self._most_copied = most_copied
+
+    def imported(self, module: str, name: str) -> Any:
+        """Return what is known of an imported name. Raises NotAPolicyError for one that acts on the machine."""
+        if (module, name) in NAMES:
+            return NAMES[module, name]
+        if (module, name) == ("_codecs", "encode"):
+            return Function("encode", self._encoded)
+        root = module.partition(".")[0]
+        if root in SYSTEM and not (root in ("builtins", "__builtin__") and name in _PLAIN_TYPES):
+            raise refusal(module, name)
+        return Name(module, name)
+
+    def reduce(self) -> Any:
+        """Return the object that a call would make, or what a known function gives."""
+        function, arguments = self.last(2)
+        if isinstance(function, Function):
+            self.stack += [function, arguments]
+            return super().reduce()
+        return self.instance(function, arguments)
+
+    def instance(self, maker: Any, arguments: Any) -> Instance:
+        """Return an object that is not made."""
+        if not isinstance(maker, Name) or not isinstance(arguments, tuple):
+            raise damaged_error("its pickle makes an object of something that is not a class")
+        if (maker.module, maker.name) in _RECONSTRUCTORS and arguments and isinstance(arguments[0], Name):
+            return Instance(arguments[0])
+        return Instance(maker, arguments)
+
+    def build(self) -> None:
+        """Set the state of the object at the top; attributes of a container are left out."""
+        state = self.pop()
+        target = self.stack[-1]
+        if isinstance(target, Instance):
+            target.state = state
+        elif not isinstance(target, dict | list):
+            raise damaged_error("its pickle sets the state of something that has none")
+
+    def collected(self) -> Instance:
+        """Return an object of its class and arguments, all above a mark."""
+        maker, *arguments = self.items()
+        return self.instance(maker, tuple(arguments))
+
+    def extend(self, values: Any) -> None:
+        """Put values into the list that is at the top; those of an object (a deque) are left out."""
+        if not isinstance(self.stack[-1], Instance):
+            super().extend(values)
+
+    def fill(self, items: Any) -> None:
+        """Put items into the dictionary that is at the top; keys that are no plain values are left out."""
+        if isinstance(self.stack[-1], Instance):  # of a subclass of dict
+            self.stack[-1].state = {k: v for k, v in zip(items[::2], items[1::2], strict=True) if isinstance(k, KEYS)}
+            return
+        target = self.top(dict)
+        target.update({k: v for k, v in zip(items[::2], items[1::2], strict=True) if isinstance(k, KEYS)})
+
+    def _encoded(self, arguments: tuple[Any, ...]) -> bytes:
+        """Return ``_codecs.encode(text, "latin1")``, with which older protocols write bytes."""
+        text, *coding = arguments
+        if not isinstance(text, str) or coding not in (["latin1"], ["latin-1"]):
+            raise damaged_error("its pickle encodes something that is not bytes")
+        self._most_copied -= len(text)
+        if self._most_copied < 0:
+            raise damaged_error("its pickle repeats its bytes")
+        return text.encode("latin1")
+
+
+_OPCODES = {
+    **OPCODES,
+    "NEWOBJ": lambda m, _: m.stack.append(m.instance(*m.last(2))),
+    "NEWOBJ_EX": lambda m, _: m.stack.append(m.instance(*m.last(3)[:2])),
+    "OBJ": lambda m, _: m.stack.append(m.collected()),
+    "INST": lambda m, name: m.stack.append(m.instance(m.imported(*name.partition(" ")[::2]), tuple(m.items()))),
+    "BYTEARRAY8": lambda m, value: m.stack.append(bytes(value)),
+    **dict.fromkeys(("STRING", "BINSTRING", "SHORT_BINSTRING"), lambda m, value: m.stack.append(value)),
+    # Sets hold no statistics: what goes into one is forgotten.
+    "EMPTY_SET": lambda m, _: m.stack.append([]),
+    "ADDITEMS": lambda m, _: m.items(),
+    "FROZENSET": lambda m, _: m.stack.append(m.items()),
+}
+
+
+# ------------------------------------------------------------------ numpy
+
+
+def array_of(value: Any, what: str) -> np.ndarray:
+    """Return a pickled array or scalar of numbers, or a number of Python, as an array of its dtype.
+
+    ``what`` is its name in errors. Raises DamagedFileError where it is something else.
+    """
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return np.array(value, np.float64)
+    if isinstance(value, Instance):
+        module, name = value.maker.module, value.maker.name
+        if module in _MULTIARRAY and name == "_reconstruct" and isinstance(value.state, tuple):
+            shape, dtype, fortran, data = value.state[-4:] if len(value.state) >= 4 else (None,) * 4
+            return _array(shape, dtype, data, "F" if fortran is True else "C", what)
+        if module in _NUMERIC and name == "_frombuffer" and len(value.arguments) == 4:
+            data, dtype, shape, order = value.arguments
+            return _array(shape, dtype, data, "F" if order == "F" else "C", what)
+        if module in _MULTIARRAY and name == "scalar" and len(value.arguments) == 2:
+            return _array((), value.arguments[0], value.arguments[1], "C", what)
+    raise damaged_error(f"its {what} is not an array of numbers")
+
+
+def _array(shape: Any, dtype: Any, data: Any, order: Literal["C", "F"], what: str) -> np.ndarray:
+    kind = _dtype(dtype)
+    whole = isinstance(shape, tuple) and all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
+    if kind is None or not whole or len(shape) > _MAX_AXES or not isinstance(data, bytes):
+        raise damaged_error(f"its {what} is not an array of numbers")
+    if math.prod(shape) * kind.itemsize != len(data):
+        raise damaged_error(f"its {what} has {len(data)} bytes, and its shape {list(shape)[:8]} needs others")
+    return np.frombuffer(data, kind).reshape(shape, order=order).astype(kind.newbyteorder("="), copy=False)
+
+
+def _dtype(value: Any) -> np.dtype[Any] | None:
+    """Return the dtype of numbers that was pickled; None where it is another."""
+    if not isinstance(value, Instance) or (value.maker.module, value.maker.name) != ("numpy", "dtype"):
+        return None
+    code = value.arguments[0] if value.arguments else None
+    state = value.state
+    order = state[1] if isinstance(state, tuple) and len(state) > 1 else "="
+    if not isinstance(code, str) or not _DTYPE.fullmatch(code) or not isinstance(order, str) or order not in _ORDERS:
+        return None
+    return np.dtype(code).newbyteorder(_ORDERS[order])
