@@ -37,6 +37,7 @@ def export_model(
     trust_source: bool = False,
     goals: Sequence[int] = (),
     activation: str | None = None,
+    normaliser: Path | str | None = None,
     opset: int | None = None,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
@@ -50,9 +51,9 @@ def export_model(
     """Export every policy of a source to ``out/<policy>/``, and compare what was written in the installed runtimes.
 
     ``export_model.export`` with flat keywords: those of ReadOptions (``brain``, ``inputs``, ``outputs``, ``values``,
-    ``step``, ``sensors``, ``goals``, ``activation``, ``trust_source``) and of WriteOptions (``names``, ``noise``,
-    ``deterministic``, ``opset``, ``dtype``, ``quantize``, ``batch``, ``labels``). ``verify`` names the runtimes,
-    ``parity`` has seed, samples and tolerances. Raises ExportModelError and its subclasses::
+    ``step``, ``sensors``, ``goals``, ``activation``, ``normaliser``, ``trust_source``) and of WriteOptions (``names``,
+    ``noise``, ``deterministic``, ``opset``, ``dtype``, ``quantize``, ``batch``, ``labels``). ``verify`` names the
+    runtimes, ``parity`` has seed, samples and tolerances. Raises ExportModelError and its subclasses::
 
         (result,) = export_model("3DBall.bytes", "out", to="onnx,tfjs")
         print(result.passed, result.folder, result.policy.signature.inputs)
@@ -72,6 +73,7 @@ def export_model(
             sensors=sensors,
             goals=goals,
             activation=activation,
+            normaliser=normaliser,
             trust_source=trust_source,
         ),
         write=WriteOptions(
@@ -104,6 +106,7 @@ def inspect_model(
     trust_source: bool = False,
     goals: Sequence[int] = (),
     activation: str | None = None,
+    normaliser: Path | str | None = None,
     why: bool = False,
 ) -> Inspection:
     """Return the policies of a source with their signatures: ``export_model.inspect`` with flat keywords.
@@ -122,6 +125,7 @@ def inspect_model(
         sensors=sensors,
         goals=goals,
         activation=activation,
+        normaliser=normaliser,
         trust_source=trust_source,
     )
     return interface.inspect(source, read=read, why=why)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
+from pathlib import Path
 
 from converters.compiler.options import CompileOptions, NoiseMode
 from converters.formats import source
@@ -33,13 +34,17 @@ class ReadOptions:
     goals: Sequence[int] = ()
     #: Activation between the layers of a bare ``.pt``.
     activation: str | None = None
+    #: File with the statistics that a model of Stable-Baselines3 was trained behind (default: the one next to it), or
+    #: ``"none"`` to leave them out.
+    normaliser: Path | str | None = None
     #: Let Keras load what is not plain data. It can run code.
     trust_source: bool = False
 
     def for_reader(self) -> source.ReadOptions:
         """Return what a format's reader needs of them."""
         sensors = tuple(tuple(shape) for shape in self.sensors)
-        return source.ReadOptions(self.step, sensors, self.trust_source, tuple(self.goals), self.activation)
+        normaliser = None if self.normaliser is None else str(self.normaliser)
+        return source.ReadOptions(self.step, sensors, self.trust_source, tuple(self.goals), self.activation, normaliser)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,6 +72,7 @@ class Origin:
     sensors: tuple[tuple[int, ...], ...] = ()
     goals: tuple[int, ...] = ()
     activation: str | None = None
+    normaliser: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json."""
@@ -83,6 +84,7 @@ class Origin:
             sensors=[list(shape) for shape in self.sensors] or None,
             goals=list(self.goals) or None,
             activation=self.activation,
+            normaliser=self.normaliser,
         )
 
 
@@ -160,6 +162,7 @@ def parse(content: Any) -> Contract:
         tuple(tuple(n.integer(1) for n in shape.items(8)) for shape in source["sensors"].items(1000)),
         tuple(n.integer(0) for n in source["goals"].items(1000)),
         None if source["activation"].missing else source["activation"].text(),
+        None if source["normaliser"].missing else source["normaliser"].text(),
     )
     entries = whole["files"].members()
     files = {_key(p, e): FileEntry(_sha256(e["sha256"]), e["bytes"].integer(0)) for p, e in entries.items()}

@@ -20,7 +20,12 @@ from signatures.errors import BundleError, ExportModelError, RefusedError, Sourc
 _Part = TypeVar("_Part")
 _Made = TypeVar("_Made")
 #: What only some sources have a use for: option, flag, and what to give to have one.
-_TAKEN = (("step", "a checkpoint or a run's folder"), ("sensors", "a .pt"), ("activation", "a state dictionary"))
+_TAKEN = (
+    ("step", "a checkpoint or a run's folder"),
+    ("sensors", "a .pt"),
+    ("activation", "a state dictionary"),
+    ("normaliser", "a saved model of Stable-Baselines3"),
+)
 
 
 def fetched(path: Path) -> tuple[Fetched, Format]:

@@ -85,7 +85,8 @@ REFUSED = (
     Format(
         key="pickle",
         label="a pickle that PyTorch did not write",
-        advice="give the checkpoint itself (.pt, .pth, .zip); settings, statistics and replay buffers are not needed",
+        advice="give the checkpoint itself (.pt, .pth, .zip): statistics next to it are read, settings and "
+        "replay buffers are not needed",
         sniff=lambda file: file.starts(*PICKLES),
     ),
     Format(key="zip", label="a ZIP archive", advice=_UNPACK, sniff=lambda file: file.starts(b"PK\x03\x04")),

@@ -76,11 +76,17 @@ class SourceModel:
     producer: str = ""
 
 
+#: What ``--set normaliser=`` is given to leave it out.
+NO_NORMALISER = "none"
+
+
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
     """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
     order, lists of entities [most, numbers], images C, H, W (empty: as far as the source tells); whether a source may
-    be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers.
+    be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers; the
+    file with the statistics that observations were normalised by (None: the one beside the source; ``NO_NORMALISER``:
+    they are left out).
     """
 
     step: int | None = None
@@ -88,3 +94,4 @@ class ReadOptions:
     trust_source: bool = False
     goals: tuple[int, ...] = ()
     activation: str | None = None
+    normaliser: str | None = None

@@ -23,7 +23,8 @@ class Saved:
 
     ``archive`` is PyTorch's file; ``settings`` what the trainer wrote beside it in the same source (None: nothing).
     ``sensors`` are the shapes of what is observed, ``goals`` the places of those that are goals, ``activation`` the one
-    between layers: what weights do not tell.
+    between layers: what weights do not tell. ``statistics`` is a file that observations were normalised by, beside the
+    weights: its name and its bytes.
     """
 
     given: Fetched
@@ -32,6 +33,7 @@ class Saved:
     sensors: tuple[tuple[int, ...], ...] = ()
     goals: tuple[int, ...] = ()
     activation: str | None = None
+    statistics: tuple[str, bytes] | None = None
 
     @property
     def value(self) -> Any:

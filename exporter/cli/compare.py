@@ -10,7 +10,7 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import JUDGING, as_given, comparing, located, pairs, trusting, understanding
+from exporter.cli.options import JUDGING, as_given, comparing, located, normalising, pairs, trusting, understanding
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 @click.argument("candidates", nargs=-1, required=True, type=PATH, metavar="CANDIDATE...")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
 @trusting
+@normalising
 @located
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if none of their runtimes is installed.")
 @reporting
@@ -39,6 +40,7 @@ def compare_command(
     candidates: tuple[Path, ...],
     mapped: tuple[str, ...],
     trust_source: bool,
+    normaliser: Path | str | None,
     runtimes: str,
     allow_unverified: bool,
     compiling: CompileOptions,
@@ -61,7 +63,7 @@ def compare_command(
             runtimes=runtimes,
             options=options,
             understanding=compiling,
-            read=ReadOptions(trust_source=trust_source),
+            read=ReadOptions(trust_source=trust_source, normaliser=None if normaliser is None else str(normaliser)),
             allow_unverified=allow_unverified,
             progress=progress,
             understood=read.append,

@@ -11,7 +11,17 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import RULES, activating, as_given, comparing, located, read_options, trusting, understanding
+from exporter.cli.options import (
+    RULES,
+    activating,
+    as_given,
+    comparing,
+    located,
+    normalising,
+    read_options,
+    trusting,
+    understanding,
+)
 from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
@@ -57,6 +67,7 @@ if TYPE_CHECKING:
 @trusting
 @click.option("--sensors", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
 @activating
+@normalising
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
@@ -86,6 +97,7 @@ def export_command(
     step: int | None,
     sensors: str | None,
     activation: str | None,
+    normaliser: Path | str | None,
     trust_source: bool,
     labels: Path | None,
     dtype: str,
@@ -117,7 +129,7 @@ def export_command(
         None if targets is None else [t for t in targets.split(",") if t],
         name,
         compiling,
-        read_options(step, sensors, trust_source, activation),
+        read_options(step, sensors, trust_source, activation, normaliser),
         opset,
         runtimes,
         options,

@@ -34,7 +34,8 @@ GROUPS = {
         *("dtype", "quantize", "batch", "scene", "target", "files"),
     ),
     "How to read the source": (
-        *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "trust_source"),
+        *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation"),
+        *("normaliser", "trust_source"),
     ),
     "What Unity would say": ("releases", "actions", "brain_parameters"),
     "How to verify": (

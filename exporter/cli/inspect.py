@@ -10,7 +10,7 @@ import click
 
 from exporter.cli.export import export_command
 from exporter.cli.group import FILE, PATH, command
-from exporter.cli.options import activating, as_given, read_options, trusting, understanding
+from exporter.cli.options import activating, as_given, normalising, read_options, trusting, understanding
 from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import ExportModelError, UsageError
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 @trusting
 @click.option("--sensors", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
 @activating
+@normalising
 @click.option(
     "--unity",
     "releases",
@@ -56,6 +57,7 @@ def inspect_command(
     step: int | None,
     sensors: str | None,
     activation: str | None,
+    normaliser: Path | str | None,
     releases: tuple[str, ...],
     actions: str | None,
     brain_parameters: Path | None,
@@ -84,6 +86,7 @@ def inspect_command(
         "--why": why,
         "--step": step is not None,
         "--activation": activation is not None,
+        "--normaliser": normaliser is not None,
         "--trust-source": trust_source,
         "--brain, --input, --output or --set": compiling != CompileOptions(),
     }
@@ -101,7 +104,7 @@ def inspect_command(
                     found.append(report)
                     status = max(status, verdict)
                 else:
-                    read = read_options(step, sensors, trust_source, activation)
+                    read = read_options(step, sensors, trust_source, activation, normaliser)
                     refused: list[ExportModelError] = []
                     answer = _inspected(here, compiling, read, logdir, svg, refused, as_json=as_json, why=why)
                     for error in refused:

@@ -68,7 +68,7 @@ def as_given(names: Container[str]) -> list[str]:
 #: What decides how a policy is read and judged. A report that says how to compare again has these as they were given.
 JUDGING = frozenset(
     (
-        *("mapped", "brain", "inputs", "outputs", "values", "trust_source", "source", "step"),
+        *("mapped", "brain", "inputs", "outputs", "values", "normaliser", "trust_source", "source", "step"),
         *("golden", "sizes", "tolerances", "atol", "rtol", "required"),
     )
 )
@@ -92,12 +92,14 @@ def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int
     return shapes, tuple(i for i, part in enumerate(parts) if part.startswith("goal:"))
 
 
-def read_options(step: int | None, sensors: str | None, trust_source: bool, activation: str | None) -> ReadOptions:
+def read_options(
+    step: int | None, sensors: str | None, trust_source: bool, activation: str | None, normaliser: Path | str | None
+) -> ReadOptions:
     """What a reader is told, of the command line's words. Raises UsageError."""
     from converters.formats.source import ReadOptions
 
     shapes, goals = sensors_of(sensors)
-    return ReadOptions(step, shapes, trust_source, goals, activation)
+    return ReadOptions(step, shapes, trust_source, goals, activation, None if normaliser is None else str(normaliser))
 
 
 #: Where files are run; a word means the same in every command.
@@ -113,8 +115,16 @@ located = click.option(
 activating = click.option(
     "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
 )
+#: For policies that were trained behind a normaliser of their own.
+normalising = click.option(
+    "--normaliser", type=FILE, metavar="FILE", help="Statistics of a .zip: vecnormalize.pkl, if not next to it."
+)
 #: For sources that only a loader of their own can read, which runs what they say.
 trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is not plain data; can run code.")
+
+
+#: What ``--set`` says of a normaliser that is to be left out.
+_WITHOUT_NORMALISER = "normaliser=none"
 
 
 def _numbers(values: Sequence[str]) -> dict[str, float]:
@@ -131,7 +141,7 @@ def _numbers(values: Sequence[str]) -> dict[str, float]:
 def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that decide what inference cannot; the command gets them as ``compiling``, a CompileOptions.
 
-    A command's own --names, --noise and --deterministic go into it, too.
+    A command's own --names, --noise and --deterministic go into it, too. --set normaliser=none is its ``normaliser``.
     """
 
     @functools.wraps(command)
@@ -140,6 +150,11 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     ) -> Any:
         from exporter.options import ReadOptions, WriteOptions, compile_options
 
+        if _WITHOUT_NORMALISER in values:
+            if rest.get("normaliser") is not None:
+                raise UsageError(f"--normaliser and --set {_WITHOUT_NORMALISER}", fix="give one of them")
+            rest["normaliser"] = _WITHOUT_NORMALISER.partition("=")[2]
+            values = [v for v in values if v != _WITHOUT_NORMALISER]
         read = ReadOptions(
             brain=brain, inputs=pairs(inputs, "--input"), outputs=pairs(outputs, "--output"), values=_numbers(values)
         )

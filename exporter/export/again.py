@@ -15,7 +15,7 @@ from converters.formats.bundle.embed import runnable
 from converters.formats.frozen_graph.writer import frozen
 from converters.formats.registry import WRITTEN
 from converters.formats.saved_model.writer import signatures_of
-from converters.formats.source import OriginalRun, ReadOptions
+from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
@@ -228,7 +228,10 @@ def _source_of(source: Path, contract: Contract, step: int | None, trust_source:
     """
     origin = contract.origin
     asked = origin.step if step is None else step
-    read = ReadOptions(asked, origin.sensors, trust_source, origin.goals, origin.activation)
+    normaliser = origin.normaliser
+    if normaliser not in (None, NO_NORMALISER):  # a file's name: it is expected beside the source
+        normaliser = str(source.parent / normaliser)
+    read = ReadOptions(asked, origin.sensors, trust_source, origin.goals, origin.activation, normaliser)
     found = read_source(source, read)
     if found.sha256 != origin.sha256:
         raise BundleError(

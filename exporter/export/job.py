@@ -109,6 +109,7 @@ def contract_of(
         read.sensors,
         read.goals,
         read.activation,
+        None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
     tool = without_none(name="export-model", version=__version__, profile=profile, weights=weights, batch=batch)
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)

@@ -109,7 +109,7 @@ def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, s
         algorithm=_algorithm(compiled, family) if facts.algorithm is None else facts.algorithm or None,
         memory=_memory(compiled, inputs, outputs, feeds, notes),
         preprocess={
-            s.name: _preprocessing(facts.image_layout, highest_colour(compiled.graph, feeds[s.name]))
+            s.name: _preprocessing(facts.image_layout, int((s.distribution or {}).get("high", 1)))
             for s in inputs
             if s.role is Role.VISUAL
         },
@@ -129,7 +129,7 @@ def _renamed(labels: Mapping[str, Any], feeds: Mapping[str, str]) -> dict[str, A
 
 def _preprocessing(layout: str, highest: int) -> dict[str, object]:
     """What is done to a camera's image before it is fed."""
-    done = "divide by 255" if highest == 1 else "as they are: the policy divides by 255 itself"
+    done = "divide by 255" if highest == 1 else "as they are: the policy scales them itself"
     return {"layout": layout, "range": [0, highest], "from_bytes": done}
 
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 from converters.formats.format import Format, deferred
 
 if TYPE_CHECKING:
+    from converters.formats.stable_baselines3 import run_folder as _run_folder
     from converters.formats.stable_baselines3 import source as _source
 else:
-    (_source,) = deferred(__name__, "source")
+    _run_folder, _source = deferred(__name__, "run_folder", "source")
 
 FORMATS = (
     Format(
@@ -18,7 +19,15 @@ FORMATS = (
         sniff=lambda file: {"data", "policy.pth"} <= set(file.entries),
         marker="policy.pth",
         read=_source.read,
-        takes=frozenset({"activation"}),
+        takes=frozenset({"activation", "normaliser"}),
+        library="stable_baselines3",
+    ),
+    Format(
+        key="stable_baselines3_run",
+        label="a run's folder of Stable-Baselines3's zoo",
+        at=_run_folder.is_run,
+        members=_run_folder.members,
+        takes=frozenset({"step", "activation", "normaliser"}),
         library="stable_baselines3",
     ),
 )

@@ -7,13 +7,16 @@ disk; what its two entries may unfold to is bounded by the file.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from converters.files.fetch import Fetched
 from converters.files.file_probe import json_in
 from converters.files.torch_archive import Archive
 from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
-from converters.formats.source import ReadOptions, SourceModel
+from converters.formats.source import NO_NORMALISER, ReadOptions, SourceModel
+from converters.formats.stable_baselines3.run_folder import settings_that_normalise, statistics_beside
 from converters.trainers.registry import rebuild
 from converters.trainers.trainer import Saved
 from signatures.errors import DamagedFileError
@@ -22,6 +25,7 @@ _DATA, _POLICY = "data", "policy.pth"
 #: Stable-Baselines3 does not compress; a ZIP that was packed again shrinks JSON to a tenth, weights hardly.
 _MOST, _MOST_ADDED = 64, 64 << 20
 _COPY_AGAIN = "copy or download it again"
+_NORMALISED = "feed observations that are normalised as in training"
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -41,8 +45,28 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         raise DamagedFileError("its data is not JSON", why=str(error)[:200], fix=_COPY_AGAIN) from error
     if not isinstance(content, dict):
         raise DamagedFileError("its data is no JSON object", why="what was saved is one", fix=_COPY_AGAIN)
-    made = rebuild(Saved(given, Archive(policy), content, activation=options.activation))
-    return [SourceModel(made.graph, files, made.facts)]
+    statistics, notes = _statistics(given, options.normaliser)
+    beside = None if statistics is None else (statistics.name, given.bytes_of(statistics))
+    made = rebuild(Saved(given, Archive(policy), content, activation=options.activation, statistics=beside))
+    facts = replace(made.facts, notes=(*made.facts.notes, *notes))
+    return [SourceModel(made.graph, (*files, *([] if statistics is None else [statistics])), facts)]
+
+
+def _statistics(given: Fetched, wanted: str | None) -> tuple[Path | None, tuple[str, ...]]:
+    """Return the file with the statistics of the observations, and notes on what is missing or left out."""
+    if wanted not in (None, NO_NORMALISER):
+        return Path(wanted), ()
+    found = statistics_beside(given.path)
+    if wanted == NO_NORMALISER:
+        said = () if found is None else (f"{found.name} is left out (--set normaliser=none): {_NORMALISED}",)
+        return None, said
+    settings = settings_that_normalise(given) if found is None else None
+    if settings is None:
+        return found, ()
+    return None, (
+        f"{settings.name} says that it was trained behind VecNormalize, and there is no vecnormalize.pkl beside it: "
+        f"{_NORMALISED}, or give the file: --normaliser FILE",
+    )
 
 
 def _entries(data: bytes) -> list[bytes]:

@@ -23,6 +23,7 @@ from converters.trainers.pytorch.activations import named, told
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights, pytorch_alone
 from converters.trainers.stable_baselines3.layers import renormalised_mlp
+from converters.trainers.stable_baselines3.normaliser import Normaliser
 from converters.trainers.stable_baselines3.spaces import Space, space_of
 from signatures.errors import DamagedFileError, SourceError, UsageError
 from signatures.records import dataclass
@@ -62,15 +63,20 @@ class _Built:
     activation: Activation
     squashed: bool
     maskable: bool
+    normaliser: Normaliser | None = None
     roles: dict[str, Role] = field(default_factory=dict)
     outputs: dict[str, Role | None] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
 def to_graph(
-    data: Mapping[str, Any], archive: Archive, state: Mapping[Any, Any], activation: str | None
+    data: Mapping[str, Any],
+    archive: Archive,
+    state: Mapping[Any, Any],
+    activation: str | None,
+    normaliser: Normaliser | None,
 ) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it; ``activation`` is what the user names.
+    """The policy and what is known of it; ``activation`` is what the user names, ``normaliser`` what lies beside it.
 
     Raises SourceError for what is not built, DamagedFileError, UsageError.
     """
@@ -89,8 +95,11 @@ def to_graph(
         _activation(kwargs, family, activation),
         family.squashed or _flag(kwargs, "squash_output"),
         family.algorithm == "MaskablePPO",
+        normaliser,
     )
     observed = space_of(data, "observation_space")
+    if normaliser is not None:
+        normaliser.check(observed.keys() if isinstance(observed, Mapping) else None)
     _check_class(kwargs)
     family.build(made, observed)
     weights.check_all_read()
@@ -102,13 +111,9 @@ def to_graph(
         algorithm=algorithm,
         image_layout="NCHW",
         memory_layout=memory,
+        distributions={} if normaliser is None else normaliser.distributions(made.roles),
         outputs=made.outputs,
-        notes=(
-            pytorch_alone("Stable-Baselines3"),
-            "if it was trained behind VecNormalize, its statistics are in a file of their own (vecnormalize.pkl) and "
-            "not here: feed observations that are normalised as in training",
-            *made.notes,
-        ),
+        notes=(pytorch_alone("Stable-Baselines3"), *(normaliser.notes() if normaliser else ()), *made.notes),
     )
     return made.net.graph(), facts
 
@@ -214,6 +219,8 @@ def _encoded(made: _Built, key: str, space: Space, module: str) -> str:
             for c, n in zip(columns, space.counts, strict=True)
         ]
         return net.concat(hot, 1)
+    if made.normaliser is not None and key in made.normaliser.moments:
+        x = made.normaliser.apply(net, x, name, key, space.shape)
     if space.image and _flag(made.kwargs, "normalize_images", default=True):
         x = net.add("RealDiv", [x, net.floats(255)])
     if nature:
