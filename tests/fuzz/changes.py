@@ -224,6 +224,15 @@ def saved_zip(files: Files, random: Random) -> Files:
     return {"policy.zip": zipped(entries)}
 
 
+def statistics(files: Files, random: Random) -> Files:
+    """The pickle beside a saved model changed; the model itself stays."""
+    data = files["vecnormalize.pkl"]
+    changed = (
+        mutation.damaged(data, random) if random.random() < 0.1 else mutation.parts(_opcodes(data), random, _opcode)
+    )
+    return {**files, "vecnormalize.pkl": changed}
+
+
 def zipped(entries: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     """A ZIP archive, the same bytes for the same entries."""
     made = io.BytesIO()

@@ -225,6 +225,20 @@ def _saved_zips() -> list[Files]:
     return [{"policy.zip": f.read_bytes()} for f in sorted((FOLDER / "sb3_zip").glob("*.zip"))]
 
 
+def _normalised() -> list[Files]:
+    """Saved models with the pickle of VecNormalize beside them."""
+    from fixtures.sb3_zip import NORMALISED
+    from tests.stable_baselines3.saved_models import saved
+
+    found = []
+    for name in ("ppo_box", "a2c_discrete", "ppo_mixed"):
+        with tempfile.TemporaryDirectory() as folder:
+            model = saved(name, Path(folder)).read_bytes()
+        found.append({"policy.zip": model, "vecnormalize.pkl": (NORMALISED / f"{name}.pkl").read_bytes()})
+    older = sorted((NORMALISED / "versions").glob("*box*.pkl"))
+    return [*found, *({**found[0], "vecnormalize.pkl": f.read_bytes()} for f in older)]
+
+
 def _single_nn() -> list[Files]:
     return [{"policy.nn": data} for files in _artefacts("", ".nn") for data in files.values()]
 
@@ -258,6 +272,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), changes.tfjs)
     yield "layers model", Reader(_web_layers, changes.tfjs)
     yield "Stable-Baselines3", Reader(_saved_zips, changes.saved_zip, "policy.zip")
+    yield "VecNormalize", Reader(_normalised, changes.statistics, "policy.zip")
     yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
     yield "Keras", Reader(_keras, changes.keras_config, "policy.keras", takes="configuration")
     yield "recording", Reader(_recordings, changes.recording, takes="recording")
