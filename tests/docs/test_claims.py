@@ -110,3 +110,7 @@ def test_the_verdict_that_readme_shows_is_one_that_is_said() -> None:
     count = f"({len(defaults)} of {len(defaults)} formats)"
     said = f"PASSED: {', '.join(defaults)} {count} agree with the original in TensorFlow"
     assert said in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_changelog_is_short() -> None:
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 80
