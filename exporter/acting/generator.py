@@ -53,7 +53,7 @@ class Generator:
         branch has nothing that could be drawn.
         """
         draws = self.uniform((len(log_probs), len(branches)))
-        return _chosen(_columns(log_probs, branches), np.ascontiguousarray(draws.T)).T.astype(np.int64)
+        return _choose_by_weight(_columns(log_probs, branches), np.ascontiguousarray(draws.T)).T.astype(np.int64)
 
 
 def likeliest(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
@@ -87,7 +87,7 @@ def _largest(scores: np.ndarray) -> np.ndarray:
     return best
 
 
-def _chosen(scores: np.ndarray, draws: np.ndarray) -> np.ndarray:
+def _choose_by_weight(scores: np.ndarray, draws: np.ndarray) -> np.ndarray:
     """``accumulate`` adds one after the other, as policy.mjs does: a last bit may decide."""
     weights = np.exp(scores - _largest(scores))
     total = np.add.accumulate(weights)[-1]

@@ -115,7 +115,7 @@ class LoadedPolicy:
             self._check_plain()
         if seed is not None:
             self.seed(seed)
-        given = self._named(observations)
+        given = self._by_name(observations)
         special = {Role.MASKS: masks, Role.MEMORY_IN: memory, Role.PREV_ACTION: previous}
         for word, role in (("masks", Role.MASKS), ("memory", Role.MEMORY_IN), ("previous", Role.PREV_ACTION)):
             if special[role] is not None and not self.takes(role):
@@ -125,7 +125,7 @@ class LoadedPolicy:
         rows: int | None = None
         for spec in sorted(self.signature.inputs, key=lambda s: s.role not in OBSERVATIONS):
             if spec.role in OBSERVATIONS:
-                array = self._fitting(spec, self._scaled(spec, given.pop(spec.name)), rows)
+                array = self._fitting(spec, self._scale_bytes(spec, given.pop(spec.name)), rows)
                 check_ids(spec, array)
                 rows = len(array)
             elif spec.role is Role.NOISE:
@@ -158,7 +158,7 @@ class LoadedPolicy:
                     fix="export the policy without --for, or leave deterministic= out",
                 )
 
-    def _named(self, observations: npt.ArrayLike | Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
+    def _by_name(self, observations: npt.ArrayLike | Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         names = [s.name for s in self.signature.observations]
         known = ", ".join(names)
         if not isinstance(observations, Mapping):
@@ -203,7 +203,7 @@ class LoadedPolicy:
                 )
             start += size
 
-    def _scaled(self, spec: TensorSpec, value: npt.ArrayLike) -> npt.ArrayLike:
+    def _scale_bytes(self, spec: TensorSpec, value: npt.ArrayLike) -> npt.ArrayLike:
         """Bytes of an image as the numbers that the policy takes; what is no image or no bytes, as it is."""
         wanted = self.signature.preprocess.get(spec.name, {}).get("range")
         if spec.role is not Role.VISUAL or wanted is None or getattr(value, "dtype", None) != np.uint8:
@@ -295,7 +295,7 @@ class Agent:
         count = next((len(a) for a in (last.continuous, last.discrete) if a is not None), 0)
         if ((rows < 0) | (rows >= count)).any():
             raise UsageError(f"there is no agent {agents}", fix=f"they are numbered 0 to {count - 1}")
-        self._last = replace(last, memory=_cleared(last.memory, rows), discrete=_cleared(last.discrete, rows))
+        self._last = replace(last, memory=_clear_rows(last.memory, rows), discrete=_clear_rows(last.discrete, rows))
 
     def decide(
         self,
@@ -318,7 +318,7 @@ class Agent:
         return self._last
 
 
-def _cleared(array: Array | None, rows: Array) -> Array | None:
+def _clear_rows(array: Array | None, rows: Array) -> Array | None:
     """A copy with these rows zero, as an episode begins."""
     if array is None:
         return None

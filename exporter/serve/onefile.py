@@ -28,7 +28,7 @@ def one_file(site: Mapping[str, bytes]) -> bytes:
     bundled = "\n".join(_as_function(name, _without_comments(site[name].decode())) for name in modules_of(site))
     script = f'"use strict";\n{bundled}'
     style = _without_comments(site["page.css"].decode())
-    files = {name: _embedded(name, data) for name, data in sorted(site.items()) if PurePosixPath(name).suffix in DATA}
+    files = {name: _embed(name, data) for name, data in sorted(site.items()) if PurePosixPath(name).suffix in DATA}
     held = _as_json(files).replace("<", "\\u003c")
     icon = f"data:image/svg+xml;base64,{base64.b64encode(site['icon.svg']).decode()}"
     policy = (
@@ -49,23 +49,23 @@ def one_file(site: Mapping[str, bytes]) -> bytes:
     return page.encode()
 
 
-def _embedded(name: str, data: bytes) -> object:
+def _embed(name: str, data: bytes) -> object:
     if not name.endswith(".json"):
         return base64.b64encode(data).decode()
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise _damaged(f"{name} is no JSON", str(error)[:200]) from error
+        raise _damaged_error(f"{name} is no JSON", str(error)[:200]) from error
 
 
 def _as_json(files: Mapping[str, object]) -> str:
     try:
         return json.dumps(files, separators=(",", ":"), allow_nan=False)
     except ValueError as error:
-        raise _damaged("a number in its files is not finite", "no browser reads such JSON") from error
+        raise _damaged_error("a number in its files is not finite", "no browser reads such JSON") from error
 
 
-def _damaged(what: str, why: str) -> DamagedFileError:
+def _damaged_error(what: str, why: str) -> DamagedFileError:
     return DamagedFileError(what, why=why, fix="export the policy again")
 
 
@@ -82,7 +82,7 @@ def modules_of(site: Mapping[str, bytes]) -> list[str]:
             return
         done[name] = None  # a circle would find this, and its functions are not made yet
         for _, path in _IMPORT.findall(site[name].decode()):
-            visit(_beside(name, path))
+            visit(_resolve_path(name, path))
         del done[name]
         done[name] = None
 
@@ -91,12 +91,12 @@ def modules_of(site: Mapping[str, bytes]) -> list[str]:
 
 
 def _as_function(name: str, text: str) -> str:
-    def taken(found: re.Match[str]) -> str:
+    def import_line(found: re.Match[str]) -> str:
         names = re.sub(r" as ", ": ", " ".join(found[1].split()))
-        return f"const {{ {names} }} = {_variable(_beside(name, found[2]))};"
+        return f"const {{ {names} }} = {_variable(_resolve_path(name, found[2]))};"
 
     exported = _EXPORT.findall(text)
-    body = _EXPORT.sub("", _IMPORT.sub(taken, text))
+    body = _EXPORT.sub("", _IMPORT.sub(import_line, text))
     assert not re.search(r"^(?:import|export)\b", body, re.M), name
     assert "</script" not in body and "<!--" not in body, name
     return f"const {_variable(name)} = (() => {{\n{body}return {{ {', '.join(exported)} }};\n}})();"
@@ -106,7 +106,7 @@ def _variable(name: str) -> str:
     return "m_" + re.sub(r"\W", "_", name)
 
 
-def _beside(name: str, path: str) -> str:
+def _resolve_path(name: str, path: str) -> str:
     """What a module means by a relative path: ``views/a.mjs`` and ``../b.mjs`` are ``b.mjs``."""
     return posixpath.normpath(posixpath.join(posixpath.dirname(name), path))
 

@@ -41,7 +41,7 @@ class Scene:
         )
 
     @property
-    def wanted(self) -> str:
+    def shapes_text(self) -> str:
         """The shapes, for an error."""
         does = f"{self.continuous} continuous actions" if self.continuous else f"branches {list(self.branches)}"
         return f"{self.observations} observations, {does}"
@@ -72,7 +72,7 @@ def scene_of(name: str, signature: PolicySignature, asked: str = AUTO) -> Scene 
     if found is None:
         raise UsageError(
             f"--scene {asked}: the policy does not fit the environment",
-            why=f"it takes {' or '.join(s.wanted for s in named)}",
+            why=f"it takes {' or '.join(s.shapes_text for s in named)}",
             fix="leave --scene out, or --scene none for the panel",
         )
     return found

@@ -109,7 +109,7 @@ def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
 
 def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]]:
     """(all files but those of npm packages and site.json, what site.json says of the policy)."""
-    policy = _checked(folder)
+    policy = _open_checked(folder)
     found = scene_of(policy.name, policy.signature, scene)
     opponent = None if found is None or found.side is None else _opponent(policy, found)
     own = sorted(path for path in PAGE.rglob("*") if path.is_file() and path.suffix in TYPES)
@@ -204,7 +204,7 @@ def _is_site(place: Path) -> bool:
     return isinstance(content, dict) and content.get("made_by") == MADE_BY
 
 
-def _checked(folder: Path) -> Bundle:
+def _open_checked(folder: Path) -> Bundle:
     found = Bundle.open(folder)
     found.verify_hashes()
     for key, why in (
@@ -233,7 +233,7 @@ def _opponent(first: Bundle, scene: Scene) -> Bundle | None:
     for other in other_side(first.name):
         beside = first.folder.resolve().parent / other
         if (beside / POLICY).is_file():
-            second = _checked(beside)
+            second = _open_checked(beside)
             found = scene_of(other, second.signature)
             if found is not None and found.id == scene.id and found.side != scene.side:
                 return second

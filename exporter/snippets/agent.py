@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from exporter.snippets.contract import Bundle, branch_lines, class_name, filled, folded, numbered
+from exporter.snippets.contract import Bundle, branch_lines, class_name, fill_template, number_names, wrap_items
 from signatures.roles import SENSOR_ORDER, Role
 from signatures.spec import TensorSpec
 
@@ -18,12 +18,12 @@ def agent(bundle: Bundle) -> str:
     sensors = _sensors(bundle)
     vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR and len(s.shape) < 3), None)
     received, own = _actions(bundle)
-    return filled(
+    return fill_template(
         "agent.cs",
         type=_class(bundle.name),
         head="\n".join(_head(bundle, sensors, vector)),
         observations="" if vector is None else _observations(bundle, vector),
-        masks=filled("agent_masks.cs") if bundle.signature.branches else "",
+        masks=fill_template("agent_masks.cs") if bundle.signature.branches else "",
         received=_inside(received),
         own=_inside(own),
     )
@@ -97,8 +97,8 @@ def _component(bundle: Bundle, spec: TensorSpec) -> str:
 def _observations(bundle: Bundle, spec: TensorSpec) -> str:
     names = bundle.signature.labels.get("observations", {}).get(spec.name, [])
     size = spec.shape[-1] or 0
-    lines = folded(f"{size} numbers, in the order of training", numbered(names))
-    return filled("agent_observations.cs", comments=_inside([f"// {line}" for line in lines]), size=str(size))
+    lines = wrap_items(f"{size} numbers, in the order of training", number_names(names))
+    return fill_template("agent_observations.cs", comments=_inside([f"// {line}" for line in lines]), size=str(size))
 
 
 def _continuous(bundle: Bundle) -> int:
@@ -111,7 +111,7 @@ def _actions(bundle: Bundle) -> tuple[list[str], list[str]]:
     received, own = [], []
     if count:
         labels = bundle.signature.labels.get("actions", [])
-        received += [f"// {line}" for line in folded(f"{count} continuous actions", numbered(labels))]
+        received += [f"// {line}" for line in wrap_items(f"{count} continuous actions", number_names(labels))]
         received.append("var continuous = actions.ContinuousActions;")
         own.append("var continuous = actionsOut.ContinuousActions;")
         own += [f"continuous[{i}] = 0f;" for i in range(min(count, 8))]

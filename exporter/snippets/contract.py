@@ -79,7 +79,7 @@ class Bundle:
         return next((s for s in self.signature.inputs if s.role is Role.PREV_ACTION), None)
 
     @property
-    def kept(self) -> dict[str, str]:
+    def kept_variables(self) -> dict[str, str]:
         """Input → the variable that a snippet keeps for it from step to step."""
         kept = {} if self.memory is None else {self.memory[0].name: "memory"}
         return kept if self.previous is None else {**kept, self.previous.name: "previous"}
@@ -87,7 +87,9 @@ class Bundle:
     def beginnings(self, line: str, value: Callable[[TensorSpec], str]) -> list[str]:
         """What declares the variables of ``kept``; ``line`` is given a variable, its first value and a comment."""
         says = {"memory": "the start of an episode; a row per agent", "previous": "no action yet"}
-        return [line.format(name, value(self.signature.input(key)), says[name]) for key, name in self.kept.items()]
+        return [
+            line.format(name, value(self.signature.input(key)), says[name]) for key, name in self.kept_variables.items()
+        ]
 
     @property
     def heads(self) -> tuple[TensorSpec, ...]:
@@ -105,12 +107,12 @@ class Bundle:
         return ["action"] if len(self.heads) == 1 else self.kinds
 
     @property
-    def fetched(self) -> dict[str, TensorSpec]:
+    def fetched_outputs(self) -> dict[str, TensorSpec]:
         """Variable → the output without chance (a draw from log-probabilities is for who knows how)."""
         return {name: self.plain(head) for name, head in zip(self.variables, self.heads, strict=True)}
 
     @property
-    def taken(self) -> str:
+    def discrete_variable(self) -> str:
         """The variable with the discrete actions, which the next step may be fed."""
         return "action" if len(self.heads) == 1 else "discrete"
 
@@ -164,13 +166,15 @@ def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
     elif spec.role is Role.VECTOR and len(spec.shape) > 2:
         text = "numbers along several axes (a history, a board)"
     names = signature.labels.get("observations", {}).get(spec.name, [])
-    return folded(f"{spec.name}: {text}", numbered(names))
+    return wrap_items(f"{spec.name}: {text}", number_names(names))
 
 
 def action_meaning(bundle: Bundle, head: TensorSpec) -> list[str]:
     """Comment lines on an action."""
     if head.is_continuous:
-        return folded(f"{head.shape[-1]} continuous actions", numbered(bundle.signature.labels.get("actions", [])))
+        return wrap_items(
+            f"{head.shape[-1]} continuous actions", number_names(bundle.signature.labels.get("actions", []))
+        )
     return branch_lines(bundle)
 
 
@@ -179,17 +183,17 @@ def branch_lines(bundle: Bundle) -> list[str]:
     labels = bundle.signature.labels.get("branches", [])
     lines: list[str] = []
     for i, size in enumerate(bundle.signature.branches):
-        names = numbered(labels[i]) if i < len(labels) else []
-        lines += folded(f"branch {i}: {size} actions", names)
+        names = number_names(labels[i]) if i < len(labels) else []
+        lines += wrap_items(f"branch {i}: {size} actions", names)
     return lines
 
 
-def numbered(names: list[str]) -> list[str]:
+def number_names(names: list[str]) -> list[str]:
     """``["0 left", "1 right"]``."""
     return [f"{i} {name}" for i, name in enumerate(names)]
 
 
-def folded(head: str, items: list[str]) -> list[str]:
+def wrap_items(head: str, items: list[str]) -> list[str]:
     """``head: item, item`` on lines of at most ``WIDTH`` characters (longer where one item is)."""
     if not items:
         return [head]
@@ -204,7 +208,7 @@ def folded(head: str, items: list[str]) -> list[str]:
     return [*lines, line]
 
 
-def quoted(text: str) -> str:
+def string_literal(text: str) -> str:
     """A string literal of Python, JavaScript, C# and JSON alike, also inside of a page's script.
 
     Characters beyond U+FFFF stand as they are: as a pair of escapes they would be two characters in Python.
@@ -227,7 +231,7 @@ def class_name(name: str) -> str:
     return f"{words}Policy" if words[0].isalpha() else f"Policy{words}"
 
 
-def filled(template: str, /, **parts: str) -> str:
+def fill_template(template: str, /, **parts: str) -> str:
     """The frame called ``template`` with its parts put in; it ends with one line break."""
     text = Template((_FRAMES / f"{template}.tmpl").read_text(encoding="utf-8")).substitute(parts)
     return text.rstrip("\n") + "\n"

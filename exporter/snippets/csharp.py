@@ -9,10 +9,10 @@ from exporter.snippets.contract import (
     class_name,
     example_shape,
     example_size,
-    filled,
+    fill_template,
     identifier,
     meaning,
-    quoted,
+    string_literal,
 )
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -42,23 +42,25 @@ def tensorflowsharp(bundle: Bundle) -> str:
     memory, previous = bundle.memory, bundle.previous
     for spec in bundle.signature.inputs:
         lines += [f"// {line}" for line in meaning(bundle, spec)]
-        lines.append(f"runner.AddInput(graph[{quoted(spec.name)}][0], {bundle.kept.get(spec.name) or _array(spec)});")
-    fetched = bundle.fetched
+        lines.append(
+            f"runner.AddInput(graph[{string_literal(spec.name)}][0], {bundle.kept_variables.get(spec.name) or _array(spec)});"
+        )
+    fetched = bundle.fetched_outputs
     outputs = [*fetched.values()] if memory is None else [*fetched.values(), bundle.signature.output(memory[1])]
-    lines += [f"runner.Fetch(graph[{quoted(spec.name)}][0]);" for spec in outputs]
+    lines += [f"runner.Fetch(graph[{string_literal(spec.name)}][0]);" for spec in outputs]
     lines.append("TFTensor[] output = runner.Run();")
     for i, (name, spec) in enumerate(fetched.items()):
         lines += [f"// {line}" for line in action_meaning(bundle, bundle.heads[i])]
         chance = bundle.heads[i].name
-        hint = "" if chance == spec.name else f"  // deterministic; drawn: graph[{quoted(chance)}]"
+        hint = "" if chance == spec.name else f"  // deterministic; drawn: graph[{string_literal(chance)}]"
         lines.append(f"var {name} = ({_kind(spec)})output[{i}].GetValue();{hint}")
     if memory is not None:
         lines.append(f"memory = ({_kind(bundle.signature.output(memory[1]))})output[{len(fetched)}].GetValue();")
     if previous is not None:
         place = "[branch]" if len(previous.shape) == 1 else "[0, branch]"
         lines += [
-            f"for (var branch = 0; branch < {bundle.taken}.GetLength(1); branch++)",
-            f"    previous{place} = ({_TYPES[previous.dtype]}){bundle.taken}[0, branch];",
+            f"for (var branch = 0; branch < {bundle.discrete_variable}.GetLength(1); branch++)",
+            f"    previous{place} = ({_TYPES[previous.dtype]}){bundle.discrete_variable}[0, branch];",
         ]
     lines += [
         f"for (var i = 0; i < {name}.GetLength(1); i++)\n    Console.WriteLine({name}[0, i]);" for name in fetched
@@ -67,8 +69,11 @@ def tensorflowsharp(bundle: Bundle) -> str:
     if bundle.remembers:
         lines = [f"for (var step = 0; step < {STEPS}; step++)", "{", *(f"    {line}" for line in lines), "}"]
     play = "\n".join(f"            {line}" for line in [*before, *lines])
-    return filled(
-        "tensorflowsharp.cs", type=class_name(bundle.name), path=quoted(bundle.path(f"{bundle.name}.bytes")), play=play
+    return fill_template(
+        "tensorflowsharp.cs",
+        type=class_name(bundle.name),
+        path=string_literal(bundle.path(f"{bundle.name}.bytes")),
+        play=play,
     )
 
 
@@ -92,7 +97,7 @@ def _array(spec: TensorSpec) -> str:
 
 def inference_engine(bundle: Bundle) -> str:
     """ModelLoader and Worker. The engine has float and int tensors; int64 becomes int."""
-    memory, previous, kept = bundle.memory, bundle.previous, bundle.kept
+    memory, previous, kept = bundle.memory, bundle.previous, bundle.kept_variables
     fields = []
     if memory is not None:
         fields.append(f"    float[] memory = new float[{example_size(memory[0])}];  // the start of an episode")
@@ -111,9 +116,9 @@ def inference_engine(bundle: Bundle) -> str:
             body.append(f"using var {tensor} = new Tensor<{kind}>({shape}, {variable});")
             if spec.name not in kept:
                 parameters.append(f"{kind}[] {variable}")
-        body.append(f"worker.SetInput({quoted(spec.name)}, {tensor});")
+        body.append(f"worker.SetInput({string_literal(spec.name)}, {tensor});")
     body.append("worker.Schedule();")
-    fetched = bundle.fetched
+    fetched = bundle.fetched_outputs
     for (name, spec), head in zip(fetched.items(), bundle.heads, strict=True):
         body += [f"// {line}" for line in action_meaning(bundle, head)]
         body.append(_read(spec, f"{name}Tensor"))
@@ -122,7 +127,7 @@ def inference_engine(bundle: Bundle) -> str:
         body.append(_read(bundle.signature.output(memory[1]), "memoryTensor"))
         body.append("memory = memoryTensor.DownloadToArray();")
     if previous is not None:
-        body.append(f"previous = {bundle.taken};")
+        body.append(f"previous = {bundle.discrete_variable};")
     kinds = [f"{'float' if s.dtype == 'float32' else 'int'}[]" for s in fetched.values()]
     if len(fetched) == 1:
         result, answer = kinds[0], next(iter(fetched))
@@ -134,7 +139,7 @@ def inference_engine(bundle: Bundle) -> str:
     if kept:
         reset = [f"    {line.split('  //')[0].strip().split(' ', 1)[1]}" for line in fields]
         methods += ["public void BeginEpisode()", "{", *reset, "}", ""]
-    return filled(
+    return fill_template(
         "inference_engine.cs",
         type=class_name(bundle.name),
         file=f"{bundle.name}.onnx",
@@ -145,4 +150,6 @@ def inference_engine(bundle: Bundle) -> str:
 
 def _read(spec: TensorSpec, variable: str) -> str:
     kind = "float" if spec.dtype == "float32" else "int"
-    return f"using var {variable} = (worker.PeekOutput({quoted(spec.name)}) as Tensor<{kind}>).ReadbackAndClone();"
+    return (
+        f"using var {variable} = (worker.PeekOutput({string_literal(spec.name)}) as Tensor<{kind}>).ReadbackAndClone();"
+    )

@@ -14,9 +14,9 @@ from exporter.snippets.contract import (
     action_meaning,
     example_shape,
     example_size,
-    filled,
+    fill_template,
     meaning,
-    quoted,
+    string_literal,
 )
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -66,12 +66,12 @@ def plain_ort(bundle: Bundle) -> str:
 
 
 def _page(bundle: Bundle, runtime: tuple[str, str], frame: str, model: str, play: str) -> str:
-    code = filled(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play)
-    return filled("page.html", name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
+    code = fill_template(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play)
+    return fill_template("page.html", name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
 
 
 def _url(bundle: Bundle, relative: str) -> str:
-    return quoted(f"./{bundle.name}/{relative}")
+    return string_literal(f"./{bundle.name}/{relative}")
 
 
 def _agents(bundle: Bundle) -> str:
@@ -94,27 +94,27 @@ def _agents(bundle: Bundle) -> str:
         "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): no draws",
         "const agents = policy.agent();",
     ]
-    return "\n".join([*start, *_looped(bundle, lines)])
+    return "\n".join([*start, *_loop_lines(bundle, lines)])
 
 
 def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: str) -> str:
     """The lines from feeds to actions, with what goes from step to step; ``read`` takes a variable and an output."""
     lines = ["const feeds = {"]
     for spec in bundle.signature.inputs:
-        lines += _entry(bundle, spec, bundle.kept.get(spec.name) or value(spec))
+        lines += _entry(bundle, spec, bundle.kept_variables.get(spec.name) or value(spec))
     lines += ["};", run]
-    lines += [read.format(name, quoted(output.name)) for name, output in bundle.fetched.items()]
+    lines += [read.format(name, string_literal(output.name)) for name, output in bundle.fetched_outputs.items()]
     before = bundle.beginnings("let {} = {};  // {}", value)
     memory, previous = bundle.memory, bundle.previous
     if memory is not None:
-        lines.append(f"memory = outputs[{quoted(memory[1])}];")
+        lines.append(f"memory = outputs[{string_literal(memory[1])}];")
     if previous is not None:
-        lines.append(_again(previous, bundle.taken, tensorflow=value is _tf_value))
+        lines.append(_again(previous, bundle.discrete_variable, tensorflow=value is _tf_value))
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
-    chance = [f"outputs[{quoted(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]
+    chance = [f"outputs[{string_literal(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]
     hint = f"  // deterministic; drawn: {', '.join(chance)}" if chance else ""
-    lines.append(f"console.log({', '.join(bundle.fetched)});{hint}")
-    return "\n".join([*before, *_looped(bundle, lines)])
+    lines.append(f"console.log({', '.join(bundle.fetched_outputs)});{hint}")
+    return "\n".join([*before, *_loop_lines(bundle, lines)])
 
 
 def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:
@@ -122,17 +122,17 @@ def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:
     if tensorflow:
         return f'previous = tf.tensor({taken}.flat(), {shape}, "int32");'
     values = f"{taken}.map(BigInt)" if spec.dtype in ("int64", "uint64") else taken
-    return f"previous = new ort.Tensor({quoted(spec.dtype)}, {_ARRAYS[spec.dtype]}.from({values}), {shape});"
+    return f"previous = new ort.Tensor({string_literal(spec.dtype)}, {_ARRAYS[spec.dtype]}.from({values}), {shape});"
 
 
-def _looped(bundle: Bundle, lines: list[str]) -> list[str]:
+def _loop_lines(bundle: Bundle, lines: list[str]) -> list[str]:
     if not bundle.remembers:
         return lines
     return [f"for (let step = 0; step < {STEPS}; step++) {{", *(f"  {line}" for line in lines), "}"]
 
 
 def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
-    key = spec.name if re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", spec.name) else quoted(spec.name)
+    key = spec.name if re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", spec.name) else string_literal(spec.name)
     return [*_comment(bundle, spec), f"  {key}: {value},"]
 
 
@@ -148,12 +148,12 @@ def _safe(comment: str) -> str:
 def _tf_value(spec: TensorSpec) -> str:
     maker = "ones" if spec.role is Role.MASKS else "zeros"
     dtype = "int32" if spec.dtype == "int64" else spec.dtype
-    return f"tf.{maker}({list(example_shape(spec))}{'' if dtype == 'float32' else f', {quoted(dtype)}'})"
+    return f"tf.{maker}({list(example_shape(spec))}{'' if dtype == 'float32' else f', {string_literal(dtype)}'})"
 
 
 def _ort_value(spec: TensorSpec) -> str:
     shape = example_shape(spec)
-    return f"new ort.Tensor({quoted(spec.dtype)}, {_flat(spec, _ARRAYS[spec.dtype])}, {list(shape)})"
+    return f"new ort.Tensor({string_literal(spec.dtype)}, {_flat(spec, _ARRAYS[spec.dtype])}, {list(shape)})"
 
 
 def _flat(spec: TensorSpec, kind: str | None = None) -> str:

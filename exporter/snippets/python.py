@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from exporter.snippets.contract import STEPS, Bundle, action_meaning, example_shape, filled, meaning, quoted
+from exporter.snippets.contract import (
+    STEPS,
+    Bundle,
+    action_meaning,
+    example_shape,
+    fill_template,
+    meaning,
+    string_literal,
+)
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
@@ -10,8 +18,10 @@ from signatures.spec import TensorSpec
 def onnxruntime(bundle: Bundle) -> str:
     """The ONNX in onnxruntime."""
     run = "dict(zip(names, session.run(names, feeds)))"
-    return filled(
-        "onnxruntime.py", path=quoted(bundle.path(f"{bundle.name}.onnx")), play=play(bundle, [f"outputs = {run}"])
+    return fill_template(
+        "onnxruntime.py",
+        path=string_literal(bundle.path(f"{bundle.name}.onnx")),
+        play=play(bundle, [f"outputs = {run}"]),
     )
 
 
@@ -21,7 +31,7 @@ def saved_model(bundle: Bundle) -> str:
         "answer = policy(**{name: tf.constant(value) for name, value in feeds.items()})",
         "outputs = {name: tensor.numpy() for name, tensor in answer.items()}",
     ]
-    return filled("saved_model.py", path=quoted(bundle.path("saved_model")), play=play(bundle, run))
+    return fill_template("saved_model.py", path=string_literal(bundle.path("saved_model")), play=play(bundle, run))
 
 
 def load_policy(bundle: Bundle) -> str:
@@ -44,7 +54,7 @@ def load_policy(bundle: Bundle) -> str:
     for head in bundle.heads:
         lines += [f"# {text}" for text in action_meaning(bundle, head)]
     lines.append(f"print({', '.join(f'decision.{kind}' for kind in bundle.kinds)})")
-    return filled("load_policy.py", path=quoted(bundle.folder.as_posix()), play=looped(bundle, lines))
+    return fill_template("load_policy.py", path=string_literal(bundle.folder.as_posix()), play=loop_text(bundle, lines))
 
 
 def play(bundle: Bundle, run: list[str]) -> str:
@@ -54,20 +64,20 @@ def play(bundle: Bundle, run: list[str]) -> str:
     memory, previous = bundle.memory, bundle.previous
     lines = ["feeds = {"]
     for spec in bundle.signature.inputs:
-        lines += _entry(bundle, spec, _fed(bundle, spec))
+        lines += _entry(bundle, spec, _feed_expression(bundle, spec))
     lines += ["}", *run]
     for variable, head in zip(bundle.variables, bundle.heads, strict=True):
         lines += _action(bundle, variable, head)
     if memory is not None:
-        lines.append(f"memory = outputs[{quoted(memory[1])}]")
+        lines.append(f"memory = outputs[{string_literal(memory[1])}]")
     if previous is not None:
         shape = ".reshape(-1)" if len(previous.shape) == 1 else ""
-        lines.append(f"previous = {bundle.taken}{shape}.astype({_dtype(previous)})")
+        lines.append(f"previous = {bundle.discrete_variable}{shape}.astype({_dtype(previous)})")
     lines.append(f"print({', '.join(bundle.variables)})")
-    return "\n".join([*before, looped(bundle, lines)])
+    return "\n".join([*before, loop_text(bundle, lines)])
 
 
-def looped(bundle: Bundle, lines: list[str]) -> str:
+def loop_text(bundle: Bundle, lines: list[str]) -> str:
     """``lines`` as they are, or in a loop of a few steps where the policy remembers."""
     if not bundle.remembers:
         return "\n".join([*lines, ""])
@@ -81,13 +91,13 @@ def array(spec: TensorSpec) -> str:
 
 
 def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
-    return [*(f"    # {text}" for text in meaning(bundle, spec)), f"    {quoted(spec.name)}: {value},"]
+    return [*(f"    # {text}" for text in meaning(bundle, spec)), f"    {string_literal(spec.name)}: {value},"]
 
 
-def _fed(bundle: Bundle, spec: TensorSpec) -> str:
+def _feed_expression(bundle: Bundle, spec: TensorSpec) -> str:
     if spec.role is Role.NOISE:
         return f"rng.standard_normal({_shape(example_shape(spec))}, {_dtype(spec)})"
-    return bundle.kept.get(spec.name) or array(spec)
+    return bundle.kept_variables.get(spec.name) or array(spec)
 
 
 def _draws(bundle: Bundle) -> bool:
@@ -98,8 +108,8 @@ def _action(bundle: Bundle, variable: str, head: TensorSpec) -> list[str]:
     plain = bundle.plain(head)
     lines = [f"# {text}" for text in action_meaning(bundle, head)]
     if plain != head:
-        lines.append(f"# deterministic: outputs[{quoted(plain.name)}]")
-    output = f"outputs[{quoted(head.name)}]"
+        lines.append(f"# deterministic: outputs[{string_literal(plain.name)}]")
+    output = f"outputs[{string_literal(head.name)}]"
     if head.role not in (Role.LOG_PROBS, Role.PROBS):
         return [*lines, f"{variable} = {output}"]
     scores = output if head.role is Role.LOG_PROBS else f"np.log({output})"

@@ -10,7 +10,7 @@ from typing import Any
 from converters.formats.format import Code, Format
 from converters.formats.registry import WRITTEN
 from exporter.snippets import agent, csharp, javascript, python, serving, unity
-from exporter.snippets.contract import Bundle, quoted
+from exporter.snippets.contract import Bundle, string_literal
 from signatures.errors import BundleError, UsageError
 from signatures.records import dataclass
 
@@ -44,13 +44,13 @@ TARGETS: tuple[Target, ...] = (
 )
 
 
-def _filled(found: Format, code: Code, bundle: Bundle) -> str:
-    return Template(code.text).substitute(path=quoted(bundle.path(found.main_of(bundle.name))))
+def _fill_code(found: Format, code: Code, bundle: Bundle) -> str:
+    return Template(code.text).substitute(path=string_literal(bundle.path(found.main_of(bundle.name))))
 
 
 # The snippets that formats bring themselves.
 TARGETS += tuple(
-    Target(code.name, code.title, code.language, (found.key,), partial(_filled, found, code))
+    Target(code.name, code.title, code.language, (found.key,), partial(_fill_code, found, code))
     for found in WRITTEN.values()
     for code in found.snippets
 )

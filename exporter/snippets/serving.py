@@ -11,7 +11,7 @@ import json
 import math
 from typing import Any
 
-from exporter.snippets.contract import Bundle, action_meaning, example_shape, filled, meaning, quoted
+from exporter.snippets.contract import Bundle, action_meaning, example_shape, fill_template, meaning, string_literal
 from exporter.snippets.python import play
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -22,7 +22,7 @@ _MOST_NUMBERS = 400
 
 def docker(bundle: Bundle) -> str:
     """The container."""
-    return filled("serving_docker.sh", folder=bundle.mount("saved_model"), name=bundle.name)
+    return fill_template("serving_docker.sh", folder=bundle.mount("saved_model"), name=bundle.name)
 
 
 def rest(bundle: Bundle) -> str:
@@ -34,27 +34,29 @@ def rest(bundle: Bundle) -> str:
     comments = "\n".join(f"# {line}" for line in texts)
     shapes = {s.name: example_shape(s)[1:] if rows else example_shape(s) for s in inputs}
     if sum(math.prod(shape) for shape in shapes.values()) <= _MOST_NUMBERS:
-        body = _body({s.name: _nested(_value(s), shapes[s.name]) for s in inputs}, rows)
-        return filled("serving_rest.sh", name=bundle.name, comments=comments, body=body)
-    calls = (f"{quoted(s.name)}: full({', '.join([repr(_value(s)), *map(str, shapes[s.name])])})" for s in inputs)
+        body = _body({s.name: _nested_list(_value(s), shapes[s.name]) for s in inputs}, rows)
+        return fill_template("serving_rest.sh", name=bundle.name, comments=comments, body=body)
+    calls = (
+        f"{string_literal(s.name)}: full({', '.join([repr(_value(s)), *map(str, shapes[s.name])])})" for s in inputs
+    )
     feeds = f"{{{', '.join(calls)}}}"
     given = f'"instances": [{feeds}]' if rows else f'"inputs": {feeds}'
     body = f'{{"signature_name": "serving_default", {given}}}'
-    return filled("serving_rest_large.sh", name=bundle.name, comments=comments, body=body)
+    return fill_template("serving_rest_large.sh", name=bundle.name, comments=comments, body=body)
 
 
 def grpc(bundle: Bundle) -> str:
     """A call from Python."""
     run = [
         "request = predict_pb2.PredictRequest()",
-        f"request.model_spec.name = {quoted(bundle.name)}",
+        f"request.model_spec.name = {string_literal(bundle.name)}",
         'request.model_spec.signature_name = "serving_default"',
         "for name, value in feeds.items():",
         "    request.inputs[name].CopyFrom(tf.make_tensor_proto(value))",
         "answer = stub.Predict(request, 10.0)  # seconds",
         "outputs = {name: tf.make_ndarray(tensor) for name, tensor in answer.outputs.items()}",
     ]
-    return filled("serving_grpc.py", play=play(bundle, run))
+    return fill_template("serving_grpc.py", play=play(bundle, run))
 
 
 def _body(feeds: dict[str, Any], rows: bool) -> str:
@@ -69,5 +71,5 @@ def _value(spec: TensorSpec) -> float | int | bool:
     return one if spec.dtype == "bool" else int(one) if spec.dtype.startswith(("int", "uint")) else float(one)
 
 
-def _nested(value: float, shape: tuple[int, ...]) -> Any:
-    return [_nested(value, shape[1:]) for _ in range(shape[0])] if shape else value
+def _nested_list(value: float, shape: tuple[int, ...]) -> Any:
+    return [_nested_list(value, shape[1:]) for _ in range(shape[0])] if shape else value

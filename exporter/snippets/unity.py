@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from exporter.snippets.contract import Bundle, branch_lines, numbered
+from exporter.snippets.contract import Bundle, branch_lines, number_names
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import TensorSpec
@@ -85,9 +85,9 @@ def _settings(bundle: Bundle, able: Sequence[Generation]) -> list[str]:
     width = max(len(name) for name, _ in rows)
     lines = [f"  {name.ljust(width)}  {value}" for name, value in rows]
     names = signature.labels.get("observations", {})
-    lines += [f"  {s.name}: {', '.join(numbered(names[s.name]))}" for s in vectors if s.name in names]
+    lines += [f"  {s.name}: {', '.join(number_names(names[s.name]))}" for s in vectors if s.name in names]
     if "actions" in signature.labels:
-        lines.append(f"  actions: {', '.join(numbered(signature.labels['actions']))}")
+        lines.append(f"  actions: {', '.join(number_names(signature.labels['actions']))}")
     return [*lines, *(f"  {line}" for line in branch_lines(bundle))]
 
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from exporter import export_model
-from exporter.snippets.contract import class_name, folded, identifier, read_bundle
+from exporter.snippets.contract import class_name, identifier, read_bundle, wrap_items
 from exporter.snippets.registry import snippets
 from fixtures import path as fixture
 from tests.commands import export_model as run
@@ -43,6 +43,6 @@ def test_names_for_code() -> None:
     assert class_name("own-names.v2") == "OwnNamesV2Policy"
     assert identifier("Brain/state") == "Brain_state"
     assert identifier("0") == "input_0"
-    lines = folded("state: numbers", [f"{i} {'x' * 20}" for i in range(12)])
+    lines = wrap_items("state: numbers", [f"{i} {'x' * 20}" for i in range(12)])
     assert len(lines) > 1
     assert max(map(len, lines)) <= 102

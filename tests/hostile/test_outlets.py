@@ -17,7 +17,7 @@ import exporter
 from converters.runtimes.javascript.node import node_executable
 from converters.runtimes.pool import RuntimePool
 from exporter.cli.terminal import say, say_json, say_lines
-from exporter.snippets.contract import quoted
+from exporter.snippets.contract import string_literal
 from fixtures import path as fixture
 from signatures.errors import SourceError
 from tests.commands import Ran, export_model
@@ -146,7 +146,7 @@ def test_there_is_one_way_to_the_terminal() -> None:
 
 @pytest.mark.parametrize("text", [NAME, "😀 \U0001f600", "`${x}`", "a\\b\"c'd", "</script>", "-->", "\u2029"])
 def test_a_quoted_text_is_itself_in_python_json_and_javascript(text: str) -> None:
-    literal = quoted(text)
+    literal = string_literal(text)
     assert ast.literal_eval(literal) == json.loads(literal) == text
     assert not {*"<>&\n\u2028\u2029"} & {*literal}
     program = node_executable()
