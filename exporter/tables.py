@@ -78,7 +78,7 @@ def paragraph(text: str, first: str = "", rest: str = "") -> str:
     )
 
 
-def typed(*words: object) -> str:
+def command_text(*words: object) -> str:
     """A call of this program as a shell takes it: what has spaces or quotes is quoted."""
     return shlex.join(["export-model", *map(str, words)])
 
@@ -94,7 +94,7 @@ def size_text(count: int) -> str:
     return f"{count} B" if count < 1000 else f"{count / 1000:.1f} kB" if count < 1_000_000 else f"{count / 1e6:.1f} MB"
 
 
-def sized(kind: str, sizes: Mapping[str, int], whole: Mapping[str, int]) -> str:
+def size_with_original(kind: str, sizes: Mapping[str, int], whole: Mapping[str, int]) -> str:
     """The size of a format, and what it would be with weights in float32 where these are kept in less."""
     text = size_text(sizes[kind]) if kind in sizes else ""
     return f"{text} of {size_text(whole[kind])}" if kind in whole else text

@@ -68,7 +68,7 @@ def compare_command(
             progress=progress,
             understood=read.append,
         )
-    console.verified(report, ", ".join(map(path_text, candidates)))
+    console.report_policy(report, ", ".join(map(path_text, candidates)))
     console.json({"reports": [report.to_dict()]})
     command = ("compare", *map(path_text, (reference, *candidates)), *as_given(JUDGING))
     console.write_reports(

@@ -119,9 +119,9 @@ class Console:
         if result.report is not None:
             self._report(result.report)
             return
-        from exporter.tables import sized, table
+        from exporter.tables import size_with_original, table
 
-        rows = [[kind, sized(kind, result.sizes, result.whole_sizes)] for kind in result.sizes]
+        rows = [[kind, size_with_original(kind, result.sizes, result.whole_sizes)] for kind in result.sizes]
         say_lines(table(("format", "size"), rows))
         say("NOT VERIFIED: --verify none")
 
@@ -132,7 +132,7 @@ class Console:
         if not self._silent and not self.quiet:
             say(summary)
 
-    def verified(self, report: ParityReport, place: object) -> None:
+    def report_policy(self, report: ParityReport, place: object) -> None:
         """One policy that was verified."""
         if self._silent or (self.quiet and report.passed is not False):
             return
@@ -198,11 +198,11 @@ class Console:
             last = results[-1]
             files = ", ".join(sorted(p.name for p in last.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
             from converters.consumers.profiles import profile as known
-            from exporter.tables import typed
+            from exporter.tables import command_text
 
             wanted = known(profile)
             say(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
-            say(f"next: {typed('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
+            say(f"next: {command_text('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         ours = results[-1].policy.signature.family.startswith("ML-Agents")
         if ours and names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
@@ -217,7 +217,7 @@ class Console:
 
 def _next(results: Sequence[ExportResult]) -> str:
     """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
-    from exporter.tables import hint, typed
+    from exporter.tables import command_text, hint
 
     last = results[-1]
     if len(results) > 1:
@@ -225,23 +225,23 @@ def _next(results: Sequence[ExportResult]) -> str:
 
         last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), last)
     if last.report is None:
-        return hint(typed("verify", last.folder), "nothing was compared yet")
+        return hint(command_text("verify", last.folder), "nothing was compared yet")
     if last.report.passed is None:
         from exporter.reports.summary import to_verify
 
         install = to_verify(last.report)
         if install is not None:
-            return hint(install, f"then: {typed('verify', last.folder)}")
+            return hint(install, f"then: {command_text('verify', last.folder)}")
     if {"tfjs", "bytes"} <= {*last.sizes}:
-        return hint(typed("serve", last.folder), "see it act, in a browser")
-    return hint(typed("snippets", last.folder), "code for Python, JavaScript, C#, Unity, TF Serving")
+        return hint(command_text("serve", last.folder), "see it act, in a browser")
+    return hint(command_text("snippets", last.folder), "code for Python, JavaScript, C#, Unity, TF Serving")
 
 
 def reporting(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options on output and reports; the command gets them as one ``console``."""
 
     @functools.wraps(command)
-    def collected(*args: Any, **options: Any) -> Any:
+    def call_with_console(*args: Any, **options: Any) -> Any:
         names = ("as_json", "quiet", "verbose", "junit", "markdown", "html", "tolerances")
         console = Console(**{name: options.pop(name) for name in names})
         return command(*args, console=console, **options)
@@ -255,5 +255,5 @@ def reporting(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("-q", "--quiet", is_flag=True, help="Print only what disagrees."),
         click.option("-v", "--verbose", is_flag=True, help="Print every step and every comparison."),
     ):
-        collected = option(collected)
-    return collected
+        call_with_console = option(call_with_console)
+    return call_with_console

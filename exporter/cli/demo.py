@@ -36,13 +36,13 @@ def demo_command(out: Path | None, no_open: bool, files: bool) -> None:
 
 def _write_files(out: Path) -> None:
     from exporter.demo.files import FILES, write_files
-    from exporter.tables import typed
+    from exporter.tables import command_text
 
     write_files(out)
     width = max(map(len, FILES))
     for name, what in FILES.items():
         say(f"{out / name!s:{width + len(str(out / 'x')) - 1}}  {what}".rstrip())
-    say(f"next: {typed(out / '3DBall.onnx', '-o', out / 'exported')}")
+    say(f"next: {command_text(out / '3DBall.onnx', '-o', out / 'exported')}")
 
 
 def _demonstrate(out: Path, no_open: bool) -> None:
@@ -58,13 +58,13 @@ def _demonstrate(out: Path, no_open: bool) -> None:
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(BALL, source)
-    _typed(export_command, "", str(source), "-o", str(out), "--html", str(report))
+    _run_as_typed(export_command, "", str(source), "-o", str(out), "--html", str(report))
     if no_open:
         return
-    _typed(serve_command, "serve ", str(out / BALL.stem), "--port", "0", "--open")
+    _run_as_typed(serve_command, "serve ", str(out / BALL.stem), "--port", "0", "--open")
 
 
-def _typed(command: click.Command, name: str, *words: str) -> None:
+def _run_as_typed(command: click.Command, name: str, *words: str) -> None:
     """Run a command, shown as a user would type it."""
     say(f" {PROGRAM} {name}{shlex.join(words)}", mark="$", colour="cyan")
     command.main(list(words), PROGRAM, standalone_mode=False)

@@ -75,7 +75,7 @@ def inspect_command(
     from converters.compiler.options import CompileOptions
     from converters.files.fetch import path_text
     from exporter.remote.fetching import nearby
-    from exporter.tables import typed
+    from exporter.tables import command_text
 
     if len(sources) > 1 and (logdir is not None or svg is not None):
         raise UsageError("--logdir and --svg are for one source", fix="name one")
@@ -106,7 +106,7 @@ def inspect_command(
                 else:
                     read = read_options(step, sensors, trust_source, activation, normaliser)
                     refused: list[ExportModelError] = []
-                    answer = _inspected(here, compiling, read, logdir, svg, refused, as_json=as_json, why=why)
+                    answer = _inspect_source(here, compiling, read, logdir, svg, refused, as_json=as_json, why=why)
                     for error in refused:
                         say_lines(f"error: {error.message}", err=True)
                         status = 2
@@ -122,12 +122,12 @@ def inspect_command(
         say_json(found[0] if len(sources) == 1 else {"sources": found})
     elif not releases and status == 0:
         both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
-        say(f"next: {typed(*map(path_text, sources), *both, '-o', 'exported')}")
+        say(f"next: {command_text(*map(path_text, sources), *both, '-o', 'exported')}")
     if status:
         sys.exit(status)
 
 
-def _inspected(
+def _inspect_source(
     source: Path,
     compiling: CompileOptions,
     read: ReadOptions,

@@ -33,13 +33,13 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
 def one_bundle(place: Path, command: str) -> Path | None:
     """The bundle at ``place``, or the only one in that folder; None where there is none. Raises UsageError."""
     from converters.formats.bundle.bundle import bundles_in
-    from exporter.tables import typed
+    from exporter.tables import command_text
 
     found = bundles_in(place)
     if len(found) > 1:
         names = ", ".join(p.name for p in found)
         raise UsageError(
-            f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: {typed(command, found[0])}"
+            f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: {command_text(command, found[0])}"
         )
     return found[0] if found else None
 
@@ -145,7 +145,7 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @functools.wraps(command)
-    def collected(
+    def parse_and_call(
         *args: Any, brain: str | None, inputs: Sequence[str], outputs: Sequence[str], values: Sequence[str], **rest: Any
     ) -> Any:
         from exporter.options import ReadOptions, WriteOptions, compile_options
@@ -168,11 +168,11 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--output", "outputs", multiple=True, metavar="N=ROLE", help="Say what an output is."),
         click.option("--set", "values", multiple=True, metavar="N=VALUE", help="Give a placeholder a fixed value."),
     ):
-        collected = option(collected)
-    return collected
+        parse_and_call = option(parse_and_call)
+    return parse_and_call
 
 
-def _required(given: str | None, *, unverified: bool) -> tuple[str, ...]:
+def _required_formats(given: str | None, *, unverified: bool) -> tuple[str, ...]:
     """Return the formats of ``--require``. Raises UsageError."""
     if given is None:
         return ()
@@ -193,7 +193,7 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
     """How to compare; the command gets it as ``options``, a VerifyOptions with the rules of ``console``."""
 
     @functools.wraps(command)
-    def collected(
+    def parse_and_call(
         *args: Any,
         console: Console,
         seed: int,
@@ -211,7 +211,9 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         from exporter.verify.tolerances import Tolerance
 
         tolerance = Tolerance(atol, rtol)
-        require = _required(required, unverified=bool(rest.get("allow_unverified")) or rest.get("runtimes") == "none")
+        require = _required_formats(
+            required, unverified=bool(rest.get("allow_unverified")) or rest.get("runtimes") == "none"
+        )
         options = VerifyOptions(seed, samples, steps, tolerance, console.rules(), golden, parse_budget(sizes), require)
         return command(*args, console=console, options=options, **rest)
 
@@ -233,5 +235,5 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--atol", type=float, metavar="X", default=1e-5, help="Absolute tolerance."),
         click.option("--rtol", type=float, metavar="X", default=1e-5, help="Relative tolerance."),
     ):
-        collected = option(collected)
-    return collected
+        parse_and_call = option(parse_and_call)
+    return parse_and_call

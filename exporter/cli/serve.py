@@ -77,7 +77,7 @@ def _bundle_of(place: Path) -> Iterator[Path]:
     from converters.files.folders import scratch_folder
     from exporter.export.options import ExportOptions
     from exporter.export.pipeline import export
-    from exporter.tables import typed
+    from exporter.tables import command_text
 
     with scratch_folder() as folder:
         results = list(export([place], ExportOptions(folder, ("bytes", "tfjs"), verify="none")))
@@ -85,8 +85,10 @@ def _bundle_of(place: Path) -> Iterator[Path]:
             raise UsageError(
                 f"{place} holds {len(results)} policies",
                 why=", ".join(r.policy.name for r in results),
-                fix=f"{typed(place, '-o', 'exported')}    "
-                f"(then: {typed('serve', Path('exported', results[0].policy.name))})",
+                fix=f"{command_text(place, '-o', 'exported')}    "
+                f"(then: {command_text('serve', Path('exported', results[0].policy.name))})",
             )
-        say(f"exported for this page alone, not compared; to keep it: {typed(place, '-o', 'exported')}", err=True)
+        say(
+            f"exported for this page alone, not compared; to keep it: {command_text(place, '-o', 'exported')}", err=True
+        )
         yield results[0].folder

@@ -25,13 +25,13 @@ def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
     """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""
     from exporter.snippets.contract import read_bundle
     from exporter.snippets.registry import snippets
-    from exporter.tables import typed
+    from exporter.tables import command_text
 
     place = one_bundle(bundle, "snippets")
     if place is None and bundle.exists():
         raise UsageError(
             f"{bundle} is not a bundle",
-            fix=f"{typed(bundle, '-o', 'exported')}    (then: export-model snippets exported)",
+            fix=f"{command_text(bundle, '-o', 'exported')}    (then: export-model snippets exported)",
         )
     found = read_bundle(place or bundle)
     made, lacking = snippets(found, target)

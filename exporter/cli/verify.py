@@ -99,7 +99,7 @@ def verify_command(
             reports.append(report)
             verified.append((folder, address))
             progress.clear()
-            console.verified(report, folder)
+            console.report_policy(report, folder)
         console.whole(reports, refused=len(refused))
         console.check_rules(reports)
         told = {"refused": [e.to_dict() for e in refused]} if refused else {}

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from exporter.reports.entry import Entry
-from exporter.tables import sized
+from exporter.tables import size_with_original
 from exporter.verify.report import ParityReport
 from signatures.fields import printable
 
@@ -47,7 +47,7 @@ def _policy(entry: Entry) -> list[str]:
     for pair in sorted(report.pairs, key=lambda p: p.passed):
         cells = [pair.worst.get(o) for o in report.outputs]
         shown = ["–" if c is None else c.short() if c.passed else f"**{c.short()}**" for c in cells]
-        size = sized(pair.format, report.sizes, report.whole_sizes)
+        size = size_with_original(pair.format, report.sizes, report.whole_sizes)
         rows.append(
             [code(pair.format), code(pair.runtime), size, *shown, pair.word if pair.passed else f"**{pair.word}**"]
         )

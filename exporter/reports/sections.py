@@ -11,7 +11,7 @@ from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
-from exporter.tables import sized, typed
+from exporter.tables import command_text, size_with_original
 from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
 
@@ -76,7 +76,7 @@ def again(entry: Entry) -> Markup | None:
     ran = [name for name, state in report.runtimes.items() if state["status"] == "ran" and name != "numpy"]
     chosen = ["--runtimes", ",".join(ran)] if ran else ["--allow-unverified"]
     numbers = ["--seed", str(report.seed), "--samples", str(report.samples), "--steps", str(entry.steps)]
-    line = typed(*entry.command, *chosen, *numbers)
+    line = command_text(*entry.command, *chosen, *numbers)
     return el("p", "To compare again: ", el("code", line), class_="soft again")
 
 
@@ -106,7 +106,7 @@ def agreement(entry: Entry) -> Markup:
     report, rows = entry.report, []
     for pair in report.pairs:
         verdict = el("td", f"{'✓' if pair.passed else '✗'} {pair.word}", class_="ok" if pair.passed else "fail")
-        size = el("td", sized(pair.format, report.sizes, report.whole_sizes), class_="number")
+        size = el("td", size_with_original(pair.format, report.sizes, report.whole_sizes), class_="number")
         worst = [_cell(pair.worst.get(output)) for output in report.outputs]
         rows.append([_breakable(pair.format), pair.runtime, verdict, size, *worst])
     head = ("format", "runtime", "verdict", "size", *report.outputs)
@@ -299,7 +299,9 @@ def files(entry: Entry) -> Markup | None:
     """Sizes of the formats."""
     if not entry.report.sizes:
         return None
-    rows = [(kind, sized(kind, entry.report.sizes, entry.report.whole_sizes)) for kind in entry.report.sizes]
+    rows = [
+        (kind, size_with_original(kind, entry.report.sizes, entry.report.whole_sizes)) for kind in entry.report.sizes
+    ]
     return section("Sizes", table("Bytes of each format", ("format", "size"), rows, [1]))
 
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from converters.formats.registry import WRITTEN
-from exporter.tables import sized, table
+from exporter.tables import size_with_original, table
 from exporter.verify.findings import Finding, Undecided
 from exporter.verify.report import ParityReport
 from exporter.verify.verdict import key_of, missing_runtimes
@@ -16,7 +16,7 @@ def parity_table(report: ParityReport) -> str:
     """Verdict, format, runtime, size, and the largest share of what is allowed with its output."""
     rows = []
     for pair in report.pairs:
-        shown = sized(pair.format, report.sizes, report.whole_sizes)
+        shown = size_with_original(pair.format, report.sizes, report.whole_sizes)
         rows.append([pair.word, pair.format, pair.runtime, shown, pair.worst_text])
     return table(("verdict", "format", "runtime", "size", "of tolerance"), rows)
 

@@ -12,7 +12,7 @@ import click
 import pytest
 
 import exporter
-from exporter.cli.demo import _typed
+from exporter.cli.demo import _run_as_typed
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused, python
 
@@ -151,6 +151,6 @@ def test_a_command_of_the_demo_is_run_as_it_is_shown(capsys: pytest.CaptureFixtu
     def command(words: tuple[str, ...]) -> None:
         given.append(words)
 
-    _typed(command, "export ", "export", "a b")
+    _run_as_typed(command, "export ", "export", "a b")
     assert given == [("export", "a b")]
     assert capsys.readouterr().out == "$ export-model export export 'a b'\n"
