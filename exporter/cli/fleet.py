@@ -14,7 +14,7 @@ from exporter.cli.console import Console
 from exporter.cli.options import RULES, as_given
 from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
-from exporter.fleet.sources import named, sources_in
+from exporter.fleet.sources import paths_text, sources_in
 from exporter.fleet.worker import Outcome, Wanted
 from signatures.errors import UsageError
 
@@ -44,7 +44,7 @@ def run_fleet(
     paths = sources_in(given, options.out, passed_over)
     if passed_over and not console.quiet:
         many = f"{len(passed_over)} files that are not models" if len(passed_over) > 1 else "a file that is not a model"
-        say_lines(f"note: the pattern also matches {many}: {named(passed_over)}", err=True)
+        say_lines(f"note: the pattern also matches {many}: {paths_text(passed_over)}", err=True)
     wanted = Wanted(console.as_json, console.wants_reports)
     tally = _Tally(len(paths))
     entries: list[Entry] = []

@@ -165,7 +165,7 @@ def _unity(
     as_json: bool,
     svg: Path | None,
 ) -> tuple[int, dict[str, Any]]:
-    from exporter.inspect.unity import accepted, check_for_unity, unity_report, unity_text
+    from exporter.inspect.unity import all_accept, check_for_unity, unity_report, unity_text
 
     verdicts = check_for_unity(source, releases, sensors or "", actions or "", parameters)
     if svg is not None:
@@ -178,4 +178,4 @@ def _unity(
             svg.write_text(behavior_parameters(verdicts[0]), encoding="utf-8")
     if not as_json:
         say_lines(unity_text(verdicts))
-    return 0 if accepted(verdicts) else 1, unity_report(verdicts)
+    return 0 if all_accept(verdicts) else 1, unity_report(verdicts)

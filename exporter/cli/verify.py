@@ -56,7 +56,7 @@ def verify_command(
     from converters.files.fetch import path_text
     from converters.formats.bundle.bundle import bundles_in, other_folders_in
     from exporter.export.again import verify_folder
-    from exporter.export.pipeline import counted
+    from exporter.export.pipeline import numbered_progress
     from exporter.remote.fetching import nearby
 
     console.prepare()
@@ -85,7 +85,7 @@ def verify_command(
                     runtimes=runtimes,
                     options=options,
                     allow_unverified=allow_unverified,
-                    progress=counted(progress, number, len(places)),
+                    progress=numbered_progress(progress, number, len(places)),
                 )
             except (UsageError, RuntimeUnavailableError):
                 raise

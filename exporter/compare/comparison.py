@@ -79,7 +79,7 @@ class _Candidate:
     #: outputs that export-model made for the reference, and that this one has none of
     spared: tuple[str, ...] = ()
 
-    def fed(self, feeds: Feeds) -> dict[str, np.ndarray]:
+    def own_feeds(self, feeds: Feeds) -> dict[str, np.ndarray]:
         """What it is fed, by its own names, for the reference's inputs."""
         rows = next((len(a) for a in feeds.values() if a.ndim), 1)
         own = [(p, feeds[name]) for name, p in self.inputs.items()]
@@ -134,7 +134,7 @@ def compare_artefacts(
         artefacts = [(path, *found) for path in near for found in ports_of(path)]
         if not artefacts:
             raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
-        aliases = _mapped(_aliases(policy, reference), names or {}, [p for *_, p in artefacts])
+        aliases = _with_user_names(_aliases(policy, reference), names or {}, [p for *_, p in artefacts])
         made = _made_here(reference, policy)
         labels = _labels(artefacts)
         matched = [
@@ -150,7 +150,7 @@ def compare_artefacts(
         pool = opened.enter_context(RuntimePool()) if pool is None else pool
         reference_file = folder / "reference.bytes"
         frozen(policy).write(reference_file)
-        copies = [_vetted(m, folder / str(number)) for number, m in enumerate(matched)]
+        copies = [_safe_copy(m, folder / str(number)) for number, m in enumerate(matched)]
         own = rounded_to(reference)
         kept = [None if (storage := rounded_to(path)) == own else storage for path, *_ in artefacts]
         reports = []
@@ -203,7 +203,7 @@ def _compared(
 def _reference(
     path: Path, understanding: CompileOptions | None, read: ReadOptions | None
 ) -> tuple[Policy, OriginalRun | None]:
-    found = list(read_source(path, read).compiled(understanding))
+    found = list(read_source(path, read).compile_models(understanding))
     if len(found) > 1:
         raise UsageError(
             f"the reference holds {len(found)} policies",
@@ -253,7 +253,7 @@ def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
     return aliases
 
 
-def _mapped(
+def _with_user_names(
     aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], artefacts: Sequence[Ports]
 ) -> dict[str, tuple[str, ...]]:
     """The aliases, with what --map says before all others of a name. Raises UsageError."""
@@ -364,7 +364,7 @@ def _constants(own: Ports, policy: Policy, taken: set[str]) -> tuple[dict[str, n
 # ---- running
 
 
-def _vetted(candidate: _Candidate, folder: Path) -> Path:
+def _safe_copy(candidate: _Candidate, folder: Path) -> Path:
     """A copy of the candidate as far as a runtime may be given it: anyone may have made it. Raises ExportModelError."""
     found, ports = candidate.format, candidate.ports
     folder.mkdir()
@@ -387,7 +387,7 @@ def _participants(
 ) -> Iterator[Participant]:
     chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
-        again = loading(runtime, path, candidate.ports.options, partial(_renamed, candidate))
+        again = loading(runtime, path, candidate.ports.options, partial(_run_renamed, candidate))
         try:
             model, run = again(pool, False)
         except RunFailedError as error:
@@ -409,7 +409,7 @@ def _participants(
                 candidate.label,
                 candidate.drawn,
                 path,
-                candidate.fed,
+                candidate.own_feeds,
                 again,
             )
         model.unload()
@@ -426,7 +426,7 @@ def _same_numbers(
         return {}
     case = draw_cases(policy.signature)[1]
     try:
-        (answers,) = _renamed(replace(candidate, outputs={n: n for n in left}), model)([case.feeds], left)
+        (answers,) = _run_renamed(replace(candidate, outputs={n: n for n in left}), model)([case.feeds], left)
     except RunFailedError:  # said where it is run for the comparison
         return {}
     expected = numpy_model.run(case.feeds, wanted)
@@ -438,10 +438,10 @@ def _same_numbers(
     return hints
 
 
-def _renamed(candidate: _Candidate, model: LoadedModel) -> Run:
+def _run_renamed(candidate: _Candidate, model: LoadedModel) -> Run:
 
     def run(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
-        answers = model.run_all([candidate.fed(feeds) for feeds in inputs], [candidate.outputs[n] for n in fetch])
+        answers = model.run_all([candidate.own_feeds(feeds) for feeds in inputs], [candidate.outputs[n] for n in fetch])
         return [{n: answer[candidate.outputs[n]] for n in fetch} for answer in answers]
 
     return run

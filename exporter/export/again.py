@@ -21,7 +21,7 @@ from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from exporter.export.job import Job, own_in, runs_elsewhere
 from exporter.export.options import storage_of
-from exporter.export.pipeline import Progress, consumer, joined
+from exporter.export.pipeline import Progress, consumer, join_reports
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.inner_tensors import saved_graph
@@ -106,7 +106,7 @@ def verify_folder(
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     sizes = {f.key: found.size(f) for f in formats}
     with scratch_folder() as scratch, RuntimePool() as pool:
-        copies = _vetted(artefacts, names, list(keys), scratch)
+        copies = _safe_copies(artefacts, names, list(keys), scratch)
         if again is not None:
             reference = scratch / "reference.bytes"
             frozen(again.policy).write(reference)
@@ -125,7 +125,7 @@ def verify_folder(
             report = replace(report.with_findings(decided), self_consistent=False, original=ran)
         if again is not None and again.own is not None:
             under = own_in(again, formats, scratch / "own")
-            report = joined(report, verify(under, used or ("numpy",), known, pool, None, progress))
+            report = join_reports(report, verify(under, used or ("numpy",), known, pool, None, progress))
     if programs:
         note = f"not compiled again: {', '.join(programs)}: source code may be any program, its bytes were compared"
         report = replace(report, notes=(*report.notes, note))
@@ -153,7 +153,7 @@ def verify_folder(
     return report
 
 
-def _vetted(
+def _safe_copies(
     artefacts: Mapping[str, Path], names: Sequence[str], signatures: Sequence[str], scratch: Path
 ) -> dict[str, Path]:
     """Copies of a bundle's artefacts as far as a runtime may be given them: anyone may have made the bundle.
@@ -256,7 +256,7 @@ def _check_meaning(found: Source, contract: Contract, folder: Path) -> None:
     A bundle that was exported with options (--input, --output) may have others: nothing is held against it then.
     """
     with naming(found.path):
-        signatures = [p.signature for _, p in found.compiled()]
+        signatures = [p.signature for _, p in found.compile_models()]
     alike = [s for s in signatures if _tensors(s) == _tensors(contract.signature)]
     wrong = [[what for what, ours, its in _meanings(contract.signature, s) if ours != its] for s in alike]
     if wrong and all(wrong):
@@ -280,7 +280,7 @@ def _meanings(ours: PolicySignature, its: PolicySignature) -> list[tuple[str, ob
 
 def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
     """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
-    compiled = list(found.compiled())
+    compiled = list(found.compile_models())
     named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
     for model, own in named or compiled[: len(compiled) == 1]:
         dressed = wanted.dress(own)

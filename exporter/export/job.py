@@ -217,7 +217,7 @@ def check_batch(options: ExportOptions, formats: Sequence[Format]) -> None:
         )
 
 
-def fixed(job: Job, batch: int, formats: Sequence[Format]) -> Job:
+def fix_batch(job: Job, batch: int, formats: Sequence[Format]) -> Job:
     """The policy of which some files are for ``batch`` agents at a time, which a note in its contract says."""
     files = " and ".join(f.main_of(job.policy.name) for f in formats if f.fixed)
     note = f"made for batches of {batch}, no more and no fewer (--batch): {files}"

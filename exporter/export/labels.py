@@ -31,7 +31,7 @@ def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
     return content
 
 
-def labelled(policy: Policy, labels: Mapping[str, Any] | None) -> Policy:
+def with_labels(policy: Policy, labels: Mapping[str, Any] | None) -> Policy:
     """The policy with ``labels`` in its contract; without any, as it is.
 
     Labels of several policies stand under ``policies``, by name; else they must fit every one. Raises UsageError.

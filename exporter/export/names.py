@@ -44,7 +44,7 @@ class Names:
         if other is None:
             self._taken[name.casefold()] = path
             return name, None
-        wishes = _numbered(name) if other == path else _wishes(path, name)
+        wishes = _numbered_names(name) if other == path else _wishes(path, name)
         found = next(wish for wish in wishes if wish.casefold() not in self._taken)
         self._taken[found.casefold()] = path
         return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {path_text(other)}"
@@ -100,8 +100,8 @@ def _wishes(path: Path, name: str) -> Iterator[str]:
         if part != name:
             wish = safe_name(f"{part}-{wish}")
             yield wish
-    yield from _numbered(name)
+    yield from _numbered_names(name)
 
 
-def _numbered(name: str) -> Iterator[str]:
+def _numbered_names(name: str) -> Iterator[str]:
     return (f"{name}-{number}" for number in itertools.count(2))

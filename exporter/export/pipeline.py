@@ -20,13 +20,13 @@ from exporter.export.job import (
     artefacts_of,
     check_batch,
     check_weights,
-    fixed,
+    fix_batch,
     own_in,
     sizes_unrounded,
     smaller,
     under_test,
 )
-from exporter.export.labels import check_labels, labelled, read_labels
+from exporter.export.labels import check_labels, read_labels, with_labels
 from exporter.export.names import Names, Naming
 from exporter.export.options import ExportOptions
 from exporter.export.sources import Source, read_source
@@ -141,12 +141,12 @@ class Exporter:
         names, outputs = Names(), dict[str, list[str]]()
         for path in paths:
             with contextlib.suppress(ExportModelError), near(path) as here:
-                for job in self.compiled(here, names, progress, path, []):
+                for job in self.compile_source(here, names, progress, path, []):
                     outputs[job.policy.name] = [s.name for s in job.policy.signature.outputs]
         check_rules(rules, outputs, {f.key: f.runtimes for f in self._formats}, self.runtimes)
         check_labels(self._labels, list(outputs))
 
-    def compiled(
+    def compile_source(
         self,
         path: Path | str | Source,
         names: Naming,
@@ -162,7 +162,7 @@ class Exporter:
         progress(f"reading {path.path if isinstance(path, Source) else path}")
         source = path if isinstance(path, Source) else read_source(path, options.read, refused)
         if refused is None:
-            found = list(source.compiled(options.compile))
+            found = list(source.compile_models(options.compile))
         else:
             found = source.compiled_or_refused(options.compile, refused)
             if isinstance(given, Path | str) and (address := remote(Path(given))) is not None:
@@ -177,13 +177,13 @@ class Exporter:
         called = names.claim(origin, [safe_name(policy.name) for _, policy in found])
         for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
-            dressed = labelled(own if dress is None else dress(own), self._labels)
+            dressed = with_labels(own if dress is None else dress(own), self._labels)
             job = Job(source, model, dressed, self._profile, None if dress is None else own, note)
-            job = job if options.batch is None else fixed(job, options.batch, self._formats)
+            job = job if options.batch is None else fix_batch(job, options.batch, self._formats)
             jobs.append(job if options.weights == "float32" else smaller(job, options.weights))
         return jobs
 
-    def written(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
+    def write_jobs(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
         """Write and verify the policies of a source, in the processes of ``pool`` where any runtime was chosen. Raises
         ExportModelError, before the first is written if it can.
         """
@@ -191,10 +191,10 @@ class Exporter:
             check_free(self.options.out, job.policy.name)
         made = [(j, *artefacts_of(j, self._formats, self.options)) for j in jobs]
         for number, (job, contract, artifacts, notes) in enumerate(made, 1):
-            result = self._verified(job, contract, artifacts, pool, counted(progress, number, len(made)))
+            result = self._verify_job(job, contract, artifacts, pool, numbered_progress(progress, number, len(made)))
             yield replace(result, left_out=notes)
 
-    def _verified(
+    def _verify_job(
         self, job: Job, contract: Contract, artifacts: Sequence[Artifact], pool: RuntimePool | None, progress: Progress
     ) -> ExportResult:
         """The bundle of a policy, verified and put in its place."""
@@ -215,13 +215,13 @@ class Exporter:
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     under = own_in(job, self._formats, folder / "own")
-                    report = joined(report, verify(under, self.runtimes, self._known, pool, rules, progress))
+                    report = join_reports(report, verify(under, self.runtimes, self._known, pool, rules, progress))
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
 
                     whole = under_test(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
                     own = verify(whole, self.runtimes, self._known, pool, rules, progress)
-                    report = joined(report, own, "the policy with its weights as they were, by the numpy kernels")
+                    report = join_reports(report, own, "the policy with its weights as they were, by the numpy kernels")
                     found = decisions(whole, tested, options.weights, self.runtimes, pool, options.parity)
                     report = replace(report.with_findings(found), whole_sizes=whole_sizes)
                 with bundle.writing(out):
@@ -262,11 +262,13 @@ def export(
 
             pool = opened.enter_context(RuntimePool())
         for number, path in enumerate(paths, 1):
-            told = counted(progress, number, len(paths))
+            told = numbered_progress(progress, number, len(paths))
             apart: list[ExportModelError] = []
             try:
                 with near(path) as here:
-                    for result in exporter.written(exporter.compiled(here, names, told, path, apart), pool, told):
+                    for result in exporter.write_jobs(
+                        exporter.compile_source(here, names, told, path, apart), pool, told
+                    ):
                         done += 1
                         yield result
             except ExportModelError as error:
@@ -286,7 +288,7 @@ def near(path: Path | str | Source) -> AbstractContextManager[Path | Source]:
     return nullcontext(path) if isinstance(path, Source) else nearby(Path(path))
 
 
-def counted(progress: Progress, number: int, total: int) -> Progress:
+def numbered_progress(progress: Progress, number: int, total: int) -> Progress:
     """Steps on one of several, with its number."""
     return progress if total == 1 else lambda text: progress(f"[{number}/{total}] {text}")
 
@@ -344,7 +346,7 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     return [written(target) for target in targets]
 
 
-def joined(
+def join_reports(
     report: ParityReport,
     own: ParityReport,
     what: str = "the policy under its own names, from which this was made",

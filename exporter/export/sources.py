@@ -40,7 +40,7 @@ class Source:
             return folder.resolve().name or self.path.stem
         return self.path.stem
 
-    def compiled(self, options: CompileOptions | None = None) -> Iterator[tuple[SourceModel, Policy]]:
+    def compile_models(self, options: CompileOptions | None = None) -> Iterator[tuple[SourceModel, Policy]]:
         """Each model's policies; raises ExportModelError that names the file."""
         for model in self.models:
             yield from self._of_model(model, options)
@@ -50,25 +50,25 @@ class Source:
     ) -> list[tuple[SourceModel, Policy]]:
         """The policies of all models; of several, one that is refused goes to ``refused``, and the others stay."""
         if len(self.models) < 2:
-            return list(self.compiled(options))
+            return list(self.compile_models(options))
         return each_or_refused(self.models, lambda model: self._of_model(model, options), refused)
 
     def _of_model(self, model: SourceModel, options: CompileOptions | None) -> list[tuple[SourceModel, Policy]]:
         with naming(self.path):
             policies = compile_graph(model.graph, self.stem(model), options, model.facts)
-            return [(narrowed(model, policy), policy) for policy in policies]
+            return [(narrow_original(model, policy), policy) for policy in policies]
 
-    def explained(self, model: SourceModel, options: CompileOptions | None) -> dict[str, tuple[Decision, ...]]:
+    def explain(self, model: SourceModel, options: CompileOptions | None) -> dict[str, tuple[Decision, ...]]:
         """Why the tensors of a model's policies have their roles, by policy."""
         with naming(self.path):
             return explanations(model.graph, self.stem(model), options, model.facts)
 
     def policies(self, options: CompileOptions | None = None) -> list[Policy]:
         """All policies in it."""
-        return [policy for _, policy in self.compiled(options)]
+        return [policy for _, policy in self.compile_models(options)]
 
 
-def narrowed(model: SourceModel, policy: Policy) -> SourceModel:
+def narrow_original(model: SourceModel, policy: Policy) -> SourceModel:
     """The model with no more of its original than a policy asks for. Raises UnsupportedOpError, GraphError."""
     if model.original is None:
         return model

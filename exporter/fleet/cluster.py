@@ -27,7 +27,7 @@ from exporter.export.labels import read_labels
 from exporter.export.names import Claim, Claimed, Turns
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter
-from exporter.fleet.worker import Outcome, Wanted, exported
+from exporter.fleet.worker import Outcome, Wanted, export_source
 from signatures.errors import RuntimeUnavailableError, SourceError
 
 #: Seconds in which a scheduler answers.
@@ -109,7 +109,7 @@ class _Working:
     def _work(self) -> None:
         station = self.station
         try:
-            self.said.put(exported(station.exporter, self.path, self, station.pool, station.run.wanted))
+            self.said.put(export_source(station.exporter, self.path, self, station.pool, station.run.wanted))
         except BaseException as error:
             self.said.put(
                 Outcome(self.path, error=SourceError("was not exported", where=path_text(self.path), why=repr(error)))
@@ -191,7 +191,7 @@ class Cluster:
 
     def run(self) -> Iterator[Outcome]:
         """What becomes of the sources, as it comes. Raises RuntimeUnavailableError."""
-        client = _connected(self.address)
+        client = _connect(self.address)
         run = Run(uuid.uuid4().hex, _anywhere(self.options), self.wanted)
         try:
             yield from self._outcomes(client, run)
@@ -210,7 +210,7 @@ class Cluster:
         def submit(number: int, function: Any, *given: Any, **where: Any) -> None:
             # A source's place is its priority: names are given in that order.
             if client.status != "running":
-                raise self._lost()
+                raise self._lost_error()
             future = client.submit(
                 function, run, _absolute(self.paths[number]), *given, pure=False, priority=-number, **where
             )
@@ -221,7 +221,7 @@ class Cluster:
             submit(number, ask)
         for future in done:
             number = index.pop(future.key)
-            worker, said = self._said(future, number)
+            worker, said = self._result_of(future, number)
             if isinstance(said, Claim):
                 self.turns.asks(number, worker, replace(said, path=self.paths[number]))
             else:
@@ -232,7 +232,7 @@ class Cluster:
             for named, where, names in self.turns.answers():
                 submit(named, answer, names, workers=[where], allow_other_workers=True)
 
-    def _said(self, future: Any, number: int) -> tuple[str, Claim | Outcome]:
+    def _result_of(self, future: Any, number: int) -> tuple[str, Claim | Outcome]:
         try:
             error = None if future.cancelled() else future.exception()
             if error is None:
@@ -240,7 +240,7 @@ class Cluster:
                 future.release()
                 return result if isinstance(result, tuple) else ("", result)
         except (CancelledError, OSError) as gone:
-            raise self._lost() from gone
+            raise self._lost_error() from gone
         path = self.paths[number]
         failed = SourceError(
             "was not exported by the cluster",
@@ -250,7 +250,7 @@ class Cluster:
         )
         return "", Outcome(path, error=failed)
 
-    def _lost(self) -> RuntimeUnavailableError:
+    def _lost_error(self) -> RuntimeUnavailableError:
         return RuntimeUnavailableError(
             f"the cluster at {self.address} was lost",
             why="its scheduler ended or was restarted",
@@ -267,7 +267,7 @@ def _dask(address: str) -> Any:
         ) from error
 
 
-def _connected(address: str) -> Any:
+def _connect(address: str) -> Any:
     try:
         client = _dask(address).Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # the last where tls:// lacks its settings

@@ -24,7 +24,7 @@ from exporter.export.names import Claim, Names, Turns
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter
 from exporter.fleet.ledger import Ledger
-from exporter.fleet.worker import Outcome, Wanted, exported, work
+from exporter.fleet.worker import Outcome, Wanted, export_source, work
 from signatures.errors import SourceError, UsageError
 
 #: How long a worker may take to clean up when it is told to end.
@@ -59,7 +59,7 @@ def export_fleet(
     ledger = Ledger(options, exporter.runtimes)
     waiting = []
     for path in paths:
-        done = None if again else ledger.unchanged(path)
+        done = None if again else ledger.unchanged_policies(path)
         if done is None:
             waiting.append(path)
             continue
@@ -85,7 +85,7 @@ def export_fleet(
 def _here(exporter: Exporter, paths: Sequence[Path], names: Names, wanted: Wanted) -> Iterator[Outcome]:
     with RuntimePool() as pool:
         for path in paths:
-            yield exported(exporter, path, names, pool, wanted)
+            yield export_source(exporter, path, names, pool, wanted)
 
 
 @contextmanager
@@ -146,7 +146,7 @@ class _Crew(AbstractContextManager["_Crew"]):
             while self.workers:
                 for ready in wait([w.pipe for w in self.workers]):
                     worker = next(w for w in self.workers if w.pipe is ready)
-                    outcome = self._heard(worker)
+                    outcome = self._receive(worker)
                     if outcome is None:
                         continue
                     self.turns.ends(worker.at)
@@ -154,7 +154,7 @@ class _Crew(AbstractContextManager["_Crew"]):
                     self._next(worker, next(todo, None))
                     yield outcome
 
-    def _heard(self, worker: _Worker) -> Outcome | None:
+    def _receive(self, worker: _Worker) -> Outcome | None:
         """What a worker says: the end of a source, or None where it asked for names."""
         path = self.paths[worker.at]
         try:

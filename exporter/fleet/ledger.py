@@ -60,9 +60,9 @@ class Ledger:
             except (ValueError, TypeError, KeyError, RecursionError):  # the last line of a run that was killed
                 continue
 
-    def unchanged(self, source: Path) -> list[str] | None:
+    def unchanged_policies(self, source: Path) -> list[str] | None:
         """The names of a source's policies, where they were exported and all is as it was; else None."""
-        entry = self._lines.get(_called(source), {})
+        entry = self._lines.get(_ledger_name(source), {})
         try:
             same = (
                 self._mark is not None
@@ -89,7 +89,7 @@ class Ledger:
         try:
             hashes = {n: sha256_hex((self._out / n / POLICY).read_bytes()) for n in policies}
             entry = {
-                "source": _called(source),
+                "source": _ledger_name(source),
                 "options": self._key,
                 "seen": seen,
                 "files": files,
@@ -125,7 +125,7 @@ def stamps(source: Path, files: Iterable[Path]) -> dict[str, Stamp]:
     return {str(f): [*_times(f), sha256_hex(f.read_bytes())] for f in sorted(set(files))}
 
 
-def _called(source: Path) -> str:
+def _ledger_name(source: Path) -> str:
     """A source in its line; of an address that has a password or a signature its hash."""
     address = address_of(source)
     return path_text(source) if address in (None, path_text(source)) else sha256_hex(str(address).encode())

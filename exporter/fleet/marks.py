@@ -25,7 +25,7 @@ def read_key() -> bytes | None:
     path = cache_folder() / "fleet.key"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _created(path) as made:
+        with _create_file(path) as made:
             made.write(secrets.token_bytes(_BYTES))
     except FileExistsError:
         pass
@@ -38,7 +38,7 @@ def read_key() -> bytes | None:
     return key if len(key) == _BYTES else None
 
 
-def _created(path: Path) -> BinaryIO:
+def _create_file(path: Path) -> BinaryIO:
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
 
 

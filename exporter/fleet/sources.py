@@ -61,13 +61,13 @@ def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None 
     found: dict[Path, None] = {}
     for path in given:
         others: list[Path] = []
-        here = list(_expanded(path, out.resolve(), others))
+        here = list(_expand(path, out.resolve(), others))
         if not here and path.is_dir():
             recognised(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
                 f"{path_text(path)} stands for no source",
-                why=f"not a model in any form that is read: {named(others)}" if others else "it matches nothing",
+                why=f"not a model in any form that is read: {paths_text(others)}" if others else "it matches nothing",
                 fix="give model files, run folders, or folders that hold them",
             )
         found.update(dict.fromkeys(here))
@@ -76,24 +76,24 @@ def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None 
     return list(found)
 
 
-def named(paths: Sequence[Path]) -> str:
+def paths_text(paths: Sequence[Path]) -> str:
     """The paths, or the first and how many more."""
     more = f" and {len(paths) - _MOST_NAMED} more" if len(paths) > _MOST_NAMED else ""
     return ", ".join(map(path_text, paths[:_MOST_NAMED])) + more
 
 
-def _expanded(path: Path, out: Path, others: list[Path]) -> Iterator[Path]:
+def _expand(path: Path, out: Path, others: list[Path]) -> Iterator[Path]:
     address = remote(path)
     if address is not None:
         yield from matching(address) if is_pattern(address) else [path]
     elif path.is_dir():
-        yield from _walked(path, out)
+        yield from _walk(path, out)
     elif _is_list(path):
         for line in _lines(path):
             listed = Path(line)
             if _is_list(listed):  # one that names itself has no end
                 raise UsageError(f"{path} names another list", where=line, fix="put its lines in its place")
-            yield from _expanded(listed, out, others)
+            yield from _expand(listed, out, others)
     elif not path.exists() and not _MAGIC.isdisjoint(str(path)):
         yield from _matching(path, out, others)
     else:
@@ -105,7 +105,7 @@ def _matching(pattern: Path, out: Path, others: list[Path]) -> Iterator[Path]:
     that are not models.
     """
     whole: set[Path] = set()
-    for match in sorted(set(_found(pattern))):
+    for match in sorted(set(_glob(pattern))):
         if not whole.isdisjoint(match.parents) or _lies_in(match, out):
             continue
         if match.is_file():
@@ -115,7 +115,7 @@ def _matching(pattern: Path, out: Path, others: list[Path]) -> Iterator[Path]:
                 others.append(match)
         elif "**" not in pattern.parts or _is_source(match):  # a ** goes into the others by itself
             whole.add(match)
-            yield from _walked(match, out)
+            yield from _walk(match, out)
 
 
 def _lies_in(path: Path, out: Path) -> bool:
@@ -123,7 +123,7 @@ def _lies_in(path: Path, out: Path) -> bool:
     return out in (real, *real.parents)
 
 
-def _found(pattern: Path) -> Iterator[Path]:
+def _glob(pattern: Path) -> Iterator[Path]:
     """What a pattern matches. ``**`` goes through no link: two that lead back have no end (glob follows them)."""
     parts = pattern.parts
     at = parts.index("**") if "**" in parts else len(parts)
@@ -133,7 +133,7 @@ def _found(pattern: Path) -> Iterator[Path]:
         for folder, folders, files in os.walk(top):
             folders[:] = [f for f in folders if not f.startswith(".")]
             if rest:
-                yield from _found(Path(glob.escape(folder), *rest))
+                yield from _glob(Path(glob.escape(folder), *rest))
             else:
                 yield from (Path(folder, *f) for f in ((), *((n,) for n in files if not n.startswith("."))))
     if at == len(parts):
@@ -157,7 +157,7 @@ def _is_list(path: Path) -> bool:
 
 def _stands_for_something(line: str) -> bool:
     try:
-        return remote(Path(line)) is not None or Path(line).exists() or next(_found(Path(line)), None) is not None
+        return remote(Path(line)) is not None or Path(line).exists() or next(_glob(Path(line)), None) is not None
     except (OSError, ValueError):  # what cannot be a path
         return False
 
@@ -180,7 +180,7 @@ def _lines(path: Path) -> Iterator[str]:
             yield line.strip()
 
 
-def _walked(top: Path, out: Path) -> Iterator[Path]:
+def _walk(top: Path, out: Path) -> Iterator[Path]:
     """What is a source in a folder: itself, or the first on each way down, however deep; no link is gone through."""
     left = [top]
     while left:

@@ -66,7 +66,7 @@ class Wanted:
     entries: bool = False
 
 
-def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, wanted: Wanted) -> Outcome:
+def export_source(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, wanted: Wanted) -> Outcome:
     """Export one source."""
     policies: list[Written] = []
     refused: list[ExportModelError] = []
@@ -74,10 +74,10 @@ def exported(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, w
     try:
         seen = state(path)
         with near(path) as here:
-            jobs = exporter.compiled(here, names, _silent, path, refused)
+            jobs = exporter.compile_source(here, names, _silent, path, refused)
             files = stamps(path, (f for job in jobs for f in job.model.files))
             steps = exporter.options.parity.steps
-            policies.extend(_written(result, wanted, steps) for result in exporter.written(jobs, pool, _silent))
+            policies.extend(_to_written(result, wanted, steps) for result in exporter.write_jobs(jobs, pool, _silent))
     except ExportModelError as error:
         refused.append(error)
     except OSError as error:
@@ -95,7 +95,7 @@ def _stays(path: Path, seen: State) -> bool:
         return False
 
 
-def _written(result: ExportResult, wanted: Wanted, steps: int) -> Written:
+def _to_written(result: ExportResult, wanted: Wanted, steps: int) -> Written:
     signature, report = result.policy.signature, result.report
     failures = [] if report is None else report.failures
     return Written(
@@ -140,7 +140,7 @@ def work(pipe: Connection, options: ExportOptions, wanted: Wanted) -> None:
     try:
         with RuntimePool() as pool:
             while (path := pipe.recv()) is not None:
-                pipe.send(exported(exporter, path, _Asking(pipe), pool, wanted))
+                pipe.send(export_source(exporter, path, _Asking(pipe), pool, wanted))
     except (EOFError, BrokenPipeError):  # nobody listens any more
         sys.exit(1)
 

@@ -78,15 +78,15 @@ def _rows(verdict: UnityVerdict) -> list[Row]:
 def _messages(verdict: UnityVerdict) -> list[tuple[str, bool]]:
     """(text, whether it is good news), each once."""
     if verdict.refused is not None:
-        return [(_thrown("Importing it", verdict.refused), False)]
+        return [(_exception_text("Importing it", verdict.refused), False)]
     found: list[tuple[str, bool]] = []
     chosen = next((m for m in verdict.modes.values() if m.accepted), next(iter(verdict.modes.values()), None))
     if chosen is not None:
         found += [(f.message, False) for f in chosen.checks]
-        found += [(_thrown("In the console", chosen.load), False)] if chosen.load is not None else []
+        found += [(_exception_text("In the console", chosen.load), False)] if chosen.load is not None else []
     found += [(f"In play: {f.message}", False) for f in verdict.played if f.outcome is not Outcome.LOADING]
     return list(dict.fromkeys(found)) or [("No message: the model is accepted.", True)]
 
 
-def _thrown(where: str, thrown: Thrown) -> str:
+def _exception_text(where: str, thrown: Thrown) -> str:
     return f"{where}: {thrown.exception}: {thrown.message}"

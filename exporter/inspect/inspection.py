@@ -142,12 +142,12 @@ def inspect_source(
     rule that decided on each tensor is found, too.
     """
     source = read_source(path, read, refused)
-    compiled = source.compiled(options) if refused is None else source.compiled_or_refused(options, refused)
+    compiled = source.compile_models(options) if refused is None else source.compiled_or_refused(options, refused)
     found = []
     decided: dict[str, tuple[Decision, ...]] = {}
     for model, policy in compiled:
         if why and policy.name not in decided:
-            decided |= source.explained(model, options)
+            decided |= source.explain(model, options)
         ops = dict(sorted(Counter(n.op for n in policy.graph.nodes).items()))
         targets = {key: _refusal(source.path, policy, f) for key, f in WRITTEN.items()}
         with naming(source.path):
@@ -214,7 +214,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
     lines += ["", f"parameters: {inspected.parameters:,}"]
     for name, way in inspected.layers.items():
         lines.append(paragraph(way, "layers: " if len(inspected.layers) == 1 else f"layers to {name}: ", "  "))
-    lines += [paragraph(text, f"{name} is normalised by: ", "  ") for name, text in _normalised(signature)]
+    lines += [paragraph(text, f"{name} is normalised by: ", "  ") for name, text in _normaliser_texts(signature)]
     lines += _label_lines(signature.labels)
     if signature.constants:
         lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
@@ -254,7 +254,7 @@ def port_tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[
     return [(("input", *middle, "what to feed"), fed), (("output", *middle, "meaning"), meant)]
 
 
-def _normalised(signature: PolicySignature) -> list[tuple[str, str]]:
+def _normaliser_texts(signature: PolicySignature) -> list[tuple[str, str]]:
     """Observation → the mean and the deviation that the policy normalises its numbers with."""
     found = []
     for spec in signature.observations:

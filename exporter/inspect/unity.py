@@ -34,7 +34,7 @@ def check_for_unity(
     return [check_file(path, release, agent) for path in _files(source) for release in dict.fromkeys(wanted)]
 
 
-def accepted(verdicts: Sequence[UnityVerdict]) -> bool:
+def all_accept(verdicts: Sequence[UnityVerdict]) -> bool:
     """Whether every release accepts every file and its player plays it, with Deterministic Inference off."""
     return all(verdict.accepted["stochastic"] for verdict in verdicts)
 
@@ -43,7 +43,7 @@ def unity_report(verdicts: Sequence[UnityVerdict]) -> dict[str, Any]:
     """For ``--json``."""
     return {
         "schema": 1,
-        "accepted": accepted(verdicts),
+        "accepted": all_accept(verdicts),
         "verdicts": [{"path": str(verdict.path), **verdict.to_dict()} for verdict in verdicts],
     }
 
@@ -96,7 +96,7 @@ def _verdict_text(verdict: UnityVerdict) -> str:
             lines += _mode_lines("" if same else f", {_MODES[mode]}", found, verdict.consumer.checks is not None)
     if verdict.misread:
         lines.append(f"  what {verdict.consumer.runtime} reads wrongly:")
-        lines += [line for finding in verdict.misread for line in _told("misread", finding)]
+        lines += [line for finding in verdict.misread for line in _finding_lines("misread", finding)]
     if verdict.refused is None:
         lines += _player_lines(verdict)
     return "\n".join(lines)
@@ -125,7 +125,7 @@ def _player_lines(verdict: UnityVerdict) -> list[str]:
             lines[-1] += " nothing is played, loading throws"
             continue
         for played in found.played:
-            lines += _told(played.outcome.value, played)
+            lines += _finding_lines(played.outcome.value, played)
             lines += paragraph(played.exception, " " * 6 + "throws: ", " " * 10).split("\n") if played.exception else []
     return lines
 
@@ -139,13 +139,13 @@ def _mode_lines(title: str, found: ModeVerdict, known: bool) -> list[str]:
         return [*lines, f"  the Inspector{title}: the same exception in place of a list"]
     if not known:
         return [*lines, "  the Inspector: the checks of this release are not known"]
-    listed = [line for finding in found.checks for line in _told(finding.severity.value, finding)]
+    listed = [line for finding in found.checks for line in _finding_lines(finding.severity.value, finding)]
     if found.check_throws is not None:
         listed = _thrown_lines(found.check_throws)
     return [*lines, f"  the Inspector{title}: {'' if listed else 'nothing to say'}".rstrip(), *listed]
 
 
-def _told(kind: str, said: Finding | Thrown | Played) -> list[str]:
+def _finding_lines(kind: str, said: Finding | Thrown | Played) -> list[str]:
     """A finding or an exception: what, where and what to do."""
     lines = []
     for head, text in ((f"{kind}: ", said.message), ("  where: ", said.where), ("  fix: ", said.fix)):
@@ -157,7 +157,7 @@ def _told(kind: str, said: Finding | Thrown | Played) -> list[str]:
 
 
 def _thrown_lines(thrown: Thrown) -> list[str]:
-    return _told(f"throws {thrown.exception}", thrown)
+    return _finding_lines(f"throws {thrown.exception}", thrown)
 
 
 def _agent_text(brain: Brain) -> str:

@@ -131,7 +131,7 @@ def is_pattern(address: str) -> bool:
 def matching(address: str) -> list[Path]:
     """The files that a pattern finds, by name. Raises SourceError, UsageError."""
     if is_http(address):
-        return _linked(address)
+        return _linked_files(address)
     system, pattern = filesystem(address)
     with asking(address):
         found = [p for p, info in system.glob(pattern, detail=True).items() if info.get("type") == "file"]
@@ -142,7 +142,7 @@ def matching(address: str) -> list[Path]:
     return [Path(each) for each in sorted(found) if each.startswith(f"{fixed}/")]
 
 
-def _linked(address: str) -> list[Path]:
+def _linked_files(address: str) -> list[Path]:
     """The files of a web server that a pattern finds, by the links of its pages, level by level."""
     if "**" in address:
         raise UsageError(

@@ -19,13 +19,13 @@ async def guarded_client(**settings: Any) -> Any:
     import aiohttp
 
     tracing = aiohttp.TraceConfig()
-    tracing.on_request_start.append(_begun)
+    tracing.on_request_start.append(_on_request_start)
     tracing.on_request_redirect.append(_sent_on)
     settings.pop("loop", None)
     return aiohttp.ClientSession(trace_configs=[tracing], **settings)
 
 
-async def _begun(session: Any, context: Any, asked: Any) -> None:
+async def _on_request_start(session: Any, context: Any, asked: Any) -> None:
     context.first = asked.url
     context.near = await _is_near(asked.url)
 
@@ -35,12 +35,12 @@ async def _sent_on(session: Any, context: Any, asked: Any) -> None:
     place = asked.response.headers.get("Location") or asked.response.headers.get("URI") or ""
     to = asked.response.url.join(type(asked.response.url)(place))
     if context.first.scheme == "https" and to.scheme != "https":
-        raise _refused(to, "what is asked for by https is not taken from elsewhere")
+        raise _redirect_error(to, "what is asked for by https is not taken from elsewhere")
     if not context.near and await _is_near(to):
-        raise _refused(to, "it is in this machine's own network, and the address given is not")
+        raise _redirect_error(to, "it is in this machine's own network, and the address given is not")
 
 
-def _refused(to: Any, why: str) -> SourceError:
+def _redirect_error(to: Any, why: str) -> SourceError:
     return SourceError(
         f"the server sends on to {to.scheme}://{to.host}", why=why, fix="give that address itself, if you mean it"
     )

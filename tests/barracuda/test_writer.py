@@ -51,7 +51,7 @@ def written(policy: Policy, contract: str = "{}") -> NnModel:
 
 
 def policies(path: Path, **options: Any) -> list[Policy]:
-    return [policy for _, policy in read_source(path).compiled(CompileOptions(**options))]
+    return [policy for _, policy in read_source(path).compile_models(CompileOptions(**options))]
 
 
 def assert_answers(policy: Policy, model: NnModel, batches: tuple[int, ...] = (1, 3)) -> None:

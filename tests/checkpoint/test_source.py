@@ -87,7 +87,7 @@ def test_the_hash_is_of_all_its_files(tmp_path: Path) -> None:
 def test_the_original_has_the_checkpoints_values_in_place_of_its_variables(tmp_path: Path) -> None:
     run_of(tmp_path)
     source = read_source(tmp_path / "model-10.cptk")
-    ((model, policy),) = source.compiled()
+    ((model, policy),) = source.compile_models()
     assert model.original is not None
     assert model.original.path == tmp_path / "raw_graph_def.pb"
     with model.original.loadable() as (path, _):

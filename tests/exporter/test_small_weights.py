@@ -136,7 +136,7 @@ def test_what_anyone_may_have_written_stays_as_it_is(odd: Node) -> None:
 
 @pytest.mark.parametrize("storage", _KEPT)
 def test_every_format_holds_the_same_numbers(storage: Storage, tmp_path: Path) -> None:
-    ((_, policy),) = read_source(fixture("visual")).compiled()
+    ((_, policy),) = read_source(fixture("visual")).compile_models()
     (result,) = export_model(
         fixture("visual"),
         tmp_path,
@@ -151,7 +151,7 @@ def test_every_format_holds_the_same_numbers(storage: Storage, tmp_path: Path) -
     for key in DEFAULTS:
         form = WRITTEN[key]
         again = read_source(result.folder / form.main_of(result.policy.name))
-        ((_, read),) = again.compiled()
+        ((_, read),) = again.compile_models()
         assert changed <= {n.value.tobytes() for n in read.graph.nodes if n.value is not None}, key
         assert result.sizes[key] < form.artifact(policy, WriteOptions("{}")).size * 0.9
     assert {*result.whole_sizes} == {*DEFAULTS}

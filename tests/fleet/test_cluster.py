@@ -124,7 +124,7 @@ def test_two_runs_leave_each_other_alone(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(fleet_cluster, "_stations", {})
     begun: list[Path] = []
     closed: list[str] = []
-    real, close = fleet_cluster.exported, fleet_cluster._Station._close
+    real, close = fleet_cluster.export_source, fleet_cluster._Station._close
 
     def counted(exporter: Any, path: Path, *more: Any) -> Outcome:
         begun.append(path)

@@ -170,7 +170,7 @@ def test_a_process_that_dies_costs_one_source(
 ) -> None:
     from exporter.fleet import fleet
 
-    real = fleet._Crew._heard
+    real = fleet._Crew._receive
 
     def killing(crew: fleet._Crew, worker: fleet._Worker) -> Outcome | None:
         if crew.paths[worker.at].name == "discrete.bytes" and crew.paths[worker.at].parent.name == "a":

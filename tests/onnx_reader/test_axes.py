@@ -87,6 +87,6 @@ def test_an_axis_outside_the_rank_is_refused_for_little(axis: int, tmp_path: Pat
 def test_a_small_file_with_a_huge_axis_is_refused_by_inspect(tmp_path: Path) -> None:
     path = tmp_path / "hot.onnx"
     path.write_bytes(onnx_file("OneHot", ["x", "depth", "values"], axis=60_000_000))
-    most, refused = peak(lambda: list(read_source(path, ReadOptions()).compiled()))
+    most, refused = peak(lambda: list(read_source(path, ReadOptions()).compile_models()))
     assert refused is not None and "60000000" in f"{refused.what} {refused.why}"
     assert most < ROOM

@@ -50,7 +50,7 @@ def as_written(entities: np.ndarray) -> np.ndarray:
 
 def compiled(path: Path, options: CompileOptions | None = None) -> list[Policy]:
     """The policies of a source, as every export has them."""
-    return [policy for _, policy in read_source(path, ReadOptions()).compiled(options)]
+    return [policy for _, policy in read_source(path, ReadOptions()).compile_models(options)]
 
 
 class Plain:
