@@ -56,11 +56,11 @@ def blocks_of(graph: Graph, outputs: Iterable[str]) -> list[Block]:
         blocks[place].nodes.append(node)
         home[node.name] = place
     for block in blocks:
-        block.title, block.detail = _described(block, graph)
+        block.title, block.detail = _describe(block, graph)
     blocks += [Block("output", [], {home[name]}, name) for name in wanted if name in home]
-    while _joined(blocks, graph):
+    while _join_pair(blocks, graph):
         pass
-    return _ordered(blocks)
+    return _topological_order(blocks)
 
 
 def chain(blocks: Sequence[Block], output: str) -> list[str]:
@@ -82,7 +82,7 @@ def chain(blocks: Sequence[Block], output: str) -> list[str]:
     return words[::-1]
 
 
-def _joined(blocks: list[Block], graph: Graph) -> bool:
+def _join_pair(blocks: list[Block], graph: Graph) -> bool:
     """Join one pair of boxes that say little apart; False where there is none left.
 
     Twins (the same sources, the same ops) and a small box with the only reader it has: neither can make a circle.
@@ -99,7 +99,7 @@ def _joined(blocks: list[Block], graph: Graph) -> bool:
     for block in blocks:
         if pair[0] in block.before:
             block.before = (block.before - {pair[0]}) | {pair[1]}
-    kept.title, kept.detail = _described(kept, graph)
+    kept.title, kept.detail = _describe(kept, graph)
     return True
 
 
@@ -143,7 +143,7 @@ def _twins(a: Block, b: Block) -> bool:
     return a.before == b.before and {n.op for n in a.nodes} == {n.op for n in b.nodes} and not _starts(a)
 
 
-def _ordered(blocks: list[Block]) -> list[Block]:
+def _topological_order(blocks: list[Block]) -> list[Block]:
     """The boxes that are left, sources before their readers, ``before`` renumbered."""
     places: dict[int, int] = {}
     left = [i for i, b in enumerate(blocks) if b.nodes or b.kind == "output"]
@@ -174,7 +174,7 @@ def _layers(places: Iterable[int], blocks: list[Block]) -> bool:
     return any(blocks[p].kind == "layer" for p in places)
 
 
-def _described(block: Block, graph: Graph) -> tuple[str, str]:
+def _describe(block: Block, graph: Graph) -> tuple[str, str]:
     ops = Counter(n.op for n in block.nodes)
     if block.kind == "input":
         return block.nodes[0].name, ""

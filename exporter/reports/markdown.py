@@ -58,17 +58,17 @@ def _policy(entry: Entry) -> list[str]:
         for c in report.comparisons
         if c.tolerance.reason
     ]
-    lines += _folded("Tolerances other than the default", list(dict.fromkeys(tolerances)))
+    lines += _collapsible_section("Tolerances other than the default", list(dict.fromkeys(tolerances)))
     missing = [
         f"- {code(name)}: {text(state['reason'] or '')}"
         for name, state in report.runtimes.items()
         if state["status"] == "not run"
     ]
-    lines += _folded("Runtimes that did not run", missing)
-    return lines + _folded("Notes", [f"- {text(note)}" for note in report.notes])
+    lines += _collapsible_section("Runtimes that did not run", missing)
+    return lines + _collapsible_section("Notes", [f"- {text(note)}" for note in report.notes])
 
 
-def _folded(title: str, lines: Sequence[str]) -> list[str]:
+def _collapsible_section(title: str, lines: Sequence[str]) -> list[str]:
     """A section that opens on a click; nothing where it would be empty."""
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""] if lines else []
 

@@ -23,7 +23,7 @@ Child: TypeAlias = "str | int | Iterable[Child] | None"
 Rows: TypeAlias = Iterable[Sequence[str]]
 
 
-def escaped(child: Child) -> Markup:
+def escape(child: Child) -> Markup:
     """A child as HTML: markup as it is, text escaped, None nothing, anything else its parts."""
     if child is None:
         return Markup("")
@@ -31,7 +31,7 @@ def escaped(child: Child) -> Markup:
         return child
     if isinstance(child, str | int):
         return Markup(html.escape(printable(str(child), "\t\n")))
-    return Markup("".join(escaped(part) for part in child))
+    return Markup("".join(escape(part) for part in child))
 
 
 def el(tag: str, /, *children: Child, **attributes: str | int | float | None) -> Markup:
@@ -40,9 +40,9 @@ def el(tag: str, /, *children: Child, **attributes: str | int | float | None) ->
     for key, value in attributes.items():
         if value is not None:
             text = f"{value:g}" if isinstance(value, float) else str(value)
-            parts.append(f'{key.rstrip("_").replace("_", "-")}="{escaped(text)}"')
+            parts.append(f'{key.rstrip("_").replace("_", "-")}="{escape(text)}"')
     opening = f"<{' '.join(parts)}>"
-    return Markup(opening if tag in _VOID else f"{opening}{escaped(children)}</{tag}>")
+    return Markup(opening if tag in _VOID else f"{opening}{escape(children)}</{tag}>")
 
 
 def svg(*children: Child, width: float, height: float, **more: str | None) -> Markup:

@@ -34,7 +34,7 @@ def picture(policy: Policy) -> str:
             fix="look at it in TensorBoard: --logdir DIR",
         )
     parts, inner, height, described = diagram_parts(
-        [_sized(b, specs, signature.labels) if b.kind != "layer" else b for b in blocks]
+        [_with_size(b, specs, signature.labels) if b.kind != "layer" else b for b in blocks]
     )
     line = f"{signature.family}, {signature.action_space} actions"
     width = max(inner, _TITLE * len(policy.name), _LINE * len(line)) + 2 * _MARGIN
@@ -52,7 +52,7 @@ def picture(policy: Policy) -> str:
     )
 
 
-def _sized(block: Block, specs: Mapping[str, TensorSpec], labels: Mapping[str, Any]) -> Block:
+def _with_size(block: Block, specs: Mapping[str, TensorSpec], labels: Mapping[str, Any]) -> Block:
     """An input or output with its size beside its name, and its role and labels where the pointer rests on it."""
     spec = specs[block.title]
     size = "×".join("any" if n is None else str(n) for n in spec.shape[1:]) or "1"

@@ -244,13 +244,13 @@ def worst_inputs(entry: Entry) -> Markup | None:
         return None
     rows = []
     for c in worst.values():
-        fed = [el("div", el("code", n), f" {shortened(a)}") for n, a in entry.feeds(c.worst_input or "").items()]
+        fed = [el("div", el("code", n), f" {first_values(a)}") for n, a in entry.feeds(c.worst_input or "").items()]
         rows.append((el("code", c.output), c.where, f"{c.max_abs_diff:.3g}", c.worst_input, _wide(fed or "–")))
     head = ("output", "where", "|Δ|", "input", "values of its first row")
     return section("Worst inputs", table("The input on which each output differs most", head, rows))
 
 
-def shortened(array: np.ndarray) -> str:
+def first_values(array: np.ndarray) -> str:
     """The first values of the first row."""
     row = np.asarray(array)[:1].reshape(-1)
     values = [f"{float(v):.4g}" for v in row[:_SHOWN_VALUES]]

@@ -50,13 +50,13 @@ class Destinations:
             if self.markdown == Path("-"):
                 echo(text.rstrip("\n"))
             else:
-                content.append((self.markdown, _appended(self.markdown, text.encode("utf-8"))))
+                content.append((self.markdown, _append_to_summary(self.markdown, text.encode("utf-8"))))
         for path, data in content:
             with _reporting(path):
                 path.write_bytes(data)
 
 
-def _appended(path: Path, data: bytes) -> bytes:
+def _append_to_summary(path: Path, data: bytes) -> bytes:
     """GitHub's summary of a job step is appended to, as its documentation asks; any other file is replaced."""
     summary = os.environ.get("GITHUB_STEP_SUMMARY")
     if not summary or path.absolute() != Path(summary).absolute() or not path.exists():

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from exporter.reports import charts
 from exporter.reports.entry import Entry, of_bundle, of_result
 from exporter.reports.page import page
-from exporter.reports.sections import shortened
+from exporter.reports.sections import first_values
 from exporter.verify.options import VerifyOptions
 from fixtures import path as fixture
 from tests.exporter.rehearsal import ActingPool, export
@@ -104,7 +104,7 @@ def test_a_page_shows_all_that_is_known_of_a_policy(recurrent: tuple[Entry, Path
     ):
         assert words in parsed.text, words
     case = max((c for c in made.report.failures if c.output == "recurrent_out"), key=lambda c: c.max_abs_diff)
-    assert shortened(made.feeds(str(case.worst_input))["state"]) in parsed.text
+    assert first_values(made.feeds(str(case.worst_input))["state"]) in parsed.text
     assert [t for t, _ in parsed.elements].index("h1") < [t for t, _ in parsed.elements].index("h2")
     assert parsed.count("h1") == 1
     assert page([of_bundle(made.report, folder, None, 3)]).count("<rect") == source.count("<rect")
