@@ -25,7 +25,7 @@ from typing import Any
 from converters.runtimes.pool import INDEPENDENT, RuntimePool
 from converters.runtimes.registry import RUNTIMES, available_runtimes
 from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.difference import added, by_decade
+from exporter.verify.difference import add_histograms, by_decade
 from exporter.verify.findings import Finding
 from exporter.verify.report import ParityReport
 from signatures.roles import Role
@@ -85,7 +85,7 @@ class Cell:
         self.rounding += bool(comparison.rounding)
         place, key = (self.apart, comparison.output) if comparison.tolerance.reason else (self.worst, policy)
         place[key] = max(place.get(key, 0.0), comparison.max_abs_diff)
-        self.elements = added([self.elements, comparison.histogram])
+        self.elements = add_histograms([self.elements, comparison.histogram])
 
     def to_dict(self) -> dict[str, Any]:
         return {

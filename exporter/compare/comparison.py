@@ -166,7 +166,7 @@ def compare_artefacts(
                 source,
                 policy.source,
             )
-            compared = partial(_compared, policy, chosen, used, known, pool, options, progress)
+            compared = partial(_compare, policy, chosen, used, known, pool, options, progress)
             if storage is None:
                 reports.append(compared(tested))
             else:
@@ -183,7 +183,7 @@ def compare_artefacts(
     return report
 
 
-def _compared(
+def _compare(
     policy: Policy,
     candidates: Sequence[tuple[_Candidate, Path]],
     runtimes: Sequence[str],

@@ -309,9 +309,9 @@ def _check_parity(options: ExportOptions, formats: Sequence[Format]) -> None:
         raise UsageError(f"{given[0]} needs a verification", why="--verify none was given", fix="leave one of them out")
     check_budget(parity.budget, {f.key: 0 for f in formats})
     if parity.golden is not None:
-        from exporter.verify.golden import recorded
+        from exporter.verify.golden import read_recording
 
-        recorded(Path(parity.golden))
+        read_recording(Path(parity.golden))
 
 
 def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:

@@ -37,7 +37,7 @@ def nearby(path: Path) -> Iterator[Path]:
         yield path
         return
     with scratch_folder() as folder:
-        local = _fetched(address, Path(folder))
+        local = _fetch(address, Path(folder))
         try:
             yield local
         except ExportModelError as error:
@@ -66,7 +66,7 @@ def version(path: Path) -> str | None:
     return sha256_hex(repr(told).encode()) if all(known for _, _, known in told) else None
 
 
-def _fetched(address: str, folder: Path) -> Path:
+def _fetch(address: str, folder: Path) -> Path:
     system, place = filesystem(address)
     with asking(address):
         found = _files(system, place)

@@ -261,13 +261,15 @@ def first_values(array: np.ndarray) -> str:
 def tolerances(entry: Entry) -> Markup:
     """The default, what differs from it with its reason, and where rounding explains more."""
     comparisons = entry.report.comparisons
-    plain = list(dict.fromkeys(c.bound for c in comparisons if not c.tolerance.reason and not isinstance(c, Failure)))
+    plain = list(
+        dict.fromkeys(c.bound_text for c in comparisons if not c.tolerance.reason and not isinstance(c, Failure))
+    )
     content: list[Child] = []
     if plain:
         rounding = ", or what float32 rounding was measured to explain there, where that is more"
         content.append(el("p", "|Δ| ≤ ", el("code", " or ".join(plain)), f" for every element{rounding}."))
     special = [
-        (el("code", c.output), c.where, el("code", c.bound), _wide(c.tolerance.reason))
+        (el("code", c.output), c.where, el("code", c.bound_text), _wide(c.tolerance.reason))
         for c in comparisons
         if c.tolerance.reason
     ]

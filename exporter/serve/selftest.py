@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Graph
-from exporter.verify.difference import floored, ties
+from exporter.verify.difference import floor_log_probs, ties
 from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.roles import Role
@@ -79,7 +79,7 @@ class _Book:
             value = answers[spec.name]
             branches = self.signature.branches
             if spec.role is Role.LOG_PROBS and value.ndim and value.dtype.kind == "f":
-                value = floored(value, branches)
+                value = floor_log_probs(value, branches)
             entry = self._tensor(spec.name, value)
             if spec.role is Role.LOG_PROBS:
                 entry["floored"] = list(branches) if sum(branches) == value.shape[-1] else [value.shape[-1]]

@@ -112,7 +112,7 @@ class Bisector:
                 continue
             difference = compare(known[name], array, Tolerance(0, 0))
             if not difference.passed:
-                found.append(_found(graph.producer(name), name, known[name], array, difference, self._source))
+                found.append(_bisection_at(graph.producer(name), name, known[name], array, difference, self._source))
         return found
 
     @cached_property
@@ -145,7 +145,7 @@ class Bisector:
         return self._opened[1]
 
     @cached_property
-    def _noted(self) -> dict[str, str]:
+    def _origins(self) -> dict[str, str]:
         """Node → the source's tensor, as the artefacts note it."""
         found: dict[str, str] = {}
         for key, path in self.tested.artefacts.items():
@@ -157,7 +157,7 @@ class Bisector:
     def _source(self, node: Node) -> str | tuple[str, ...] | None:
         """The source's tensor: what the graph knows of it, else what an artefact notes."""
         if node.origin is None or node.origin == f"{node.name}:0":
-            return self._noted.get(node.name, node.origin)
+            return self._origins.get(node.name, node.origin)
         return node.origin
 
 
@@ -180,7 +180,7 @@ class _Search:
         expected = run_graph(self.graph, self.feeds, tensors)
         seen: set[str] = set()
         for chunk in _chunks(tensors, expected):
-            got = self._fetched(chunk)
+            got = self._fetch(chunk)
             seen |= got.keys()
             for tensor in chunk:
                 if tensor in got and (found := self._wrong(tensor, expected[tensor], got[tensor], seen)) is not None:
@@ -193,7 +193,7 @@ class _Search:
             return Bisection(sampler.name, sampler.op, self.source(sampler), reason=reason)
         return Bisection(None, reason="no tensor that leads to it differs by more than the tolerance")
 
-    def _fetched(self, tensors: Sequence[str]) -> dict[str, np.ndarray]:
+    def _fetch(self, tensors: Sequence[str]) -> dict[str, np.ndarray]:
         """The candidate's values; one that it cannot give is left out, as one that it has not."""
         try:
             return self.candidate.fetch(self.feeds, tensors)
@@ -201,7 +201,7 @@ class _Search:
             if len(tensors) == 1:
                 return {}
             half = len(tensors) // 2
-            return {**self._fetched(tensors[:half]), **self._fetched(tensors[half:])}
+            return {**self._fetch(tensors[:half]), **self._fetch(tensors[half:])}
 
     def _wrong(self, tensor: str, expected: np.ndarray, got: np.ndarray, seen: set[str]) -> Bisection | None:
         node = self.graph.producer(tensor)
@@ -220,7 +220,7 @@ class _Search:
             if difference.passed:
                 return None
         hidden = tuple(r for r in dict.fromkeys(node.inputs) if r not in seen and not self._is_setting(r))
-        return _found(node, tensor, expected, got, difference, self.source, hidden)
+        return _bisection_at(node, tensor, expected, got, difference, self.source, hidden)
 
     def _is_setting(self, tensor: str) -> bool:
         """An axis, a shape: other formats have it as an attribute."""
@@ -228,7 +228,7 @@ class _Search:
         return value is not None and value.dtype.kind != "f"
 
 
-def _found(
+def _bisection_at(
     node: Node,
     tensor: str,
     expected: np.ndarray,

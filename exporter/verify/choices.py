@@ -45,7 +45,7 @@ class Choices:
         if not choices:
             return
         try:
-            ranked = [self._ranked(node, feeds, tolerance, moved) for node in choices]
+            ranked = [self._rank(node, feeds, tolerance, moved) for node in choices]
             for rival in range(1, _RIVALS + 1):
                 made, changed = dict(feeds), False
                 for node, (order, near) in zip(choices, ranked, strict=True):
@@ -59,19 +59,19 @@ class Choices:
         except GraphError:  # what does not run explains nothing
             return
 
-    def tied(self, output: str, feeds: Feeds, tolerance: Tolerance, rows: int) -> np.ndarray:
+    def tied_rows(self, output: str, feeds: Feeds, tolerance: Tolerance, rows: int) -> np.ndarray:
         """Whether a choice that ``output`` hangs on is open, for each of ``rows``."""
         found = np.zeros(rows, bool)
         try:
             for node in self.behind(output):
-                _, near = self._ranked(node, feeds, tolerance, None)
+                _, near = self._rank(node, feeds, tolerance, None)
                 if len(near) == rows:
                     found |= near[..., 1:].reshape(rows, -1).any(axis=1)
         except GraphError:
             return found
         return found
 
-    def undefined(self, output: str, feeds: Feeds) -> bool:
+    def has_only_nan_scores(self, output: str, feeds: Feeds) -> bool:
         """Whether all scores that ``output`` is chosen by are NaN."""
         graph, choices = runnable(self._graph), self.behind(output)
         try:
@@ -80,7 +80,7 @@ class Choices:
             return False
         return bool(choices) and all(np.isnan(s).all() for s in scores.values())
 
-    def _ranked(
+    def _rank(
         self, node: Node, feeds: Feeds, tolerance: Tolerance, moved: Moved | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Places from the best on along the last axis, and which are as good as it."""

@@ -189,7 +189,7 @@ def spread(answers: Sequence[np.ndarray]) -> np.ndarray | None:
     return np.where(np.isfinite(varies) & (varies > 0), varies, np.inf)
 
 
-def floored(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
+def floor_log_probs(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
     """Log-probabilities with those that say "never" brought to one value: 2⁻¹²⁶ of the likeliest class of the branch.
 
     Below it a float32 probability is denormal or zero: its logarithm has few digits left, is −∞ where it is flushed to
@@ -240,7 +240,7 @@ def decades_by_group(differences: np.ndarray, groups: np.ndarray, count: int) ->
     return np.bincount(groups * BINS + places, minlength=count * BINS).reshape(count, BINS)
 
 
-def added(histograms: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
+def add_histograms(histograms: Iterable[tuple[int, ...]]) -> tuple[int, ...]:
     """The sum of histograms; empty ones count nothing."""
     return tuple(map(sum, zip(*filter(None, histograms), strict=True)))
 

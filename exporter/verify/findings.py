@@ -122,7 +122,7 @@ class Finding:
         return f"{self.format} in {self.runtime}"
 
     @property
-    def bound(self) -> str:
+    def bound_text(self) -> str:
         """What is allowed, as a formula."""
         return f"{self.tolerance.atol:g} + {self.tolerance.rtol:g}·|reference|"
 
@@ -154,7 +154,7 @@ class Finding:
         if self.reason:
             text += f": {self.reason}"
         elif math.isfinite(self.max_abs_diff):
-            text += f" by {self.max_abs_diff:.3g} (relative {self.max_rel_diff:.3g}), allowed {self.bound}"
+            text += f" by {self.max_abs_diff:.3g} (relative {self.max_rel_diff:.3g}), allowed {self.bound_text}"
         return f"{text} [{self.kind}, {self.worst_input}]"
 
     def explanation(self) -> list[str]:
@@ -304,13 +304,13 @@ def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -
     return Failure(kind, runtime, output, infinite, infinite, Tolerance(), False, None, text.strip())
 
 
-def died(kind: str, runtime: str, error: RunFailedError) -> Undecided:
+def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undecided:
     """A reference that gave no answer: nothing was held against it."""
     text = error.what if error.why is None else f"{error.what}: {error.why}"
-    return undecided(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {text.strip()}")
+    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {text.strip()}")
 
 
-def undecided(kind: str, runtime: str, output: str, reason: str, where: str | None = None) -> Undecided:
+def undecided_finding(kind: str, runtime: str, output: str, reason: str, where: str | None = None) -> Undecided:
     """What could not be compared, and why."""
     infinite = float("inf")
     return Undecided(kind, runtime, output, infinite, infinite, Tolerance(), False, where, reason)

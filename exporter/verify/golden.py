@@ -48,7 +48,7 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
         spec = specs.get(name) or specs.get(name.removesuffix(":0"))
         if spec is None:
             known = ", ".join(s.name for s in (*signature.inputs, *signature.outputs))
-            raise _refused(path, f"{name!r} is no input or output of the policy", f"there are {known}")
+            raise _recording_error(path, f"{name!r} is no input or output of the policy", f"there are {known}")
         given[spec.name] = _fitting(path, spec, array)
     rows = _rows(path, signature, given)
     for spec in signature.inputs:
@@ -56,7 +56,7 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
             continue
         if spec.role not in _DEFAULTS:
             fix = "record every observation; memory, noise and masks may be left out"
-            raise _refused(path, f"the input {spec.name!r} was not recorded", fix)
+            raise _recording_error(path, f"the input {spec.name!r} was not recorded", fix)
         if spec.role is Role.NOISE:
             noiseless.add(spec.name)
         shape = tuple(rows if i == 0 else n or 1 for i, n in enumerate(spec.shape))
@@ -71,16 +71,16 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
     return Golden(tuple(cases), tuple(answers), frozenset(noiseless))
 
 
-def recorded(path: Path) -> bytes:
+def read_recording(path: Path) -> bytes:
     """The content of a recording. Raises UsageError where it cannot be read."""
     try:
         return read_bytes(path)
     except SourceError as error:
-        raise _refused(path, error.what, error.fix, error.why) from error
+        raise _recording_error(path, error.what, error.fix, error.why) from error
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    data = recorded(path)
+    data = read_recording(path)
     try:
         with open_archive(data) as archive:
             names = archive.namelist()
@@ -92,10 +92,10 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"its {len(data)} bytes unpack to {whole}")
             return {name.removesuffix(".npy"): read_array(entry_of(archive, name, whole)) for name in names}
     except (*ZIP_ERRORS, TypeError, RecursionError) as error:
-        raise _refused(path, "cannot be read as an .npz archive", "numpy.savez(FILE, …)", str(error)) from error
+        raise _recording_error(path, "cannot be read as an .npz archive", "numpy.savez(FILE, …)", str(error)) from error
 
 
-def _refused(path: Path, what: str, fix: str | None, why: str | None = None) -> UsageError:
+def _recording_error(path: Path, what: str, fix: str | None, why: str | None = None) -> UsageError:
     return UsageError(f"--golden: {what}", where=str(path), why=why, fix=fix)
 
 
@@ -109,7 +109,7 @@ def _fitting(path: Path, spec: TensorSpec, array: np.ndarray) -> np.ndarray:
     if not spec.fits(array) or array.dtype.kind not in "fiub":
         wanted = "[" + ", ".join("rows" if n is None else str(n) for n in spec.shape) + "]"
         what = f"{spec.name!r} is {array.dtype} {list(array.shape)}, and {spec.dtype} {wanted} is wanted"
-        raise _refused(path, what, "record it as the policy takes and gives it, a row for each step")
+        raise _recording_error(path, what, "record it as the policy takes and gives it, a row for each step")
     return np.ascontiguousarray(array.astype(spec.dtype))
 
 
@@ -119,5 +119,5 @@ def _rows(path: Path, signature: PolicySignature, given: Mapping[str, np.ndarray
     if not counts or min(counts.values()) != max(counts.values()) or not min(counts.values()):
         said = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
         fix = "give every array a row for each recorded step"
-        raise _refused(path, "the arrays have not the same number of rows", fix, f"rows: {said}")
+        raise _recording_error(path, "the arrays have not the same number of rows", fix, f"rows: {said}")
     return min(counts.values())

@@ -33,12 +33,12 @@ def inner_tensors(
             return
         own, run, view, origins = participant.fed, found.run, found.view, origins or {}
 
-        def known(tensor: str) -> View | None:
+        def find_view(tensor: str) -> View | None:
             source = origins.get(tensor, tensor)
             names = (tensor, source, source.removesuffix(":0"), f"{source.removesuffix(':0')}:0")
             return next((v for name in names if (v := view(name)) is not None), None)
 
-        yield InnerTensors(known, lambda feeds, fetch: run(own(feeds), fetch), foreign=True)
+        yield InnerTensors(find_view, lambda feeds, fetch: run(own(feeds), fetch), foreign=True)
 
 
 def saved_graph(folder: Path) -> Graph:

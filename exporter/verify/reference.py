@@ -13,7 +13,7 @@ from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.drawn_columns import drawn_columns
-from exporter.verify.findings import Undecided, died
+from exporter.verify.findings import Undecided, undecided_reference
 from exporter.verify.original import Original
 from exporter.verify.participants import PolicyUnderTest
 from signatures.roles import Role
@@ -55,7 +55,7 @@ class Reference(AbstractContextManager["Reference"]):
             with source.loadable() as (path, options):
                 model = pool.process(source.runtime).load(path, **options)
         except RunFailedError as error:
-            self.failures.append(died("source", source.runtime, error))
+            self.failures.append(undecided_reference("source", source.runtime, error))
             return
         self._loaded.append(model)
         self.original = Original(model, self.signature, tested.source_map)

@@ -69,7 +69,7 @@ class Rounding:
             names = list(dict.fromkeys([*self._names, memory]))
             try:
                 exact = rolled(lambda feeds: model.run(feeds, names))
-                moved = [_moved(model, rolled, jitter, key[1], names) for jitter in self._runs(sure)]
+                moved = [_jittered_answers(model, rolled, jitter, key[1], names) for jitter in self._runs(sure)]
             except RunFailedError:
                 exact, moved = [], []
             self._known[key] = self._largest_of(exact, moved)
@@ -91,7 +91,9 @@ class Rounding:
         return [{n: _largest(step[n], [m[i][n] for m in moved]) for n in step} for i, step in enumerate(exact)]
 
 
-def _moved(model: LoadedModel, rolled: Rolled, jitter: int, arithmetic: str, names: Sequence[str]) -> list[Arrays]:
+def _jittered_answers(
+    model: LoadedModel, rolled: Rolled, jitter: int, arithmetic: str, names: Sequence[str]
+) -> list[Arrays]:
     count = 0
 
     def run(feeds: Feeds) -> Arrays:

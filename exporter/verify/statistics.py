@@ -144,7 +144,7 @@ def dependent(deviations: Sequence[np.ndarray], largest: float = 3.0) -> int:
     return int(np.flatnonzero(wrong[1:])[0]) + 1 if wrong[1:].any() else 0
 
 
-def related(reference: np.ndarray, draws: np.ndarray) -> bool:
+def columns_related(reference: np.ndarray, draws: np.ndarray) -> bool:
     """Whether the columns of two samples [n, columns] hang together by their ranks otherwise than by chance."""
     if reference.shape[1] < 2 or not np.isfinite(draws).all():
         return False

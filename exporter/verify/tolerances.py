@@ -60,7 +60,9 @@ def tolerance_for(signature: PolicySignature, output: str, default: Tolerance) -
     return known if known.atol > default.atol else default
 
 
-def ruled(rules: Sequence[ToleranceRule], policy: str, kind: str, runtime: str, output: str) -> Tolerance | None:
+def tolerance_by_rules(
+    rules: Sequence[ToleranceRule], policy: str, kind: str, runtime: str, output: str
+) -> Tolerance | None:
     """What a user's rules say of a comparison: the last one that covers it decides; None where none does."""
     return next((r.tolerance for r in reversed(rules) if r.covers(policy, kind, runtime, output)), None)
 

@@ -15,7 +15,7 @@ from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
 from exporter.verify.choices import Choices, broken_ties
-from exporter.verify.difference import SHARE, Difference, compare, compare_all, floored, spread, ties
+from exporter.verify.difference import SHARE, Difference, compare, compare_all, floor_log_probs, spread, ties
 from exporter.verify.drawn_columns import without_draws
 from exporter.verify.findings import Bisection, Finding, Shape
 from exporter.verify.golden import Golden, read_golden
@@ -23,7 +23,7 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.reference import Reference
 from exporter.verify.rounding import Rounding
-from exporter.verify.tolerances import Tolerance, ruled, tolerance_for
+from exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
 from exporter.verify.work import Allowance, products
 from signatures.roles import Role
 from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
@@ -65,9 +65,9 @@ class Trial:
         drawn = {*reference.drawn, *reference.partly_drawn}
         if self.signature.memory is not None and self.signature.memory.output in drawn:
             self.steps = []  # it keeps what was drawn: every run goes another way
-        self.expected_steps = self.rolled(lambda feeds: reference.answers([feeds])[0])
+        self.expected_steps = self.roll_out(lambda feeds: reference.answers([feeds])[0])
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
-        self.rounding = Rounding(self.options.seed, numbers, self._settled)
+        self.rounding = Rounding(self.options.seed, numbers, self._comparable)
         self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
         self._spreads: dict[str, np.ndarray | None] = {}
         self._flushed: dict[str, Arrays] = {}
@@ -91,13 +91,15 @@ class Trial:
     def _left_out(self) -> list[str]:
         return [note for (who, _), each in self._allowances.items() if (note := each.note(who)) is not None]
 
-    def drawn(self, name: str, participant: Participant) -> bool:
+    def is_drawn(self, name: str, participant: Participant) -> bool:
         """Whether the reference or the participant draws an output: there is no number to compare then."""
         return name in self.reference.drawn or name in participant.drawn
 
     def tolerance(self, output: str, participant: Participant) -> Tolerance:
         """How far apart they may be: what a user said, an exception of the table, or the default."""
-        found = ruled(self.options.rules, self.tested.name, participant.format, participant.runtime, output)
+        found = tolerance_by_rules(
+            self.options.rules, self.tested.name, participant.format, participant.runtime, output
+        )
         return found or tolerance_for(self.signature, output, self.options.tolerance)
 
     def difference(
@@ -106,23 +108,23 @@ class Trial:
         """``got`` beside the reference's answer. What rounding explains is looked at where it matters, for an input or
         a step of the rollout.
         """
-        found = self._compared(name, expected, got, participant)
+        found = self._compare(name, expected, got, participant)
         if at is None or found.passed or found.reason:
             return found
         if isinstance(at, Case) and (flushed := at.flush_denormals()) is not None:
             if at.name not in self._flushed:
                 (self._flushed[at.name],) = self.reference.answers([flushed])
-            if (other := self._compared(name, self._flushed[at.name], got, participant)).passed:
+            if (other := self._compare(name, self._flushed[at.name], got, participant)).passed:
                 return other
-        rounding = self._explained(at, participant)
-        explained = self._compared(name, expected, got, participant, rounding)
+        rounding = self._rounding_bounds(at, participant)
+        explained = self._compare(name, expected, got, participant, rounding)
         if not explained.passed and (settled := self._broken_ties(name, expected, got, participant, at)) is not None:
             expected = {**expected, name: settled}
-            explained = self._compared(name, expected, got, participant, rounding)
+            explained = self._compare(name, expected, got, participant, rounding)
         far = {n: _HOPELESS * a for n, a in rounding.items()}
-        if explained.passed or not self._compared(name, expected, got, participant, far).passed:
+        if explained.passed or not self._compare(name, expected, got, participant, far).passed:
             return explained
-        return self._compared(name, expected, got, participant, self._explained(at, participant, sure=True))
+        return self._compare(name, expected, got, participant, self._rounding_bounds(at, participant, sure=True))
 
     def _broken_ties(
         self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, at: Case | int
@@ -154,8 +156,8 @@ class Trial:
     ) -> list[Difference]:
         """``difference`` of several inputs or steps. What passes as it is, nearly all, is compared at once."""
         found = compare_all(
-            [self._settled({name: e[name]})[name] for e in expected],
-            [self._settled({name: g})[name] for g in got],
+            [self._comparable({name: e[name]})[name] for e in expected],
+            [self._comparable({name: g})[name] for g in got],
             self.tolerance(name, participant),
             narrowed=narrows(participant.format),
             most=self._most(name, participant),
@@ -165,22 +167,22 @@ class Trial:
             for i, known in enumerate(found)
         ]
 
-    def _explained(self, at: Case | int, participant: Participant, *, sure: bool = False) -> Feeds:
+    def _rounding_bounds(self, at: Case | int, participant: Participant, *, sure: bool = False) -> Feeds:
         """Per output, what rounding explains of it."""
         if isinstance(at, Case):
             return self.rounding.outputs(self.reference.model, at, participant.runtime, sure=sure)
         assert self.signature.recurrence is not None
         kept, runtime = self.signature.recurrence[1], participant.runtime
-        return self.rounding.steps(self.reference.model, self.rolled, kept, at, runtime, sure=sure)
+        return self.rounding.steps(self.reference.model, self.roll_out, kept, at, runtime, sure=sure)
 
-    def _compared(
+    def _compare(
         self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: Feeds | None = None
     ) -> Difference:
         return compare(
-            self._settled({name: expected[name]})[name],
-            self._settled({name: got})[name],
+            self._comparable({name: expected[name]})[name],
+            self._comparable({name: got})[name],
             self.tolerance(name, participant),
-            free=self._undecided(name, expected, participant, rounding or {}),
+            free=self._open_choices(name, expected, participant, rounding or {}),
             narrowed=narrows(participant.format),
             rounding=None if rounding is None or got.dtype.kind != "f" else rounding.get(name),
             most=self._most(name, participant),
@@ -195,14 +197,14 @@ class Trial:
             return None
         if name not in self._spreads:
             made = [
-                self._settled(answers)[name]
+                self._comparable(answers)[name]
                 for case, answers in zip(self.cases, self.expected, strict=True)
                 if name in answers and case.name.startswith("typical")
             ]
             self._spreads[name] = spread(made)
         return self._spreads[name]
 
-    def bisected(
+    def bisect(
         self, participant: Participant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
     ) -> Bisection | None:
         """Where a difference begins; None where there is none, or its reason says all there is to say."""
@@ -250,7 +252,7 @@ class Trial:
         share = float(most.min())
         return Tolerance(share, 0.0, f"a thousandth of how far it varies (a column by {share / SHARE:.2g} only)")
 
-    def rolled(self, run: Callable[[Feeds], Arrays]) -> list[Arrays]:
+    def roll_out(self, run: Callable[[Feeds], Arrays]) -> list[Arrays]:
         """Outputs of each step, the memory fed back."""
         answers: list[Arrays] = []
         for feeds in self.steps:
@@ -273,11 +275,11 @@ class Trial:
                 return False
         return True
 
-    def _settled(self, values: Feeds) -> Arrays:
+    def _comparable(self, values: Feeds) -> Arrays:
         """Values as they are compared: log-probabilities that say "never" are all the same, drawn columns are zeros."""
         partly = self.reference.partly_drawn
         return {
-            n: floored(a, self.signature.branches)
+            n: floor_log_probs(a, self.signature.branches)
             if n in self._scores and a.dtype.kind == "f" and a.ndim
             else without_draws(a, partly[n])
             if n in partly
@@ -285,7 +287,7 @@ class Trial:
             for n, a in values.items()
         }
 
-    def _undecided(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
+    def _open_choices(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
         """Where an argmax is not decided, because the scores of the reference are too close; and where no noise times a
         deviation that overflows is NaN in a source that is fed zeros: the policy gives its mean there.
         """

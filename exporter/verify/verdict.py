@@ -91,14 +91,14 @@ def _agreement(report: ParityReport) -> str:
     rest = _remedy(report, unchecked, "the other" if len(unchecked) == 1 else "the others")
     count = f"{len(checked)} of {len(every)} {what if len(every) > 1 else what[:-1]}{rest}"
     verb = "agrees" if len(checked) == 1 else "agree"
-    return f"{', '.join(checked)} ({count}) {verb} with {reference_text(report)}{_rounded(report)}"
+    return f"{', '.join(checked)} ({count}) {verb} with {reference_text(report)}{_rounded_weights_text(report)}"
 
 
-def _rounded(report: ParityReport) -> str:
+def _rounded_weights_text(report: ParityReport) -> str:
     """What was compared in which way, where weights were rounded."""
     kept = list(dict.fromkeys(c.runtime for c in report.comparisons if isinstance(c, Decisions)))
     return (
-        f": numbers with weights rounded to {_listed(kept)} there too, decisions with weights as they were"
+        f": numbers with weights rounded to {_enumerate_names(kept)} there too, decisions with weights as they were"
         if kept
         else ""
     )
@@ -125,18 +125,18 @@ def _remedy(report: ParityReport, unchecked: Sequence[str], others: str) -> str:
     if not unchecked:
         return ""
     install, ask = missing_runtimes(report, unchecked)
-    verbs = [f"{verb} {_listed(names)}" for verb, names in (("install", install), ("ask for", ask)) if names]
-    return f"; {' and '.join(verbs)} to check {others}" if verbs else f"; no runtime runs {_listed(unchecked)}"
+    verbs = [f"{verb} {_enumerate_names(names)}" for verb, names in (("install", install), ("ask for", ask)) if names]
+    return f"; {' and '.join(verbs)} to check {others}" if verbs else f"; no runtime runs {_enumerate_names(unchecked)}"
 
 
 def required_reason(report: ParityReport, missing: Sequence[str]) -> str:
     """Return why what was required (``--require``) is not decided."""
     were = "was" if len(missing) == 1 else "were"
     them = "it" if len(missing) == 1 else "them"
-    return f"{_listed(missing)} {were} required, and not checked{_remedy(report, missing, them)}"
+    return f"{_enumerate_names(missing)} {were} required, and not checked{_remedy(report, missing, them)}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def _enumerate_names(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) < 2 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
@@ -204,9 +204,13 @@ def _alone(report: ParityReport) -> str:
         return ""
     (kind,) = kinds
     agreeing = [n for n, passed in ran[kind].items() if passed]
-    where = f" in {_listed([n for _, n in wrong])}" if agreeing else ""
-    others = [*right, *([f"{kind} in {_listed(agreeing)}"] if agreeing else [])]
-    return f"; {kind}{where} alone differs, {_listed(others)} agree{'s' if len(others) == 1 else ''}" if others else ""
+    where = f" in {_enumerate_names([n for _, n in wrong])}" if agreeing else ""
+    others = [*right, *([f"{kind} in {_enumerate_names(agreeing)}"] if agreeing else [])]
+    return (
+        f"; {kind}{where} alone differs, {_enumerate_names(others)} agree{'s' if len(others) == 1 else ''}"
+        if others
+        else ""
+    )
 
 
 def _drawn_apart(report: ParityReport) -> str:

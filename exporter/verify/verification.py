@@ -11,11 +11,11 @@ from converters.runtimes.registry import RuntimeInfo
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
-from exporter.verify.checks.finite import undefined
-from exporter.verify.checks.numbers import numbers, recorded
+from exporter.verify.checks.finite import check_defined
+from exporter.verify.checks.numbers import check_recording, numbers
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.checks.size import check_budget, sizes
-from exporter.verify.findings import Finding, died, failure, undecided
+from exporter.verify.findings import Finding, failure, undecided_finding, undecided_reference
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import (
     Failure,
@@ -76,25 +76,28 @@ def _findings(
     try:
         trial.ask(reference)
     except RunFailedError as error:
-        return [*findings, died("reference" if reference.original is None else "source", reference.runtime, error)]
-    findings += recorded(trial)
-    findings += undefined(trial)
+        return [
+            *findings,
+            undecided_reference("reference" if reference.original is None else "source", reference.runtime, error),
+        ]
+    findings += check_recording(trial)
+    findings += check_defined(trial)
 
-    def failed(kind: str, runtime: str, error: RunFailedError, output: str) -> None:
+    def add_failure(kind: str, runtime: str, error: RunFailedError, output: str) -> None:
         findings.append(failure(kind, runtime, error, output))
 
     taking_part: Iterable[Participant]
     if participants is None:
-        taking_part = participants_of(trial.tested, runtimes, trial.pool, reference, failed)
+        taking_part = participants_of(trial.tested, runtimes, trial.pool, reference, add_failure)
     else:
-        taking_part = participants(reference.model, failed)
+        taking_part = participants(reference.model, add_failure)
     for participant in taking_part:
         progress(f"{trial.tested.name}: {participant.name} in {participant.runtime}")
         try:
             for check in CHECKS:
                 findings += check(trial, participant)
         except RunFailedError as error:
-            failed(participant.name, participant.runtime, error, "*")
+            add_failure(participant.name, participant.runtime, error, "*")
         finally:
             trial.bisector.close()
     return findings
@@ -138,16 +141,16 @@ def _report(
         self_consistent=tested.source is None and not tested.runs_elsewhere,
         original=reference.removeprefix("source/") if reference.startswith("source/") else None,
     )
-    return _required(report, options.require)
+    return _with_required(report, options.require)
 
 
-def _required(report: ParityReport, wanted: Collection[str]) -> ParityReport:
+def _with_required(report: ParityReport, wanted: Collection[str]) -> ParityReport:
     """Return the report with a finding for each format that was required (``--require``) and that nothing checked."""
     missing = [k for k in report.unchecked if "all" in wanted or key_of(k) in wanted]
     missing += [k for k in wanted if k != "all" and k not in map(key_of, report.sizes)]
     if not missing:
         return report
     reason = required_reason(report, missing)
-    found = tuple(undecided(kind, "none", "*", reason) for kind in missing)
+    found = tuple(undecided_finding(kind, "none", "*", reason) for kind in missing)
     passed = report.passed if report.passed is False else None
     return replace(report, passed=passed, comparisons=(*report.comparisons, *found))

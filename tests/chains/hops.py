@@ -15,7 +15,7 @@ from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.verify.difference import compare, floored
+from exporter.verify.difference import compare, floor_log_probs
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.contract import safe_name
 from signatures.roles import Role
@@ -87,7 +87,7 @@ def told(policy: Policy) -> dict[str, Any]:
 def _settled(answers: Mapping[str, np.ndarray], signature: PolicySignature) -> dict[str, np.ndarray]:
     """Answers as verification compares them: log-probabilities that say "never" are one value."""
     scores = {s.name for s in signature.outputs if s.role is Role.LOG_PROBS and s.dtype == "float32"}
-    return {n: floored(a, signature.branches) if n in scores else a for n, a in answers.items()}
+    return {n: floor_log_probs(a, signature.branches) if n in scores else a for n, a in answers.items()}
 
 
 def assert_runs_alike(wanted: ExportResult, got: ExportResult, form: str, pool: RuntimePool) -> None:

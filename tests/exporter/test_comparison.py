@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.verify.difference import compare, compare_all, floored, ties
+from exporter.verify.difference import compare, compare_all, floor_log_probs, ties
 from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from signatures.roles import Role
@@ -164,17 +164,17 @@ def test_log_probabilities_that_say_never_are_all_the_same() -> None:
     scores = np.array([[0.0, -1e8, -5.0, -5.0 - 88], [-3.0, -np.inf, -5.0, -80.0]], np.float32)
     never = math.log(2) * -126
     expected = np.array([[0, never, -5, -5 + never], [-3, -3 + never, -5, -80]], np.float32)
-    np.testing.assert_allclose(floored(scores, (2, 2)), expected, rtol=1e-6, strict=True)
+    np.testing.assert_allclose(floor_log_probs(scores, (2, 2)), expected, rtol=1e-6, strict=True)
 
 
 def test_log_probabilities_that_do_not_fit_the_branches_are_one_branch() -> None:
     scores = np.array([[0.0, -200.0, -1.0]], np.float32)
-    assert floored(scores, (2, 2))[0, 1] == pytest.approx(-126 * math.log(2))
-    assert floored(np.zeros((0, 3), np.float32), (3,)).shape == (0, 3)
+    assert floor_log_probs(scores, (2, 2))[0, 1] == pytest.approx(-126 * math.log(2))
+    assert floor_log_probs(np.zeros((0, 3), np.float32), (3,)).shape == (0, 3)
 
 
 def test_what_is_not_a_number_stays_so() -> None:
-    result = floored(np.array([[math.nan, 0.0], [-math.inf, -math.inf]], np.float32), (2,))
+    result = floor_log_probs(np.array([[math.nan, 0.0], [-math.inf, -math.inf]], np.float32), (2,))
     assert np.isnan(result[0]).any()
     assert (result[1] == -math.inf).all()
 

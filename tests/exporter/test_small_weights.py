@@ -208,7 +208,7 @@ def test_too_many_other_decisions_fail(tmp_path: Path, monkeypatch: pytest.Monke
     ids=["choices", "spread", "same", "what never varied", "not a number"],
 )
 def test_shares(was: np.ndarray, made: np.ndarray, share: float) -> None:
-    assert check.compared(was, made)[0] == pytest.approx(share)
+    assert check.compare_decisions(was, made)[0] == pytest.approx(share)
 
 
 @pytest.mark.parametrize(

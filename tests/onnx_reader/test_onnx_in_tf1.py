@@ -12,7 +12,7 @@ from converters.formats.frozen_graph.writer import frozen
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.export.sources import read_source
-from exporter.verify.difference import compare, floored
+from exporter.verify.difference import compare, floor_log_probs
 from exporter.verify.tolerances import Tolerance
 from fixtures.sb3 import FOLDER, POLICIES
 from signatures.roles import Role
@@ -49,7 +49,7 @@ def test_runs_there_and_agrees(source: Path, legacy: RuntimeProcess, tmp_path: P
         for spec in outputs:
             pair = [wanted[spec.name], got[spec.name]]
             if spec.role is Role.LOG_PROBS:
-                pair = [floored(a, policy.signature.branches) for a in pair]
+                pair = [floor_log_probs(a, policy.signature.branches) for a in pair]
             if pair[0].dtype.kind == "f":
                 difference = compare(*pair, CLOSE)
                 assert difference.passed, f"{case.name}: {spec.name}: {difference}"

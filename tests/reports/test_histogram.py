@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.verify.difference import BINS, added, by_decade, compare, decades
+from exporter.verify.difference import BINS, add_histograms, by_decade, compare, decades
 from exporter.verify.tolerances import Tolerance
 
 
@@ -32,9 +32,9 @@ def test_every_element_is_counted_once_where_it_belongs(values: np.ndarray) -> N
 
 def test_sums() -> None:
     one = decades(np.array([1.0]))
-    assert added([one, ()]) == added([(), one]) == one
-    assert by_decade(added([one, one])) == {"1e0": 2}
-    assert added([()]) == ()
+    assert add_histograms([one, ()]) == add_histograms([(), one]) == one
+    assert by_decade(add_histograms([one, one])) == {"1e0": 2}
+    assert add_histograms([()]) == ()
 
 
 def test_a_comparison_counts_its_elements_and_none_where_there_are_no_numbers() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerance_file import read_tolerances
-from exporter.verify.tolerances import Tolerance, ToleranceRule, ruled
+from exporter.verify.tolerances import Tolerance, ToleranceRule, tolerance_by_rules
 from fixtures import path as fixture
 from signatures.errors import UsageError
 from tests.commands import export_model, is_refused
@@ -51,10 +51,10 @@ def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
 def test_the_last_rule_that_covers_a_comparison_decides() -> None:
     loose, tight = Tolerance(1, 1, "loose"), Tolerance(0, 0, "tight")
     rules = (ToleranceRule(loose), ToleranceRule(tight, format="saved_model", output="action", policy="a"))
-    assert ruled(rules, "a", "saved_model:deterministic", "tensorflow", "action") == tight
-    assert ruled(rules, "b", "saved_model", "tensorflow", "action") == loose
-    assert ruled(rules, "a", "onnx", "onnxruntime", "action") == loose
-    assert ruled((), "a", "onnx", "onnxruntime", "action") is None
+    assert tolerance_by_rules(rules, "a", "saved_model:deterministic", "tensorflow", "action") == tight
+    assert tolerance_by_rules(rules, "b", "saved_model", "tensorflow", "action") == loose
+    assert tolerance_by_rules(rules, "a", "onnx", "onnxruntime", "action") == loose
+    assert tolerance_by_rules((), "a", "onnx", "onnxruntime", "action") is None
 
 
 @pytest.mark.parametrize(

@@ -40,9 +40,11 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
                 continue
             verdict = check_file(files[key], asked)
             if checks:
-                yield _finding(Accepted, key, release, _unaccepted(verdict))
+                yield _finding(Accepted, key, release, _import_faults(verdict))
             if plays:
-                yield _finding(Played, key, release, _unplayed(verdict) + ([] if checks else _unaccepted(verdict)))
+                yield _finding(
+                    Played, key, release, _player_faults(verdict) + ([] if checks else _import_faults(verdict))
+                )
 
 
 def _finding(kind: type[Accepted], key: str, release: str, wrong: list[str]) -> Finding:
@@ -50,7 +52,7 @@ def _finding(kind: type[Accepted], key: str, release: str, wrong: list[str]) -> 
     return kind(key, release, "*", 0.0, 0.0, Tolerance(0.0, 0.0), not wrong, None, reason)
 
 
-def _unaccepted(verdict: UnityVerdict) -> list[str]:
+def _import_faults(verdict: UnityVerdict) -> list[str]:
     """Return what speaks against a file in its import and its checks."""
     modes = [m for mode, m in verdict.modes.items() if mode == _MODE]
     thrown = [
@@ -60,7 +62,7 @@ def _unaccepted(verdict: UnityVerdict) -> list[str]:
     return [*thrown, *listed, *(f.message for f in verdict.misread)]
 
 
-def _unplayed(verdict: UnityVerdict) -> list[str]:
+def _player_faults(verdict: UnityVerdict) -> list[str]:
     """Return what our model of the player finds wrong with a file."""
     modes = [m for mode, m in verdict.modes.items() if mode == _MODE]
     return [f"{p.outcome.value}: {p.message}" for m in modes for p in m.played if p.fails]

@@ -45,7 +45,7 @@ def decisions(
 
     Where both have the same graph (a bundle that is verified again), it is the source alone that says what was.
     """
-    names = list(dict.fromkeys(_judged(small.signature)))
+    names = list(dict.fromkeys(_action_names(small.signature)))
     pairs: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     try:
         with (
@@ -57,7 +57,7 @@ def decisions(
                 return []
             ask = before.original.run if again and before.original is not None else partial(_one, before)
             steps = draw_typical(small.signature, seed=options.seed, count=_CASES)
-            sides = (_acted(small.signature, steps, each) for each in (ask, partial(_one, after)))
+            sides = (_play_steps(small.signature, steps, each) for each in (ask, partial(_one, after)))
             for asked, given in zip(*sides, strict=True):
                 for name in names:
                     if name in asked and name in given:
@@ -68,7 +68,7 @@ def decisions(
     limit, found = LIMITS[storage], list[Finding]()
     for name, answers in pairs.items():
         was, made = (np.concatenate([answer[side] for answer in answers]) for side in (0, 1))
-        off, said = compared(_choices(small.signature, name, was), _choices(small.signature, name, made))
+        off, said = compare_decisions(_choices(small.signature, name, was), _choices(small.signature, name, made))
         text = f"{said} {source}; {limit:.0%} is allowed"
         found.append(Decisions("weights", storage, name, off, off, Tolerance(limit, 0.0), off <= limit, None, text))
     return found
@@ -78,7 +78,7 @@ def _one(reference: Reference, feeds: Feeds) -> Mapping[str, np.ndarray]:
     return reference.answers([feeds])[0]
 
 
-def _acted(
+def _play_steps(
     signature: PolicySignature, steps: Sequence[Case], ask: Callable[[Feeds], Mapping[str, np.ndarray]]
 ) -> Iterator[Mapping[str, np.ndarray]]:
     """The answers to each step; a memory is empty before the first, and is fed back from then on."""
@@ -92,7 +92,7 @@ def _acted(
             carried = {fed: answers[kept]}
 
 
-def compared(was: np.ndarray, made: np.ndarray) -> tuple[float, str]:
+def compare_decisions(was: np.ndarray, made: np.ndarray) -> tuple[float, str]:
     """How much of what is decided is otherwise, and a sentence that ends before whose decisions those were."""
     if was.shape != made.shape or not (np.isfinite(was) == np.isfinite(made)).all():
         return math.inf, "it is of another shape, or finite elsewhere, than that of"
@@ -109,7 +109,7 @@ def compared(was: np.ndarray, made: np.ndarray) -> tuple[float, str]:
     return share, f"it moved by {share:.2%} of its spread from that of"
 
 
-def _judged(signature: PolicySignature) -> Iterator[str]:
+def _action_names(signature: PolicySignature) -> Iterator[str]:
     """The actions, without chance where there is such an output."""
     for head in signature.heads:
         if head.plain is not None:

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.checks.draws import DEPENDENT, DRAWS, REPEATED, REPEATED_CALLS, STARTS, likely, repeated
+from exporter.verify.checks.draws import DEPENDENT, DRAWS, REPEATED, REPEATED_CALLS, STARTS, likely, repeated_draws
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant
-from exporter.verify.statistics import dependent, ranks, related, same_distribution
+from exporter.verify.statistics import columns_related, dependent, ranks, same_distribution
 from exporter.verify.trial import Trial
 from signatures.roles import Role
 from signatures.sampling import Case
@@ -29,7 +29,7 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     names = [
         n
         for n in participant.outputs
-        if (trial.drawn(n, participant) or n in trial.reference.partly_drawn)
+        if (trial.is_drawn(n, participant) or n in trial.reference.partly_drawn)
         and trial.signature.output(n).dtype == "float32"
     ]
     if not names:
@@ -52,7 +52,7 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
     alike = {
         n
-        for n in repeated(trial, participant, lambda run: run([feeds], names)[0])
+        for n in repeated_draws(trial, participant, lambda run: run([feeds], names)[0])
         if (samples[1][n] != samples[1][n][:1]).any()
     }
     again = _rows(trial, case, STARTS) if participant.runtime != "numpy" else None
@@ -99,7 +99,7 @@ def _joint(reference: np.ndarray, drawn: np.ndarray) -> Difference | None:
     """What is wrong with numbers [draws, columns] together, whatever each is by itself."""
     if np.isfinite(drawn).all() and (apart := dependent([ranks(drawn)], 3.0 * drawn.shape[1])):
         return wrong(DEPENDENT.format(apart))
-    if related(reference, drawn):
+    if columns_related(reference, drawn):
         return wrong("its numbers hang together otherwise than the reference's: one draw serves several")
     return None
 

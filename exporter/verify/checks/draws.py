@@ -60,7 +60,7 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
         for row in range(2 if case.name == ONE_ALLOWED else 1)
         if case.name not in _LEFT_OUT and case.name != ONE_FORBIDDEN and not np.isnan(expected[scores][row]).any()
     ]
-    known = _decided(trial, scores, known)
+    known = _without_open_choices(trial, scores, known)
     if not known:
         return
     cases = [case for case, _, _ in known]
@@ -75,7 +75,7 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     if (anew := _called_alike(trial, participant, action, rows, log_probs)) is not None:
         yield trial.finding(Draws, participant, action, wrong(REPEATED_CALLS), cases[anew].name)
         return
-    drawn = _drawn(trial, participant, action, rows)
+    drawn = _draws_of_rows(trial, participant, action, rows)
     p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
     difference = likely(p_value)
     if (
@@ -87,11 +87,11 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     if difference.passed and (masked := _with_one_forbidden(trial, participant, action, scores)) is not None:
         yield masked
         return
-    begins = trial.bisected(participant, action, difference, rows[worst], branch)
+    begins = trial.bisect(participant, action, difference, rows[worst], branch)
     yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
 
 
-def _decided(
+def _without_open_choices(
     trial: Trial, scores: str, known: list[tuple[Case, int, np.ndarray]]
 ) -> list[tuple[Case, int, np.ndarray]]:
     """Those of the inputs at which no choice that the odds hang on is open: another is right there too."""
@@ -101,7 +101,7 @@ def _decided(
     return [
         each
         for each, feeds in zip(known, rows, strict=True)
-        if not trial.choices.tied(scores, feeds, Tolerance(), 1)[0]
+        if not trial.choices.tied_rows(scores, feeds, Tolerance(), 1)[0]
     ]
 
 
@@ -131,7 +131,7 @@ def _with_one_forbidden(trial: Trial, participant: Participant, action: str, sco
     drawn = np.concatenate([answer[action] for answer in participant.run(inputs, [action])])
     drawn = drawn.reshape(case.batch, count, -1)
     log_probs = np.asarray(expected[scores])
-    decided = np.flatnonzero(~trial.choices.tied(scores, case.feeds, Tolerance(), case.batch))
+    decided = np.flatnonzero(~trial.choices.tied_rows(scores, case.feeds, Tolerance(), case.batch))
     if not decided.size:
         return None
     drawn, log_probs = drawn[decided], log_probs[decided]
@@ -143,7 +143,7 @@ def _with_one_forbidden(trial: Trial, participant: Participant, action: str, sco
         return None
     worst = int(decided[worst])
     row = {n: a[worst : worst + 1] if n in batched else a for n, a in case.feeds.items()}
-    begins = trial.bisected(participant, action, difference, row, branch)
+    begins = trial.bisect(participant, action, difference, row, branch)
     return trial.finding(Draws, participant, action, difference, case.name, bisection=begins)
 
 
@@ -169,7 +169,7 @@ def _started_alike(
         drawn = dict(zip(told, _of_rows(run, action, [rows[row] for row in told], count, single=single), strict=True))
         return {str(branch): drawn[row][:, branch] for branch, row in shown.items()}
 
-    alike = repeated(trial, participant, ask)
+    alike = repeated_draws(trial, participant, ask)
     return {branch: row for branch, row in shown.items() if str(branch) in alike}
 
 
@@ -191,7 +191,7 @@ def _called_alike(
     return row if np.array_equal(one, other) else None
 
 
-def repeated(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays]) -> set[str]:
+def repeated_draws(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays]) -> set[str]:
     """What of the answers of ``ask`` is drawn alike after two starts, by its key.
 
     Nothing where it cannot be started again. A file that another runtime has drawn from is not started in a second
@@ -203,16 +203,16 @@ def repeated(trial: Trial, participant: Participant, ask: Callable[[Run], Arrays
     if apart and participant.path in trial.started:
         return set()
     trial.started.add(participant.path)
-    one = _asked(participant, trial.pool, ask)
+    one = _ask_again(participant, trial.pool, ask)
     if not apart:
-        other = _asked(participant, trial.pool, ask)
+        other = _ask_again(participant, trial.pool, ask)
     else:
         with RuntimePool() as second:
-            other = _asked(participant, second, ask)
+            other = _ask_again(participant, second, ask)
     return {name for name, drawn in one.items() if np.array_equal(drawn, other[name])}
 
 
-def _asked(participant: Participant, pool: RuntimePool, ask: Callable[[Run], Arrays]) -> dict[str, np.ndarray]:
+def _ask_again(participant: Participant, pool: RuntimePool, ask: Callable[[Run], Arrays]) -> dict[str, np.ndarray]:
     assert participant.again is not None
     model, run = participant.again(pool, True)
     with model:
@@ -234,7 +234,7 @@ def _one_row_at_a_time(participant: Participant) -> bool:
     return participant.runtime.startswith("tfjs-cpu")
 
 
-def _drawn(trial: Trial, participant: Participant, action: str, rows: Sequence[Feeds]) -> np.ndarray:
+def _draws_of_rows(trial: Trial, participant: Participant, action: str, rows: Sequence[Feeds]) -> np.ndarray:
     single = _one_row_at_a_time(participant)
     cameras = any(s.role is Role.VISUAL for s in trial.signature.inputs)
     count = max(1, FEW // len(rows)) if single or cameras else DRAWS

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.findings import Finding, undecided
+from exporter.verify.findings import Finding, undecided_finding
 from exporter.verify.trial import Trial
 
 
-def undefined(trial: Trial) -> Iterator[Finding]:
+def check_defined(trial: Trial) -> Iterator[Finding]:
     """A finding for each output that is NaN or infinite throughout, or is chosen by scores that are NaN throughout."""
     typical = [
         (case, answers)
@@ -25,8 +25,10 @@ def undefined(trial: Trial) -> Iterator[Finding]:
             without = all(not np.isfinite(each).any() for each in made)
             what = f"{spec.name} has not one finite number for any typical input"
         else:
-            without = bool(typical) and trial.choices.undefined(spec.name, typical[-1][0].feeds)
+            without = bool(typical) and trial.choices.has_only_nan_scores(spec.name, typical[-1][0].feeds)
             what = f"the scores that {spec.name} is chosen by are NaN for every typical input"
         if without:
             runtime = trial.reference.runtime
-            yield undecided("reference", runtime, spec.name, f"{what}, so nothing was compared", typical[0][0].name)
+            yield undecided_finding(
+                "reference", runtime, spec.name, f"{what}, so nothing was compared", typical[0][0].name
+            )

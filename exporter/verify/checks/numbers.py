@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from converters.formats.registry import narrows
-from exporter.verify.difference import Difference, added, wrong
+from exporter.verify.difference import Difference, add_histograms, wrong
 from exporter.verify.findings import Bisection, Finding, Numbers, Shape
 from exporter.verify.participants import Feeds, Participant
 from exporter.verify.trial import Trial
@@ -34,7 +34,7 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
     answers = participant.run([case.feeds for case in cases], list(participant.outputs))
     for name in participant.outputs:
         got = [answer[name] for answer in answers]
-        if trial.drawn(name, participant):
+        if trial.is_drawn(name, participant):
             narrowed = narrows(participant.format)
             pairs = zip(cases, got, strict=True)
             found = [plausible(trial.signature, name, array, case, narrowed=narrowed) for case, array in pairs]
@@ -46,12 +46,12 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
         worst[name] = max(zip(found, cases, strict=True), key=lambda pair: rank(pair[0]))
     rounded = trial.bisector.constants(participant, trial.cases[0].feeds)
     for name, (difference, case) in worst.items():
-        kind = Shape if trial.drawn(name, participant) else Numbers
+        kind = Shape if trial.is_drawn(name, participant) else Numbers
         needed = largest([d.smallest_tolerance for d in every[name]])
-        counted = added(d.histogram for d in every[name])
+        counted = add_histograms(d.histogram for d in every[name])
         share = max(d.share for d in every[name])
         difference = replace(difference, smallest_tolerance=needed, histogram=counted, share=share)
-        begins = trial.bisected(participant, name, difference, case.feeds)
+        begins = trial.bisect(participant, name, difference, case.feeds)
         if difference.passed and (other := _upstream(trial, name, rounded)) is not None:
             difference = replace(difference, passed=False, reason=f"the constant {other.tensor} has another value")
             begins = other
@@ -90,7 +90,7 @@ def plausible(
     return Difference(0.0, 0.0, True)
 
 
-def recorded(trial: Trial) -> Iterator[Finding]:
+def check_recording(trial: Trial) -> Iterator[Finding]:
     """The reference beside what a user recorded (exporter/verify/golden.py); what hangs on noise that was not is left
     out.
     """

@@ -27,8 +27,8 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
         fed.append(feeds)
         return participant.run([feeds], list(participant.outputs))[0]
 
-    got = trial.rolled(step)
-    names = [n for n in participant.outputs if n in trial.expected_steps[0] and not trial.drawn(n, participant)]
+    got = trial.roll_out(step)
+    names = [n for n in participant.outputs if n in trial.expected_steps[0] and not trial.is_drawn(n, participant)]
     numbers = range(len(fed))
     steps = {n: trial.differences(n, trial.expected_steps, [g[n] for g in got], participant, numbers) for n in names}
     where = [f"step {i + 1} of {len(fed)}" for i in range(len(fed))]
@@ -42,7 +42,7 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
             # An output that goes wrong after the memory did goes wrong because of it.
             output = min((n for n in (name, memory.output) if n in steps), key=lambda n: _first(steps[n]))
             first = _first(steps[output])
-            begins = trial.bisected(participant, output, steps[output][first], fed[first])
+            begins = trial.bisect(participant, output, steps[output][first], fed[first])
             begins = begins and replace(begins, input=where[first])
         drift = tuple(d.max_abs for d in differences)
         yield trial.finding(Rollout, participant, name, difference, where[worst], drift, begins)
