@@ -237,7 +237,7 @@ class LoadedPolicy:
             if head.is_continuous:
                 taken[head.name] = continuous = outputs[((deterministic and head.plain) or head.spec).name]
                 if self._spread is not None and not deterministic:
-                    taken[head.name] = continuous = self._drawn(continuous, outputs[self._spread.name])
+                    taken[head.name] = continuous = self._draw(continuous, outputs[self._spread.name])
             else:
                 discrete = self._discrete(head, outputs, deterministic)
                 if head.spec.role is Role.SAMPLED:
@@ -247,7 +247,7 @@ class LoadedPolicy:
         kept = None if memory is None or memory.output is None else outputs[memory.output]
         return Decision(continuous, discrete, kept, {**outputs, **taken})
 
-    def _drawn(self, mean: Array, spread: Array) -> Array:
+    def _draw(self, mean: Array, spread: Array) -> Array:
         """A draw from N(mean, σ²), as the trainer's own distribution makes it: not squashed, not clipped."""
         assert self._spread is not None
         std = np.exp(spread) if self._spread.role is Role.LOG_STD else spread
