@@ -85,7 +85,7 @@ class Bundle:
         return kept if self.previous is None else {**kept, self.previous.name: "previous"}
 
     def beginnings(self, line: str, value: Callable[[TensorSpec], str]) -> list[str]:
-        """What declares the variables of ``kept``; ``line`` is given a variable, its first value and a comment."""
+        """Lines that declare ``kept_variables``; ``line`` is given a variable, its first value and a comment."""
         says = {"memory": "the start of an episode; a row per agent", "previous": "no action yet"}
         return [
             line.format(name, value(self.signature.input(key)), says[name]) for key, name in self.kept_variables.items()

@@ -42,9 +42,8 @@ def tensorflowsharp(bundle: Bundle) -> str:
     memory, previous = bundle.memory, bundle.previous
     for spec in bundle.signature.inputs:
         lines += [f"// {line}" for line in meaning(bundle, spec)]
-        lines.append(
-            f"runner.AddInput(graph[{string_literal(spec.name)}][0], {bundle.kept_variables.get(spec.name) or _array(spec)});"
-        )
+        value = bundle.kept_variables.get(spec.name) or _array(spec)
+        lines.append(f"runner.AddInput(graph[{string_literal(spec.name)}][0], {value});")
     fetched = bundle.fetched_outputs
     outputs = [*fetched.values()] if memory is None else [*fetched.values(), bundle.signature.output(memory[1])]
     lines += [f"runner.Fetch(graph[{string_literal(spec.name)}][0]);" for spec in outputs]

@@ -29,7 +29,7 @@ _ARITHMETIC = {r.name: r.arithmetic for r in RUNTIMES}
 
 Arrays = dict[str, np.ndarray]
 Run = Callable[[Feeds], Arrays]
-#: One run after the other, each fed what the one before answered (``Trial.rolled``).
+#: One run after the other, each fed what the one before answered (``Trial.roll_out``).
 Rolled = Callable[[Run], list[Arrays]]
 
 

@@ -130,7 +130,7 @@ def test_two_runs_leave_each_other_alone(tmp_path: Path, monkeypatch: pytest.Mon
         begun.append(path)
         return real(exporter, path, *more)
 
-    monkeypatch.setattr(fleet_cluster, "exported", counted)
+    monkeypatch.setattr(fleet_cluster, "export_source", counted)
     monkeypatch.setattr(fleet_cluster._Station, "_close", lambda s: (closed.append(s.run.identity), close(s)))
     source = fixture("discrete")
     a, b, c = (fleet_cluster.Run(n, ExportOptions(tmp_path / n, verify="none"), Wanted()) for n in "abc")

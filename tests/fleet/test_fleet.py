@@ -184,7 +184,7 @@ def test_a_process_that_dies_costs_one_source(
                     break
         return real(crew, worker)
 
-    monkeypatch.setattr(fleet._Crew, "_heard", killing)
+    monkeypatch.setattr(fleet._Crew, "_receive", killing)
     made = run(sources, tmp_path / "out", jobs=2)
     lost = made[str(tmp_path / "a" / "discrete.bytes")]
     assert lost.error is not None
