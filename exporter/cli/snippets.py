@@ -18,15 +18,24 @@ from signatures.errors import UsageError
     ("export-model snippets exported/3DBall", "all of it"),
     ("export-model snippets exported/3DBall --for tfjs", "one, ready to be piped"),
 )
-@click.argument("bundle", type=PATH, metavar="BUNDLE")
-@click.option("--for", "target", metavar="NAME", help="Only this one (or all that start with it), ready to pipe.")
+@click.argument("bundle", type=PATH, metavar="BUNDLE", required=False)
+@click.option("--for", "target", metavar="NAME", help="Only this one, ready to pipe; 'help' lists them.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
+def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> None:
     """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""
     from exporter.snippets.contract import read_bundle
-    from exporter.snippets.registry import snippets
-    from exporter.tables import command_text
+    from exporter.snippets.registry import TARGETS, snippets
+    from exporter.tables import command_text, table
 
+    if target == "help":
+        rows = [[t.name, t.title, " or ".join(t.needs).replace("+", " and ")] for t in TARGETS]
+        if as_json:
+            say_json({"targets": [dict(zip(("name", "title", "needs"), row, strict=True)) for row in rows]})
+        else:
+            say_lines(table(("--for", "what", "needs"), rows))
+        return
+    if bundle is None:
+        raise UsageError("no bundle was given", fix="export-model snippets exported/3DBall")
     place = one_bundle(bundle, "snippets")
     if place is None and bundle.exists():
         raise UsageError(
@@ -46,4 +55,4 @@ def snippets_command(bundle: Path, target: str | None, as_json: bool) -> None:
         say()
         say_lines(snippet.code)
     for name, needed in lacking.items():
-        say(f"left out: {name} needs {needed}, which this bundle has not")
+        say(f"left out: {name} needs {needed}, which is not in this bundle")

@@ -82,7 +82,9 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
     name = _for_consumer(bundle, name)
     chosen = [t for t in TARGETS if name in (None, t.name)] or [t for t in TARGETS if t.name.startswith(f"{name}-")]
     if not chosen:
-        raise UsageError(f"--for {name}: there is no such target", fix=f"one of: {', '.join(t.name for t in TARGETS)}")
+        raise UsageError(
+            f"--for {name}: there is no such target", fix=f"one of: help, {', '.join(t.name for t in TARGETS)}"
+        )
     has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
     able = {t.name for t in chosen if any(has.issuperset(need.split("+")) for need in t.needs)}
     lacking = {t.name: " or ".join(t.needs).replace("+", " and ") for t in chosen if t.name not in able}

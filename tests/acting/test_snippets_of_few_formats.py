@@ -16,7 +16,7 @@ from tests.commands import is_refused
 def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:
     (result,) = export_model(fixture("continuous"), tmp_path, to="bytes", verify="none")
     ran = run("snippets", result.folder)
-    assert "left out: onnxruntime needs onnx, which this bundle has not" in ran.out
+    assert "left out: onnxruntime needs onnx, which is not in this bundle" in ran.out
     assert "left out: policy-ort needs tfjs and onnx" in ran.out
     assert "(--for tensorflowsharp)" in ran.out
     is_refused(run("snippets", result.folder, "--for", "onnxruntime"), "has no onnx", "fix")

@@ -17,14 +17,16 @@ from tests.conftest import FULL
 from tests.docs.blocks import Block, blocks, blocks_of, name_of, pages
 from tests.docs.workshop import HOW, Workshop, furnish
 
+CORE_PAGES = ("README.md", "docs/start.md", "docs/unity.md", "docs/web.md", "docs/robots.md")
 #: Pages whose blocks have a test of their own.
 ELSEWHERE = {
     "docs/live.md": "tests/live/test_docs.py",
     "docs/acting.md": "tests/acting/test_docs.py",
     "docs/extending.md": "tests/docs/test_extending.py",
+    **dict.fromkeys(CORE_PAGES, "tests/docs/test_core_pages.py"),
 }
-#: Pages that run with all runtimes: the first one, and those whose comparisons need TensorFlow.js.
-EVERY = {"README.md", "docs/ci.md", "docs/tasks/tensorflowjs-converter.md"}
+#: Pages that run with all runtimes.
+EVERY = {"docs/parity.md"}
 #: Languages that stand for something to run; the rest is looked at.
 RUN = {"sh", "python", "js"}
 

@@ -1,6 +1,6 @@
 """What the importers refuse: the exception that ends the import of an ONNX file, or None.
 
-Measured with 352 constructs and 400 files; see docs/tasks/unity.md. Where an exception's text goes on with the node as
+Measured with 352 constructs and 400 files; see docs/unity.md. Where an exception's text goes on with the node as
 JSON and a stack, only its beginning is given.
 """
 

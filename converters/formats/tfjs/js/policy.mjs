@@ -85,30 +85,62 @@ function upperHalf(a, b) {
 // ---- loading --------------------------------------------------------------------------------------------------------
 
 /**
- * @param {string | object} source the URL of model.json (a loader with `load()` will do) or of the .onnx (bytes will do)
+ * @param {string | object} source the URL, or in Node the path, of model.json (a loader with `load()` will do) or of the
+ *   .onnx (bytes will do)
  * @param {{tf?: object, ort?: object, contract?: string | object, seed?: number}} options exactly one of tf and ort;
- *   `contract` is policy.json or its URL, needed for ONNX ("policy.json" beside the model where it is left out)
+ *   `contract` is policy.json, its URL or in Node its path, needed for ONNX ("policy.json" beside the model where it is
+ *   left out)
  */
 export async function loadPolicy(source, { tf, ort, contract, seed = 0 } = {}) {
   if ((tf === undefined) === (ort === undefined)) {
     throw new TypeError("loadPolicy needs a runtime: { tf } of TensorFlow.js, or { ort } of onnxruntime-web");
   }
   const [run, own, dispose] = tf === undefined ? await withOnnx(ort, source, contract) : await withTfjs(tf, source);
-  const found = own ?? (typeof contract === "string" ? await fetched(contract) : contract);
+  const found = own ?? (typeof contract === "string" ? await readJson(contract) : contract);
   if (found?.outputs === undefined) {
     throw new Error("the model holds no contract of export-model; give policy.json: loadPolicy(url, { tf, contract })");
   }
   return new Policy(found, run, dispose, seed);
 }
 
-async function fetched(url) {
-  const answer = await fetch(url);
-  if (!answer.ok) throw new Error(`${url}: HTTP status ${answer.status}`);
+/** Whether `source` is a path for Node to read: there is no page that it could be relative to. */
+function isFile(source) {
+  if (typeof source !== "string" || globalThis.location !== undefined) return false;
+  return globalThis.process?.versions?.node !== undefined && !/^(https?|data|blob):/.test(source);
+}
+
+async function readFile(source) {
+  const files = "node:fs/promises"; // a name that no bundler of pages follows
+  const { readFile: read } = await import(/* @vite-ignore */ /* webpackIgnore: true */ files);
+  return read(source.startsWith("file:") ? new URL(source) : source);
+}
+
+async function readJson(source) {
+  if (isFile(source)) return JSON.parse(await readFile(source));
+  const answer = await fetch(source);
+  if (!answer.ok) throw new Error(`${source}: HTTP status ${answer.status}`);
   return answer.json();
 }
 
+/** The place of `name` in the folder of the file `source`. */
+function beside(source, name) {
+  if (isFile(source)) return source.replace(/[^/\\]*$/, name);
+  return new URL(name, new URL(source, globalThis.location?.href)).href;
+}
+
+/** What tf.io.http loads of a page's server, from files. */
+function fromFiles(tf, source) {
+  const weights = async (manifest) => {
+    const paths = manifest.flatMap((group) => group.paths);
+    const parts = await Promise.all(paths.map((path) => readFile(beside(source, path))));
+    return [manifest.flatMap((group) => group.weights), await new Blob(parts).arrayBuffer()];
+  };
+  return { load: async () => tf.io.getModelArtifactsForJSON(await readJson(source), weights) };
+}
+
 async function withTfjs(tf, source) {
-  const artifacts = await (typeof source === "string" ? tf.io.http(source) : source).load();
+  const loader = isFile(source) ? fromFiles(tf, source) : typeof source === "string" ? tf.io.http(source) : source;
+  const artifacts = await loader.load();
   const model = await tf.loadGraphModel({ load: async () => artifacts });
   const held = artifacts.userDefinedMetadata?.contract;
   const run = async (feeds, names) => {
@@ -133,7 +165,7 @@ async function withOnnx(ort, source, contract) {
   const session = await ort.InferenceSession.create(source);
   let own;
   if (contract === undefined && typeof source === "string") {
-    own = await fetched(new URL("policy.json", new URL(source, globalThis.location?.href)).href);
+    own = await readJson(beside(source, "policy.json"));
   }
   const run = async (feeds, names) => {
     const given = {};
