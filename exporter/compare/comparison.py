@@ -39,7 +39,7 @@ from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnde
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
-from exporter.verify.verification import verify
+from exporter.verify.verification import Judge, verify
 from signatures.contract import POLICY
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, naming, suggestion
 from signatures.records import dataclass
@@ -108,6 +108,7 @@ def compare_artefacts(
     progress: Progress = _LOG.info,
     understood: Callable[[Policy], object] | None = None,
     pool: RuntimePool | None = None,
+    judge: Judge = verify,
 ) -> ParityReport:
     """Compare files that any tool made with a reference; every format of a candidate that is a bundle takes part.
 
@@ -117,6 +118,7 @@ def compare_artefacts(
     - ``allow_unverified``: no error where none of the candidates' runtimes is installed.
     - ``progress``: called with each step; the default logs them.
     - ``understood``: called with the reference as it was understood, before anything runs.
+    - ``judge``: what is made of the candidates' participants, in place of a verification.
 
     Raises ExportModelError where a file cannot be read, UsageError where a name of ``names`` is none,
     RuntimeUnavailableError where no runtime could run any::
@@ -166,7 +168,7 @@ def compare_artefacts(
                 source,
                 policy.source,
             )
-            compared = partial(_compare, policy, chosen, used, known, pool, options, progress)
+            compared = partial(_compare, policy, chosen, used, known, pool, options, progress, judge)
             if storage is None:
                 reports.append(compared(tested))
             else:
@@ -191,13 +193,14 @@ def _compare(
     pool: RuntimePool,
     options: VerifyOptions | None,
     progress: Progress,
+    judge: Judge,
     tested: PolicyUnderTest,
 ) -> ParityReport:
     def taking_part(numpy_model: LoadedModel, failure: Failure) -> Iterator[Participant]:
         for candidate, copy in candidates:
             yield from _participants(candidate, copy, policy, numpy_model, runtimes, pool, failure)
 
-    return verify(tested, runtimes, known, pool, options, progress, participants=taking_part)
+    return judge(tested, runtimes, known, pool, options, progress, taking_part)
 
 
 def _reference(

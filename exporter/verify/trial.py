@@ -25,6 +25,7 @@ from exporter.verify.reference import Reference
 from exporter.verify.rounding import Rounding
 from exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
 from exporter.verify.work import Allowance, products
+from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
 
@@ -33,6 +34,14 @@ Arrays = dict[str, np.ndarray]
 _HOPELESS = 8
 #: Outputs that an argmax is taken of.
 _SCORES = (Role.LOG_PROBS, Role.PROBS, Role.Q_VALUES)
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a policy is asked in place of inputs that are drawn: states that were met, and steps in a row."""
+
+    cases: Sequence[Case]
+    steps: Sequence[Feeds] = ()
 
 
 class Trial:
@@ -45,7 +54,11 @@ class Trial:
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
         recurrent = self.signature.recurrence is not None
-        self.steps = draw_rollout(self.signature, seed=options.seed, steps=options.steps) if recurrent else []
+        self.steps: list[Feeds] = []
+        if recurrent:
+            self.steps += draw_rollout(self.signature, seed=options.seed, steps=options.steps)
+        #: cases that tell how far an output varies
+        self._typical = [case for case in drawn if case.name.startswith("typical")]
         self._scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
         self.choices = Choices(tested.graph)
         self._cost = 0
@@ -54,6 +67,10 @@ class Trial:
         self.started: set[Path] = set()
         self.expected: list[Arrays] = []
         self.expected_steps: list[Arrays] = []
+
+    def replace_inputs(self, inputs: Inputs) -> None:
+        """Ask these in place of what was drawn."""
+        self.cases, self.steps, self._typical = list(inputs.cases), list(inputs.steps), list(inputs.cases)
 
     def ask(self, reference: Reference) -> None:
         """Have every input answered by the reference. Raises RunFailedError."""
@@ -196,10 +213,11 @@ class Trial:
         if self.tolerance(name, participant) != Tolerance():
             return None
         if name not in self._spreads:
+            typical = {id(case) for case in self._typical}
             made = [
                 self._comparable(answers)[name]
                 for case, answers in zip(self.cases, self.expected, strict=True)
-                if name in answers and case.name.startswith("typical")
+                if name in answers and id(case) in typical
             ]
             self._spreads[name] = spread(made)
         return self._spreads[name]

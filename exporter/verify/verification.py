@@ -27,13 +27,27 @@ from exporter.verify.participants import (
 )
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
-from exporter.verify.trial import Trial
+from exporter.verify.trial import Inputs, Trial
 from exporter.verify.verdict import key_of, required_reason
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.
 Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
+#: What is made of participants: ``verify``, or something with its first parameters.
+Judge = Callable[
+    [
+        PolicyUnderTest,
+        Sequence[str],
+        Sequence[RuntimeInfo],
+        RuntimePool,
+        VerifyOptions | None,
+        Callable[[str], None],
+        Participants | None,
+    ],
+    ParityReport,
+]
+Check = Callable[[Trial, Participant], Iterator[Finding]]
 #: What each participant is put through, one after the other.
-CHECKS: tuple[Callable[[Trial, Participant], Iterator[Finding]], ...] = (numbers, rollout, draws, densities)
+CHECKS: tuple[Check, ...] = (numbers, rollout, draws, densities)
 
 
 def verify(
@@ -44,10 +58,13 @@ def verify(
     options: VerifyOptions | None = None,
     progress: Callable[[str], None] = lambda text: None,
     participants: Participants | None = None,
+    inputs: Callable[[Reference], Inputs] | None = None,
+    checks: Sequence[Check] = CHECKS,
 ) -> ParityReport:
     """The report on one policy. A runtime that fails is a finding, not an exception.
 
-    ``participants`` says who takes part, given the numpy reference; without it, the policy's artefacts do. Raises
+    ``participants`` says who takes part, given the numpy reference; without it, the policy's artefacts do. ``inputs``
+    gives what is asked in place of inputs that are drawn, ``checks`` what each participant is put through. Raises
     UsageError, before anything runs, where an option does not fit the policy.
     """
     options = options or VerifyOptions()
@@ -59,7 +76,7 @@ def verify(
         pool.start(needed_runtimes(tested, runtimes))
         with Reference(tested, runtimes, pool, options.seed) as answering:
             reference = answering.name
-            findings += _findings(trial, answering, runtimes, progress, participants)
+            findings += _findings(trial, answering, runtimes, progress, participants, inputs, checks)
         notes = trial.notes()
     findings += consumers(tested.profile, tested.files, memory=tested.signature.memory is not None)
     return _report(trial, reference, runtimes, known, in_order(findings, tested), notes)
@@ -71,9 +88,13 @@ def _findings(
     runtimes: Sequence[str],
     progress: Callable[[str], None],
     participants: Participants | None,
+    inputs: Callable[[Reference], Inputs] | None,
+    checks: Sequence[Check],
 ) -> list[Finding]:
     findings: list[Finding] = [*reference.failures]
     try:
+        if inputs is not None:
+            trial.replace_inputs(inputs(reference))
         trial.ask(reference)
     except RunFailedError as error:
         return [
@@ -94,7 +115,7 @@ def _findings(
     for participant in taking_part:
         progress(f"{trial.tested.name}: {participant.name} in {participant.runtime}")
         try:
-            for check in CHECKS:
+            for check in checks:
                 findings += check(trial, participant)
         except RunFailedError as error:
             add_failure(participant.name, participant.runtime, error, "*")
