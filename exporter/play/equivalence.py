@@ -1,0 +1,127 @@
+"""Whether one player earns as much as another: two one-sided tests on the mean of paired differences.
+
+The unit is the episode. Episode i of the candidate and episode i of the reference begin alike and draw alike, so what
+is looked at is the difference of their returns, one number for each pair: agents that share a world share its episode
+and are no further evidence. Student's interval of the mean difference has to lie within ±margin:
+
+- EQUIVALENT: all of the 95 % interval does (both one-sided tests reject at 2.5 %).
+- DIFFERENT: all of the interval in which a right player would be with all but one in a million lies outside.
+- NOT DECIDED: neither, and how many episodes would decide is said.
+
+A right player that is called DIFFERENT stops a release, so that takes far more evidence than 95 %; most pairs are equal
+to the last bit, and the few that are not are far from normal. k equal differences among many episodes are √k standard
+errors, so that no fewer than 23 of 200 episodes make a player DIFFERENT, and a rare accident alone does not.
+
+A share as a margin is of how large returns are: of |mean|, or of the distance from their 5th to their 95th percentile
+where that is larger, both of the reference. A mean near 0 says nothing of a scale, nor does one episode that went
+wrong; where every return is 0 the margin is 0, and any difference is larger.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from statistics import NormalDist
+
+import numpy as np
+
+from exporter.play.student import t_quantile
+from exporter.verify.statistics import FALSE_ALARM
+from signatures.errors import UsageError
+from signatures.records import dataclass
+
+EQUIVALENT, DIFFERENT, NOT_DECIDED = "EQUIVALENT", "DIFFERENT", "NOT DECIDED"
+#: Of the interval that has to lie within the margin.
+CONFIDENCE = 0.95
+#: Of returns, those that tell how far they usually lie apart.
+PERCENTILES = (5, 95)
+#: Fewer say nothing: twenty equal differences are as rare as FALSE_ALARM where either sign is as likely.
+LEAST_EPISODES = 20
+MOST_EPISODES = 1_000_000
+#: How surely a player that is right would be found EQUIVALENT with as many episodes as are proposed.
+POWER = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Margin:
+    """How far mean returns may be apart: a number, or a share of how large the reference's returns are."""
+
+    value: float
+    is_share: bool = True
+
+    def of(self, returns: np.ndarray) -> float:
+        """Return the margin in the unit of ``returns``, those of the reference."""
+        return self.value * scale_of(returns) if self.is_share else self.value
+
+
+def parse_margin(text: str) -> Margin:
+    """Return the margin of ``1%`` (a share) or ``0.5`` (in the unit of returns). Raises UsageError."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
+    value = float(found[1]) if found else 0.0
+    if found is None or not 0 < value < math.inf:
+        raise UsageError(
+            f"margin {text!r}: must be a share such as 1%, or a positive number in the unit of returns",
+            fix="give for example --margin 1%",
+        )
+    return Margin(value / 100, True) if found[2] else Margin(value, False)
+
+
+def scale_of(returns: np.ndarray) -> float:
+    """Return how large returns are: |mean|, or how far they usually lie apart where that is more."""
+    low, high = np.percentile(returns, PERCENTILES)
+    return float(max(abs(returns.mean()), high - low))
+
+
+@dataclass(frozen=True, slots=True)
+class Equivalence:
+    """What pairs of episodes tell: the mean difference of returns, its interval, the verdict."""
+
+    verdict: str
+    #: candidate less reference
+    difference: float
+    low: float
+    high: float
+    margin: float
+    #: standard deviation of the differences
+    deviation: float
+    episodes: int
+    #: episodes whose returns are equal
+    equal: int
+    #: how many episodes would decide, where these did not; None where none would
+    needed: int | None = None
+
+
+def equivalence(reference: np.ndarray, candidate: np.ndarray, margin: float) -> Equivalence:
+    """Return the verdict on paired returns, float64 [episodes] each."""
+    differences = candidate - reference
+    count = len(differences)
+    mean = float(differences.mean())
+    deviation = float(differences.std(ddof=1))
+    error = deviation / math.sqrt(count)
+    near = t_quantile((1 - CONFIDENCE) / 2, count - 1) * error
+    far = t_quantile(FALSE_ALARM / 2, count - 1) * error
+    needed = None
+    if abs(mean) + near <= margin:
+        verdict = EQUIVALENT
+    elif abs(mean) - far > margin:
+        verdict = DIFFERENT
+    else:
+        verdict, needed = NOT_DECIDED, _needed(mean, deviation, margin, near)
+    equal = int((differences == 0).sum())
+    return Equivalence(verdict, mean, mean - near, mean + near, margin, deviation, count, equal, needed)
+
+
+def _needed(mean: float, deviation: float, margin: float, near: float) -> int | None:
+    """Return the number of episodes that would decide: of a right player where the interval holds 0, else of this."""
+    inside, outside, power = (
+        NormalDist().inv_cdf(1 - tail) for tail in ((1 - CONFIDENCE) / 2, FALSE_ALARM / 2, 1 - POWER)
+    )
+    if abs(mean) <= near:  # a difference of 0 is as likely as any: its |mean| stays within the power's two-sided bound
+        distance, errors = margin, inside + NormalDist().inv_cdf(1 - (1 - POWER) / 2)
+    elif abs(mean) < margin:
+        distance, errors = margin - abs(mean), inside + power
+    else:
+        distance, errors = abs(mean) - margin, outside + power
+    if distance <= 0 or deviation * errors > distance * math.sqrt(MOST_EPISODES):
+        return None
+    return math.ceil((deviation * errors / distance) ** 2)
