@@ -19,6 +19,10 @@ from exporter.export.pipeline import export as run_export
 from exporter.export.sources import Source, live_source
 from exporter.inspect.inspection import Inspection, inspect_source
 from exporter.options import ReadOptions, WriteOptions, compile_options
+from exporter.play.options import PlayOptions
+from exporter.play.play import play_policy
+from exporter.play.report import PlayReport
+from exporter.play.worlds import MakeWorld
 from exporter.remote.fetching import nearby
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
@@ -222,4 +226,46 @@ def compare(
         understanding=compile_options(read),
         read=read.for_reader(),
         allow_unverified=allow_unverified,
+    )
+
+
+def play(
+    reference: Path | str,
+    env: str | MakeWorld,
+    candidates: Path | str | Sequence[Path | str] = (),
+    *,
+    options: PlayOptions | None = None,
+    partner: Path | str | None = None,
+    names: Mapping[str, str] | None = None,
+    read: ReadOptions | None = None,
+    verify: str | Sequence[str] | VerifyOptions = "auto",
+) -> PlayReport:
+    """Play an environment with every format in the installed runtimes, and compare what they earn.
+
+    Each is fed the states that the reference met, step by step; then each plays whole episodes from the same seeds.
+
+    - ``reference``, ``candidates``: as for ``compare``. Without candidates the formats of the bundle play, or those
+      that an export of the source would write.
+    - ``env``: ``3DBall``, ``GridWorld``, ``Hallway``, ``Tennis`` or ``Crawler2D``, or a function that makes a World
+      (exporter/play/worlds.py) for a policy's signature.
+    - ``options``: episodes, seed, margin, and whether actions are drawn; ``partner``: the bundle that plays the other
+      side, where there is one.
+    - ``names``, ``read``, ``verify``: as for ``compare``.
+
+    Raises ExportModelError; a difference is not raised, ``passed`` is False::
+
+        report = export_model.play("exported/3DBall", "3DBall")
+        print(report.sentence)
+    """
+    read = read or ReadOptions()
+    return play_policy(
+        reference,
+        env,
+        candidates,
+        options=options,
+        partner=partner,
+        names=names,
+        understanding=compile_options(read),
+        read=read.for_reader(),
+        judging=judged_by(verify),
     )

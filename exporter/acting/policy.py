@@ -187,6 +187,23 @@ class LoadedPolicy:
                 text = ", ".join("any" if n is None else str(n) for n in shape)
                 raise UsageError(f"the parameter {name!r} has the shape {list(found)}", why=f"[{text}] is wanted")
 
+    def needed_outputs(self, *, deterministic: bool) -> list[str]:
+        """Return the outputs that a decision is made of: actions or what they are drawn from, and the memory."""
+        scores = [] if self._scores is None else [self._scores.name]
+        names: list[str] = []
+        for head in self.signature.heads:
+            if deterministic and head.plain is not None:
+                names.append(head.plain.name)
+            elif head.is_continuous or head.spec.role in (Role.DETERMINISTIC, Role.PROBS) or not scores:
+                names.append(head.name)
+            else:
+                names += scores
+        if self._spread is not None and not deterministic:
+            names.append(self._spread.name)
+        if self.signature.memory is not None and self.signature.memory.output is not None:
+            names.append(self.signature.memory.output)
+        return list(dict.fromkeys(names))
+
     def takes(self, role: Role) -> bool:
         """Whether an input has this role."""
         return any(s.role is role for s in self.signature.inputs)

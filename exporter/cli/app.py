@@ -13,6 +13,7 @@ _COMMANDS = (
     "demo",
     "export",
     "inspect",
+    "play",
     "runtimes",
     "serve",
     "snippets",

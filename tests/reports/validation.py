@@ -12,7 +12,7 @@ from tests.commands import ROOT
 
 
 def schema(name: str) -> Any:
-    """The schema of parity.json or policy.json."""
+    """The schema of parity.json, policy.json or what play prints."""
     return json.loads((ROOT / "exporter" / "reports" / f"{name}.schema.json").read_text(encoding="utf-8"))
 
 
@@ -49,3 +49,9 @@ def check_parity(data: bytes | str) -> None:
 def check_policy(data: bytes | str) -> None:
     """Assert that ``data`` is a policy.json as documented."""
     _checked("policy", data)
+
+
+def check_play(data: bytes | str) -> None:
+    """Assert that ``data`` is what ``play --json`` prints, as documented."""
+    _checked("play", data)
+    check_parity(json.dumps(json.loads(data)["replay"]))

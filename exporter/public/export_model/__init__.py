@@ -1,8 +1,8 @@
 """export-model: trained policies for every runtime, proven to act the same.
 
 ``export`` writes a policy in every format and compares them, ``load`` gives one that acts, ``inspect`` shows what is in
-a file, ``verify`` checks a bundle again, ``compare`` checks files of any tool. What they need is imported when they are
-called.
+a file, ``verify`` checks a bundle again, ``compare`` checks files of any tool, ``play`` compares what they earn in an
+environment. What they need is imported when they are called.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ if TYPE_CHECKING:
     from typing import Any
 
     from exporter import __version__
-    from exporter.interface import compare, export, inspect, load, verify
+    from exporter.interface import compare, export, inspect, load, play, verify
     from exporter.options import ReadOptions, WriteOptions
+    from exporter.play.options import PlayOptions
     from exporter.verify.options import VerifyOptions
     from signatures.errors import ExportModelError
 
 _HOMES = {
-    **dict.fromkeys(("compare", "export", "inspect", "load", "verify"), "exporter.interface"),
+    **dict.fromkeys(("compare", "export", "inspect", "load", "play", "verify"), "exporter.interface"),
     **dict.fromkeys(("ReadOptions", "WriteOptions"), "exporter.options"),
+    "PlayOptions": "exporter.play.options",
     "VerifyOptions": "exporter.verify.options",
     "ExportModelError": "signatures.errors",
     "__version__": "exporter",
@@ -29,6 +31,7 @@ _HOMES = {
 
 __all__ = [
     "ExportModelError",
+    "PlayOptions",
     "ReadOptions",
     "VerifyOptions",
     "WriteOptions",
@@ -37,6 +40,7 @@ __all__ = [
     "export",
     "inspect",
     "load",
+    "play",
     "verify",
 ]
 

@@ -1,0 +1,109 @@
+"""The command ``play``. Imports click only; the rest when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from exporter.cli.group import PATH, command
+from exporter.cli.options import located, pairs, trusting, understanding
+from exporter.cli.terminal import Progress, say_json, say_lines, say_paragraph
+
+if TYPE_CHECKING:
+    from converters.compiler.options import CompileOptions
+
+_COLOURS = {True: "green", False: "red", None: "yellow"}
+
+
+@command(
+    "play",
+    "Play an environment: does every format earn the same?",
+    ("export-model play exported/3DBall --env 3DBall", "every format"),
+    ("export-model play 3DBall.bytes theirs.onnx --env 3DBall", "a file of any tool"),
+    core=(
+        "env",
+        "episodes",
+        "margin",
+        "likeliest",
+        "strict",
+        "partner",
+        "runtimes",
+        "seed",
+        "as_json",
+        "verbose",
+        "quiet",
+    ),
+)
+@click.argument("reference", type=PATH)
+@click.argument("candidates", nargs=-1, type=PATH, metavar="[CANDIDATE]...")
+@click.option("--env", required=True, metavar="ENV", help="3DBall, GridWorld, Hallway, Tennis or Crawler2D.")
+@click.option("--episodes", type=int, default=200, metavar="N", help="Episodes that each plays.")
+@click.option("--seed", type=int, default=0, metavar="N", help="Seed of the episodes and of drawn actions.")
+@click.option("--margin", default="1%", metavar="SIZE", help="How far mean returns may be apart: 1%, or a number.")
+@click.option(
+    "--deterministic", "likeliest", is_flag=True, help="Take the likeliest action and the mean, in place of draws."
+)
+@click.option("--strict", is_flag=True, help="Fail where more episodes are needed to decide, too.")
+@click.option("--partner", type=PATH, metavar="BUNDLE", help="Who plays the other side, where there is one.")
+@click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
+@trusting
+@located
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+@click.option("-q", "--quiet", is_flag=True, help="Print only what disagrees.")
+@click.option("-v", "--verbose", is_flag=True, help="Print every step.")
+@understanding
+def play_command(
+    reference: Path,
+    candidates: tuple[Path, ...],
+    env: str,
+    episodes: int,
+    seed: int,
+    margin: str,
+    likeliest: bool,
+    strict: bool,
+    partner: Path | None,
+    mapped: tuple[str, ...],
+    trust_source: bool,
+    runtimes: str,
+    as_json: bool,
+    quiet: bool,
+    verbose: bool,
+    compiling: CompileOptions,
+) -> None:
+    """Play an environment with every format in the installed runtimes, and compare what they earn.
+
+    Each is fed the states that the reference met, step by step; then each plays whole episodes from the same seeds.
+    Without a candidate, the formats of the bundle play, or those that an export of the source would write.
+    """
+    from converters.formats.source import ReadOptions
+    from exporter.play.options import PlayOptions
+    from exporter.play.play import play_policy
+    from exporter.verify.options import VerifyOptions
+
+    options = PlayOptions(episodes, seed, margin, likeliest)
+    with Progress(quiet=quiet or as_json, verbose=verbose) as progress:
+        report = play_policy(
+            reference,
+            env,
+            candidates,
+            options=options,
+            partner=partner,
+            names=pairs(mapped, "--map"),
+            understanding=compiling,
+            read=ReadOptions(trust_source=trust_source),
+            judging=VerifyOptions(runtimes=runtimes),
+            progress=progress,
+        )
+    if as_json:
+        say_json(report.to_dict())
+    elif not quiet or report.passed is not True:
+        for note in report.notes:
+            say_paragraph(note, "note: ", "    ")
+        for line in report.lines():
+            say_lines(line)
+        say_paragraph(report.sentence, colour=_COLOURS[report.passed])
+    if report.passed is False or (strict and report.passed is None):
+        sys.exit(1)

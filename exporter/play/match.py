@@ -1,0 +1,184 @@
+"""One policy in one world: the reference plays and is recorded, every artefact in every runtime plays beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from converters.files.children.process import RunFailedError
+from converters.formats.bundle.embed import runnable
+from converters.graph.run import run_graph
+from converters.policy.policy import Policy
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import RuntimeInfo
+from exporter.acting.policy import LoadedPolicy
+from exporter.play.episodes import Episodes, play_episodes
+from exporter.play.equivalence import Equivalence, equivalence
+from exporter.play.options import PlayOptions
+from exporter.play.recording import Recorder
+from exporter.play.replay import replay
+from exporter.play.worlds import MakeWorld
+from exporter.verify.checks.rollout import rollout
+from exporter.verify.findings import Finding
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import Participant, PolicyUnderTest
+from exporter.verify.reference import Reference
+from exporter.verify.report import ParityReport
+from exporter.verify.trial import Inputs, Trial
+from exporter.verify.verification import Participants, verify
+from signatures.batches import Arrays, Run
+from signatures.errors import ExportModelError
+from signatures.records import dataclass
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Played:
+    """One artefact in one runtime: its episodes, and how their returns compare with the reference's."""
+
+    format: str
+    runtime: str
+    episodes: Episodes
+    compared: Equivalence
+
+
+class Match:
+    """The episodes of one policy; ``judge`` is what a comparison makes of its candidates."""
+
+    def __init__(self, make_world: MakeWorld, options: PlayOptions) -> None:
+        self._make_world, self._options = make_world, options
+        self.policy: Policy | None = None
+        self.reference: Episodes | None = None
+        #: what played as the reference: ``source/tensorflow``, ``numpy``
+        self.reference_name = ""
+        self.played: list[Played] = []
+        self.notes: tuple[str, ...] = ()
+        self.world_name = ""
+        #: steps that were kept for the replay
+        self.recorded = 0
+        self._progress: Progress = lambda text: None
+
+    def understood(self, policy: Policy) -> None:
+        """Take the policy that is played. Raises UsageError where it does not fit the environment."""
+        self.policy = policy
+        self._world = self._make_world(policy.signature)
+        self.notes, self.world_name = self._world.notes, self._world.name
+
+    @property
+    def margin(self) -> float:
+        """How far mean returns may be apart."""
+        assert self.reference is not None
+        return self._options.bound.of(self.reference.returns)
+
+    def judge(
+        self,
+        tested: PolicyUnderTest,
+        runtimes: Sequence[str],
+        known: Sequence[RuntimeInfo],
+        pool: RuntimePool,
+        options: VerifyOptions | None,
+        progress: Progress,
+        participants: Participants | None,
+    ) -> ParityReport:
+        """Return the report on the replay; what was played is kept here."""
+        self._progress = progress
+        options = options or VerifyOptions(seed=self._options.seed)
+
+        def record(reference: Reference) -> Inputs:
+            return self._record(tested, reference)
+
+        checks = (replay, rollout, self._play)
+        return verify(tested, runtimes, known, pool, options, progress, participants, record, checks)
+
+    def _record(self, tested: PolicyUnderTest, reference: Reference) -> Inputs:
+        """Have the reference play, and keep what it met."""
+        assert self.policy is not None
+        recorder = Recorder(tested.signature)
+        actor = self._actor(_run_of(reference), reference.name)
+        actor = self._actor(recorder.recording(self._acting(actor, _run_of(reference))), reference.name)
+        episodes = self._episodes(actor, f"the reference, {reference.name}", recorder.watch)
+        if tested.graph is self.policy.graph:
+            self.reference, self.reference_name = episodes, reference.name
+        elif self.reference is None:  # rounded weights are held against themselves by numbers, by returns against these
+            graph = runnable(self.policy.graph)
+            whole = self._actor(lambda feeds, fetch: run_graph(graph, feeds, fetch), "numpy")
+            self.reference, self.reference_name = self._episodes(whole, "the reference, numpy"), "numpy"
+        inputs = recorder.inputs()
+        self.recorded = max(self.recorded, len(inputs.cases))
+        return inputs
+
+    def _play(self, trial: Trial, participant: Participant) -> Iterator[Finding]:
+        """Have a participant play; what comes of it is no finding of numbers. Raises RunFailedError."""
+        assert self.reference is not None
+
+        def run(feeds: Arrays, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+            return participant.run([feeds], fetch)[0]
+
+        actor = self._actor(run, participant.runtime)
+        lacks = [
+            n for n in actor.needed_outputs(deterministic=self._options.deterministic) if n not in participant.outputs
+        ]
+        if lacks:
+            if ":" not in participant.format:  # a SavedModel's other signatures are for other callers
+                raise RunFailedError("cannot play", why=f"it has no output {lacks[0]!r}")
+            return
+        actor = self._actor(self._acting(actor, run), participant.runtime)
+        try:
+            episodes = self._episodes(actor, f"{participant.name} in {participant.runtime}")
+        except RunFailedError:
+            raise
+        except ExportModelError as error:  # what it decided is not an action
+            raise RunFailedError(
+                "stopped playing", why=f"{error.what}: {error.why}" if error.why else error.what
+            ) from error
+        compared = equivalence(self.reference.returns, episodes.returns, self.margin)
+        self.played.append(Played(participant.name, participant.runtime, episodes, compared))
+        yield from ()
+
+    def _actor(self, run: Run, runtime: str) -> LoadedPolicy:
+        assert self.policy is not None
+        source = self.policy.source
+        kept = source.noise_kept and bool(source.noise)
+        return LoadedPolicy(self.policy.name, self.policy.signature, run, runtime, draws_itself=kept)
+
+    def _acting(self, actor: LoadedPolicy, run: Run) -> Run:
+        """Return ``run``, asked for what a decision takes alone."""
+        names = actor.needed_outputs(deterministic=self._options.deterministic)
+        return lambda feeds, fetch: run(feeds, names)
+
+    def _episodes(
+        self,
+        actor: LoadedPolicy,
+        who: str,
+        watch: Callable[[int, np.ndarray], None] = lambda step, playing: None,
+    ) -> Episodes:
+        options = self._options
+        self._progress(f"{who} plays {options.episodes} episodes")
+
+        def advance(ended: int, count: int, rate: float) -> None:
+            self._progress(f"{who}: {ended} of {count} episodes, {rate:,.0f} decisions/s")
+
+        return play_episodes(
+            self._world,
+            actor,
+            options.episodes,
+            options.seed,
+            deterministic=options.deterministic,
+            watch=watch,
+            advance=advance,
+        )
+
+
+def _run_of(reference: Reference) -> Run:
+    """Return how the reference acts: the source where it answers, the numpy kernels for the rest."""
+
+    def run(feeds: Arrays, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        answers = {} if reference.original is None else reference.original.run(feeds)
+        rest = [name for name in fetch if name not in answers]
+        if rest:
+            answers.update(reference.run([feeds], rest)[0])
+        return answers
+
+    return run

@@ -1,0 +1,57 @@
+"""Environments by name: those of this package, Gymnasium's, and the user's own code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from exporter.acting.loading import load_policy
+from exporter.play.environments import ENVIRONMENTS
+from exporter.play.environments.base import Observation
+from exporter.play.environments.tennis import follow_ball
+from exporter.play.worlds import Decide, MakeWorld, OwnWorld, World, own_scene
+from exporter.serve.scenes import SCENES, other_side
+from signatures.contract import POLICY
+from signatures.errors import UsageError
+from signatures.roles import Role
+from signatures.spec import PolicySignature
+
+
+def world_maker(env: str, place: Path, partner: Path | str | None = None) -> MakeWorld:
+    """Return what makes the world called ``env`` for a policy at ``place``. Raises UsageError where there is none."""
+    name = next((n for n in ENVIRONMENTS if n.casefold() == env.casefold()), None)
+    if name is None:
+        known = ", ".join(ENVIRONMENTS)
+        raise UsageError(f"--env {env}: unknown environment", fix=f"one of {known}")
+    if partner is not None and all(s.side is None for s in SCENES if s.name == name):
+        raise UsageError(f"--partner does not go with --env {name}", why="one policy plays there", fix="leave it out")
+
+    def make(signature: PolicySignature) -> World:
+        scene = own_scene(name, signature)
+        if scene.side is None:
+            return OwnWorld(scene, signature, _nobody)
+        return OwnWorld(scene, signature, *_partner(place, scene.side, partner))
+
+    return make
+
+
+def _partner(place: Path, side: str, partner: Path | str | None) -> tuple[Decide, tuple[str, ...]]:
+    """Return the player of the other side, and what a report says of it."""
+    beside = [place.absolute().parent / name for name in other_side(place.absolute().name)]
+    found = next((p for p in beside if (p / POLICY).is_file()), None) if partner is None else Path(partner)
+    if found is None:
+        other = "RightBrain" if side == "left" else "LeftBrain"
+        return lambda seen: follow_ball(other, seen), (f"the other side, {other}, is a player that follows the ball",)
+    policy = load_policy(found)
+    masked = policy.takes(Role.MASKS)
+
+    def decide(seen: Observation) -> np.ndarray:
+        masks = seen.get("action_masks") if masked else None
+        return policy.decide(seen["state"], masks=masks, deterministic=True).action
+
+    return decide, (f"the other side is {policy.name}, in {policy.runtime}, without chance",)
+
+
+def _nobody(seen: Observation) -> np.ndarray:
+    raise AssertionError("one policy plays alone")

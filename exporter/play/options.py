@@ -1,0 +1,32 @@
+"""How to play."""
+
+from __future__ import annotations
+
+from exporter.acting.generator import MAX_SEED
+from exporter.play.equivalence import LEAST_EPISODES, MOST_EPISODES, Margin, parse_margin
+from signatures.errors import whole
+from signatures.records import dataclass
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How to play."""
+
+    #: Episodes that each plays.
+    episodes: int = 200
+    #: Seed of the episodes and of drawn actions.
+    seed: int = 0
+    #: How far mean returns may be apart: a share of how large they are (``1%``), or a number in their unit.
+    margin: str = "1%"
+    #: Take the likeliest action and the mean, in place of draws.
+    deterministic: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "episodes", whole("episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
+        object.__setattr__(self, "seed", whole("seed", self.seed, 0, MAX_SEED))
+        parse_margin(self.margin)
+
+    @property
+    def bound(self) -> Margin:
+        """The margin as it is computed with."""
+        return parse_margin(self.margin)

@@ -1,0 +1,115 @@
+"""``export-model play``: whether artefacts play as well as their reference."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from converters.compiler.options import CompileOptions
+from converters.files.children.process import RunFailedError
+from converters.files.folders import scratch_folder
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.source import ReadOptions
+from converters.runtimes.pool import RuntimePool
+from exporter.compare.comparison import compare_artefacts
+from exporter.export.options import ExportOptions
+from exporter.export.pipeline import export
+from exporter.play.match import Match
+from exporter.play.named import world_maker
+from exporter.play.options import PlayOptions
+from exporter.play.report import PlayReport
+from exporter.play.worlds import MakeWorld
+from exporter.remote.fetching import nearby
+from exporter.verify.options import VerifyOptions
+from signatures.contract import POLICY
+from signatures.errors import UsageError
+
+_LOG = logging.getLogger(__name__)
+
+
+def play_policy(
+    reference: Path | str,
+    env: str | MakeWorld,
+    candidates: Path | str | Sequence[Path | str] = (),
+    *,
+    options: PlayOptions | None = None,
+    partner: Path | str | None = None,
+    names: Mapping[str, str] | None = None,
+    understanding: CompileOptions | None = None,
+    read: ReadOptions | None = None,
+    judging: VerifyOptions | None = None,
+    progress: Callable[[str], None] = _LOG.info,
+    pool: RuntimePool | None = None,
+) -> PlayReport:
+    """Play a policy's artefacts in an environment beside their reference: recorded states first, then whole episodes.
+
+    - ``reference``: a bundle, or a source of any kind. Without ``candidates`` the formats of the bundle play, or those
+      that an export of the source would write; ``names`` maps names of the reference to those of the candidates.
+    - ``env``: an environment of this package (``3DBall``), or a function that makes a World for a signature.
+    - ``options``: episodes, seed, margin; ``partner``: the bundle that plays the other side, where there is one.
+    - ``understanding``, ``read``: how to read the reference; ``judging``: the runtimes, the tolerances of the replay.
+
+    Raises ExportModelError. A disagreement is not raised: ``passed`` is False.
+    """
+    options = options or PlayOptions()
+    judging = judging or VerifyOptions()
+    if judging.runtimes == "none":
+        raise UsageError("--verify none leaves nothing that plays", fix="leave it out, or name a runtime")
+    with ExitStack() as opened:
+        given = [candidates] if isinstance(candidates, Path | str) else [*candidates]
+        whole = [opened.enter_context(nearby(Path(path))) for path in (reference, *given)]
+        make = world_maker(env, whole[0], partner) if isinstance(env, str) else env
+        for place in whole:
+            if (place / POLICY).is_file():
+                Bundle.open(place).verify_hashes()
+        first, *others = whole
+        match = Match(make, options)
+        if not others:
+            others = [first] if (first / POLICY).is_file() else [_exported(first, understanding, read, opened)]
+        report = compare_artefacts(
+            first,
+            others,
+            names=names,
+            runtimes=judging.runtimes,
+            options=replace(judging, seed=options.seed),
+            understanding=understanding,
+            read=read,
+            progress=progress,
+            understood=match.understood,
+            pool=pool,
+            judge=match.judge,
+        )
+    assert match.policy is not None
+    if match.reference is None:
+        raise RunFailedError("the reference cannot play", why="\n".join(c.sentence() for c in report.failures) or None)
+    return PlayReport(
+        match.policy.name,
+        match.world_name,
+        options,
+        match.margin,
+        match.reference_name,
+        match.reference,
+        tuple(match.played),
+        report,
+        match.recorded,
+        match.notes,
+    )
+
+
+def _exported(source: Path, understanding: CompileOptions | None, read: ReadOptions | None, opened: ExitStack) -> Path:
+    """Return a bundle of the formats that an export of a source writes, in a folder that goes when ``opened`` does."""
+    folder = Path(opened.enter_context(scratch_folder()))
+    options = ExportOptions(
+        folder, compile=understanding or CompileOptions(), read=read or ReadOptions(), verify="none"
+    )
+    results = list(export([source], options))
+    if len(results) != 1:
+        raise UsageError(
+            f"{source} holds {len(results)} policies",
+            why=", ".join(r.policy.name for r in results),
+            fix="choose one with --brain, or export it and give a bundle",
+        )
+    return results[0].folder
