@@ -19,7 +19,7 @@ from converters.compiler.passes.inputs import complete_shapes, set_values, settl
 from converters.compiler.passes.memories import Joined, join_memories
 from converters.compiler.passes.mixtures import settle_mixtures
 from converters.compiler.passes.naming import name_ports
-from converters.compiler.passes.noise import settle_noise, settle_single_draws, unseeded
+from converters.compiler.passes.noise import clear_seeds, settle_noise, settle_single_draws
 from converters.compiler.passes.normalise import normalise
 from converters.compiler.passes.outputs import derive_outputs, leave_out_without_rows, without_chance
 from converters.compiler.passes.passed_through import drop_passed_through
@@ -58,7 +58,7 @@ PASSES = (
     Pass("leave out", leave_out_without_rows, (has.meanings,), (has.meanings,)),
     Pass("settle single draws", settle_single_draws, (has.meanings,), (has.one_spelling,)),
     Pass("settle noise", settle_noise, (has.no_control_flow,), (has.noise_as_asked,)),
-    Pass("remove seeds", on_graph(unseeded), (), (has.no_seeds,)),
+    Pass("remove seeds", on_graph(clear_seeds), (), (has.no_seeds,)),
     Pass("derive outputs", derive_outputs, (has.meanings, has.noise_as_asked), (has.actions_without_chance,)),
     Pass("leave chance out", without_chance, (has.actions_without_chance,), (has.actions_without_chance,)),
     FOLD,
@@ -92,7 +92,7 @@ def compile_graph(
 
 def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> list[tuple[str, Compilation]]:
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
-    joined = _prepared(graph, options, facts)
+    joined = _prepare(graph, options, facts)
     original, options, facts = joined.graph, joined.options, joined.facts
     graph = set_values(original, options.values)
     brains = find_brains(graph, options.outputs, facts.outputs, facts.decisions)
@@ -130,7 +130,7 @@ def explanations(
 ) -> dict[str, tuple[Decision, ...]]:
     """Policy → why its inputs and outputs have their roles, by the source's names. Raises as ``compile_graph``."""
     with np.errstate(all="ignore"):
-        joined = _prepared(graph, options or CompileOptions(), facts or SourceFacts())
+        joined = _prepare(graph, options or CompileOptions(), facts or SourceFacts())
         graph, options, facts = set_values(joined.graph, joined.options.values), joined.options, joined.facts
         brains = find_brains(graph, options.outputs, facts.outputs, facts.decisions)
         found = {}
@@ -139,17 +139,17 @@ def explanations(
             told, declared = facts.decisions, bool(facts.outputs)
             inputs = explain_inputs(graph, brain, options.inputs, facts.roles, told, declared=declared)
             decisions = (*inputs, *explain_outputs(brain, told))
-            found[own] = tuple(replace(d, tensor=_shown(graph, d.tensor)) for d in decisions)
+            found[own] = tuple(replace(d, tensor=_tensor_text(graph, d.tensor)) for d in decisions)
     return found
 
 
-def _shown(graph: Graph, reference: str) -> str:
+def _tensor_text(graph: Graph, reference: str) -> str:
     """The source's name for a tensor, or the node's."""
     origin = _source_of(graph, reference)
     return origin if isinstance(origin, str) else ", ".join(origin) if origin else reference
 
 
-def _prepared(graph: Graph, options: CompileOptions, facts: SourceFacts) -> Joined:
+def _prepare(graph: Graph, options: CompileOptions, facts: SourceFacts) -> Joined:
     """A source's graph with one memory, any number of rows, and inputs of the dtypes that every target has."""
     graph, facts = widen_small_integers(*narrow_doubles(graph, facts))
     options = _by_nodes(graph, options)
@@ -184,10 +184,10 @@ def _by_nodes(graph: Graph, options: CompileOptions) -> CompileOptions:
     """The options with nodes in place of names that only the source has (ONNX values are named more freely)."""
     names = {n.origin: n.name for n in graph.nodes if isinstance(n.origin, str)}
 
-    def moved(given: Mapping[str, Any]) -> dict[str, Any]:
+    def rekey(given: Mapping[str, Any]) -> dict[str, Any]:
         return {k if node_of(k) in graph else names.get(k, k): v for k, v in given.items()}
 
-    return replace(options, inputs=moved(options.inputs), outputs=moved(options.outputs), values=moved(options.values))
+    return replace(options, inputs=rekey(options.inputs), outputs=rekey(options.outputs), values=rekey(options.values))
 
 
 def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from converters.compiler.passes.weights import Storage, rounded
+from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.frozen_graph.writer import frozen
 from converters.policy.policy import Policy
@@ -44,7 +44,7 @@ def compare_rounded(
 
     ``folder`` is where the rounded policy is written to.
     """
-    graph = rounded(tested.graph, storage)
+    graph = round_weights(tested.graph, storage)
     reference = folder / f"reference-{storage}.bytes"
     small = replace(tested, graph=graph, reference=reference, source=None)
     frozen(replace(policy, graph=graph)).write(reference)

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.compiler.passes.weights import Storage, rounded
+from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.format import Artifact, Format, WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.formats.source import ReadOptions, SourceModel
@@ -230,7 +230,9 @@ def smaller(job: Job, weights: Storage) -> Job:
     whole = job.policy
     note = f"weights were rounded to {weights}; what is computed with them is float32"
     signature = replace(whole.signature, notes=(*whole.signature.notes, note))
-    return replace(job, policy=replace(whole, graph=rounded(whole.graph, weights), signature=signature), whole=whole)
+    return replace(
+        job, policy=replace(whole, graph=round_weights(whole.graph, weights), signature=signature), whole=whole
+    )
 
 
 def sizes_unrounded(job: Job, formats: Sequence[Format], options: ExportOptions) -> dict[str, int]:

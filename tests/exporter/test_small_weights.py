@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from converters.compiler.passes.int8_products import join_products, multiply_products
-from converters.compiler.passes.weights import LEAST, Storage, are_steps, compact, rounded
+from converters.compiler.passes.weights import LEAST, Storage, are_steps, compact, round_weights
 from converters.formats.format import WriteOptions
 from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
@@ -41,7 +41,7 @@ def drawn(*shape: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("turned", [False, True], ids=["", "transposed"])
 def test_what_is_rounded_comes_back_to_the_bit(storage: Storage, turned: bool) -> None:
     whole = drawn(24, 40).T if turned else drawn(40, 24)
-    made = rounded(graph_of(whole, transpose_b=turned), storage)["w"].value
+    made = round_weights(graph_of(whole, transpose_b=turned), storage)["w"].value
     assert made is not None and made.dtype == np.float32 and not np.array_equal(made, whole)
     axis = 0 if turned else 1
     limit = np.abs(whole).max(axis=1 - axis, keepdims=True) * (2.0**-11 if storage == "float16" else 0.51 / 127)
@@ -67,16 +67,16 @@ def test_what_is_rounded_comes_back_to_the_bit(storage: Storage, turned: bool) -
 )
 def test_what_needs_every_digit_keeps_it(kept: Graph) -> None:
     for storage in ("float16", "int8"):
-        assert rounded(kept, storage)["w"] == kept["w"]
+        assert round_weights(kept, storage)["w"] == kept["w"]
 
 
 def test_what_float16_cannot_hold_stays() -> None:
     large = graph_of(drawn(40, 24) * np.float32(1e6))
-    assert rounded(large, "float16")["w"] == large["w"]
+    assert round_weights(large, "float16")["w"] == large["w"]
 
 
 def test_tensorflow_js_multiplies_the_products_of_layers_and_not_their_matrices() -> None:
-    matrix = rounded(graph_of(drawn(40, 24)), "int8")["w"].value
+    matrix = round_weights(graph_of(drawn(40, 24)), "int8")["w"].value
     plain = Graph(
         (
             Node("x", "Placeholder", attrs={"dtype": np.dtype(np.float32), "shape": TensorShape((None, 40))}),
@@ -101,7 +101,7 @@ def test_tensorflow_js_multiplies_the_products_of_layers_and_not_their_matrices(
 
 
 def test_a_matrix_that_is_turned_or_read_by_others_is_multiplied_itself() -> None:
-    matrix = rounded(graph_of(drawn(24, 40).T, transpose_b=True), "int8")["w"].value
+    matrix = round_weights(graph_of(drawn(24, 40).T, transpose_b=True), "int8")["w"].value
     for other in (("y", "MatMul", ("x", "w"), {"transpose_b": True}), ("y", "Square", ("w",), {})):
         plain = Graph((Node("x", "Placeholder"), Node("w", "Const", value=matrix), Node(*other)))
         assert multiply_products(plain)["y"] == plain["y"] and multiply_products(plain)["w"].op == "Mul"
@@ -143,7 +143,7 @@ def test_every_format_holds_the_same_numbers(storage: Storage, tmp_path: Path) -
         verify="none",
         **({"dtype": "float16"} if storage == "float16" else {"quantize": "int8"}),
     )
-    wanted = rounded(policy.graph, storage)
+    wanted = round_weights(policy.graph, storage)
     changed = {
         n.value.tobytes() for n in wanted.nodes if n.value is not None and n.value is not policy.graph[n.name].value
     }

@@ -40,7 +40,7 @@ def for_any_number(graph: Graph, outputs: Sequence[str]) -> tuple[Graph, int] | 
     try:
         if too_large(upstream):
             return None
-        found = _freed(upstream, outputs, inputs) or _turned(upstream, outputs, inputs)
+        found = _free_first_axis(upstream, outputs, inputs) or _vectorise(upstream, outputs, inputs)
     except ExportModelError:
         return None
     if found is None:
@@ -51,7 +51,7 @@ def for_any_number(graph: Graph, outputs: Sequence[str]) -> tuple[Graph, int] | 
     return Graph(topological([*made.nodes, *constants])), rows
 
 
-def _freed(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) -> tuple[Graph, int] | None:
+def _free_first_axis(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) -> tuple[Graph, int] | None:
     """The first axes left free, where these are the agents'."""
     rows = {dims[0] for dims in inputs.values()}
     if len(rows) != 1 or all(len(dims) == 1 for dims in inputs.values()):
@@ -69,7 +69,7 @@ def _freed(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) -> 
     return made, rows.pop()
 
 
-def _turned(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) -> tuple[Graph, int] | None:
+def _vectorise(graph: Graph, outputs: Sequence[str], inputs: Mapping[str, Dims]) -> tuple[Graph, int] | None:
     """Computed for each agent; a first axis of 1 is the agents'. Raises UnsupportedOpError where it cannot be."""
     types = infer_types(normalise(graph, outputs))
     first = {(types[o].shape or (None,))[0] for o in outputs}

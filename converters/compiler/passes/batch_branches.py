@@ -44,7 +44,7 @@ def join_branches(graph: Graph, roots: Iterable[str], actions: Collection[str]) 
         if name not in graph or tried == _MOST_TRIED or not _is_alike(graph, graph[name], depths):
             continue
         tried += 1
-        made = _Joining(graph, outputs, depths).made(graph[name], name in actions)
+        made = _Joining(graph, outputs, depths).joined_graph(graph[name], name in actions)
         if made is not None and _size(made) < _size(graph):
             graph, depths = made, _depths(made)
     return _flat(graph, outputs)
@@ -97,7 +97,7 @@ class _Joining:
         #: parts that have nothing in common
         self.apart: set[tuple[str, ...]] = set()
 
-    def made(self, root: Node, action: bool) -> Graph | None:
+    def joined_graph(self, root: Node, action: bool) -> Graph | None:
         """The graph, if there is anything to join."""
         parts, kind = root.inputs[:-1], self.types[root.name]
         axis = self.graph.constant(root.inputs[-1])
@@ -166,7 +166,7 @@ class _Joining:
 
     # ------------------------------------------------------------------ groups
 
-    def _joined(self, parts: tuple[str, ...]) -> tuple[str, bool]:
+    def _join(self, parts: tuple[str, ...]) -> tuple[str, bool]:
         """A tensor in which the parts lie side by side, and whether it took no ConcatV2 of them."""
         whole = self._together(parts)
         if whole is not None:
@@ -181,13 +181,13 @@ class _Joining:
         if parts in self.groups or parts in self.apart or self.level == _DEEPEST:
             return self.groups.get(parts)
         self.level += 1
-        made = self._found(parts)
+        made = self._batched_op(parts)
         self.level -= 1
         if made is None:
             self.apart.add(parts)
         return made
 
-    def _found(self, parts: tuple[str, ...]) -> str | None:
+    def _batched_op(self, parts: tuple[str, ...]) -> str | None:
         whole = self._cut_from(parts)
         if whole is not None:
             return whole
@@ -260,7 +260,7 @@ class _Joining:
         if all(k.constant is not None for k in kinds):
             return self._constants(parts, given)
         if [k.shape for k in kinds] == [self.types[p].shape for p in parts]:
-            value, free = self._joined(tuple(given))
+            value, free = self._join(tuple(given))
             return value if free or not activation else None
         if len(set(given)) == 1 and kinds[0].shape is not None and kinds[0].shape[-1:] in ((), (1,)):
             return given[0]
@@ -290,7 +290,7 @@ class _Joining:
             # A zero times what is no number is none either, and would spread to the other parts.
             if self.types[node.inputs[0]].shape != self.types[part].shape or not self._is_number(node.inputs[0]):
                 return None
-        summed, _ = self._joined(tuple(n.inputs[0] for n in nodes))
+        summed, _ = self._join(tuple(n.inputs[0] for n in nodes))
         part_of = np.repeat(np.arange(len(widths)), widths)
         ones = self.editor.const((part_of[:, None] == part_of).astype(FLOAT32), f"{nodes[0].name}/ones")
         product = self.editor.add("MatMul", [summed, ones], f"{nodes[0].name}/joined")

@@ -53,14 +53,14 @@ def rank_actions(c: Compilation) -> Compilation:
         return c
     evidence = evidence_of(given)
     if evidence is None:
-        return _noted(
+        return _add_note(
             c,
             f"nothing tells whether {given.name} holds continuous actions or values of discrete ones (Q-values, "
             "scores); it is exported as continuous actions; if the largest is the action: "
             f"--output {given.name}=q_values",
         )
     if evidence is not EVIDENCE[0]:
-        c = _noted(
+        c = _add_note(
             c,
             f"{given.name} is taken for values of discrete actions (Q-values), since {evidence.said}; the action is "
             f"the largest; if it is a continuous action: --output {given.name}=action",
@@ -141,5 +141,5 @@ def _without_role(c: Compilation) -> Compilation:
     return replace(c, brain=replace(c.brain, outputs=outputs))
 
 
-def _noted(c: Compilation, note: str) -> Compilation:
+def _add_note(c: Compilation, note: str) -> Compilation:
     return replace(c, facts=replace(c.facts, notes=(*c.facts.notes, note)))

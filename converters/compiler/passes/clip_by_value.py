@@ -15,9 +15,9 @@ def clip_by_value(graph: Graph, roots: Iterable[str]) -> Graph:
     editor = Editor(graph)
     left_out: set[str] = set()
     for node in graph.nodes:
-        above = _bound(graph, node, "Maximum")
+        above = _limit_of(graph, node, "Maximum")
         inner = graph.producer(above[0]) if above is not None else None
-        below = _bound(graph, inner, "Minimum") if inner is not None else None
+        below = _limit_of(graph, inner, "Minimum") if inner is not None else None
         if above is None or inner is None or below is None or len(readers[inner.name]) > 1 or inner.name in outputs:
             editor.keep(node)
         elif above[1] <= below[1]:
@@ -29,7 +29,7 @@ def clip_by_value(graph: Graph, roots: Iterable[str]) -> Graph:
     return Graph(tuple(n for n in editor.graph().nodes if n.name not in left_out)) if left_out else graph
 
 
-def _bound(graph: Graph, node: Node, op: str) -> tuple[str, float] | None:
+def _limit_of(graph: Graph, node: Node, op: str) -> tuple[str, float] | None:
     """(tensor, number) of a Maximum or Minimum of a tensor and one number."""
     if node.op != op:
         return None

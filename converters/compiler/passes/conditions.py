@@ -46,11 +46,11 @@ def constants_folded(c: Compilation) -> str | None:
     """What does not depend on an input is a Const."""
     types = infer_types(c.graph)
 
-    def known(node: Node) -> bool:
+    def is_constant(node: Node) -> bool:
         results = [types[ref(node.name, i)] for i in range(max(op_of(node).outputs, 1))]
         return all(r.constant is not None for r in results)
 
-    return _first(n for n in c.graph.nodes if not traits(n).start and known(n))
+    return _first(n for n in c.graph.nodes if not traits(n).start and is_constant(n))
 
 
 def no_identities(c: Compilation) -> str | None:

@@ -60,7 +60,7 @@ def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
         kind, value, number = found
         before = chains.get(value)
         if before is not None and before[0] == kind and len(readers[value]) == 1 and value not in outputs:
-            merged = _merged(kind, before[2], number)
+            merged = _merge(kind, before[2], number)
             if merged is not None:
                 value, number = before[1], merged
         chains[node.name] = (kind, value, number)
@@ -107,7 +107,7 @@ def _operand(graph: Graph, node: Node) -> tuple[str, str, np.ndarray] | None:
     return ("Mul" if kind == "factor" else "Add"), value, -wide if kind == "subtrahend" else wide
 
 
-def _merged(kind: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+def _merge(kind: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
     """One constant in place of two; None where float32 has none that does the same, or rounding is what they do."""
     try:
         made = first * second if kind == "Mul" else first + second

@@ -156,7 +156,7 @@ def _image_shape(graph: Graph, node: Node, consumers: Mapping[str, list[Node]], 
         return TensorShape((None, dims[1], dims[2], dims[3] or channels))
     for side in range(1, _LARGEST_IMAGE + 1):
         height, width = dims[1] or side, dims[2] or side
-        if _flattened(layers, graph, height, width) == weights.shape[0]:
+        if _flat_size(layers, graph, height, width) == weights.shape[0]:
             return TensorShape((None, height, width, dims[3] or channels))
     return TensorShape((None, dims[1], dims[2], dims[3] or channels))
 
@@ -175,7 +175,7 @@ def _window_chain(first: Node, consumers: Mapping[str, list[Node]]) -> tuple[lis
     return chain, node
 
 
-def _flattened(layers: list[Node], graph: Graph, height: int, width: int) -> int:
+def _flat_size(layers: list[Node], graph: Graph, height: int, width: int) -> int:
     channels = 0
     for layer in layers:
         kernel = None if traits(layer).layer == "pool" else graph.constant(layer.inputs[1])

@@ -42,7 +42,7 @@ def join_memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> 
     origins = {m.input: _origin(graph, m.input) for m in memories} | {
         m.output: _origin(graph, m.output) for m in memories
     }
-    joined, taken, given = _rewritten(graph, memories, origins)
+    joined, taken, given = _rewrite(graph, memories, origins)
     inputs, outputs = {m.input for m in memories}, {m.output for m in memories}
     wanted = {n: r for n, r in options.outputs.items() if normal_ref(n) not in outputs}
     if not {*wanted.values()}.isdisjoint(
@@ -94,7 +94,7 @@ def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tupl
     given_out = {normal_ref(n): r for n, r in options.outputs.items()}
     told = tuple(
         m
-        for m in (_paired(graph, facts) if facts.memories is None else facts.memories)
+        for m in (_pair_by_name(graph, facts) if facts.memories is None else facts.memories)
         if m.input not in options.values
         and given_in.get(m.input) in (None, Role.MEMORY_IN)
         and given_out.get(m.output) in (None, Role.MEMORY_OUT)
@@ -107,10 +107,10 @@ def _memories(graph: Graph, options: CompileOptions, facts: SourceFacts) -> tupl
     # A format that declares no outputs has several brains in one graph, each with a memory of its own.
     if not facts.outputs or (max(len(inputs), len(outputs)) < 2 and all(_has_rows_first(graph[n]) for n in inputs)):
         return ()
-    return _named(graph, inputs, outputs)
+    return _memories_from_user(graph, inputs, outputs)
 
 
-def _paired(graph: Graph, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
+def _pair_by_name(graph: Graph, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
     """The memories that names and shapes tell, of inputs that nothing else is known of."""
     named = (n for n in graph.nodes if n.op == "Placeholder" and n.name not in facts.roles)
     unknown = [n.name for n in named if role_by_name(n.name.rsplit("/", 1)[-1], n) is None]
@@ -118,7 +118,7 @@ def _paired(graph: Graph, facts: SourceFacts) -> tuple[SeparateMemory, ...]:
     return paired_memories(unknown, outputs, lambda: infer_types(graph, partial=True))
 
 
-def _named(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[SeparateMemory, ...]:
+def _memories_from_user(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[SeparateMemory, ...]:
     """The memories that the user names, the first output fed back to the first input."""
     if len(inputs) != len(outputs):
         raise SignatureError(
@@ -153,7 +153,7 @@ def _named(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> tuple
     return tuple(memories)
 
 
-def _rewritten(graph: Graph, memories: Sequence[SeparateMemory], origins: Mapping[str, str]) -> tuple[Graph, str, str]:
+def _rewrite(graph: Graph, memories: Sequence[SeparateMemory], origins: Mapping[str, str]) -> tuple[Graph, str, str]:
     """(the graph with one memory, its placeholder, the node that gives it)."""
     editor = Editor(graph)
     taken = editor.add_name(CANONICAL[Role.MEMORY_IN])

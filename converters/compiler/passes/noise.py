@@ -28,7 +28,7 @@ def samplers(graph: Graph) -> list[Node]:
     return [n for n in graph.nodes if traits(n).sampler == "normal"]
 
 
-def unseeded(graph: Graph) -> Graph:
+def clear_seeds(graph: Graph) -> Graph:
     """Samplers without the seed that the trainer's run had: with it, a game draws the same actions after every start,
     and TensorFlow.js, which starts its generator anew for every run, the same one each time.
     """
@@ -114,7 +114,7 @@ def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> G
             attrs = {"dtype": FLOAT32, "shape": TensorShape(dims)}
             editor.nodes.append(Node(node.name, "Placeholder", attrs=attrs, origin=node.origin))
         else:
-            _turned(editor, node, dims)
+            _move_batch_first(editor, node, dims)
     return editor.graph()
 
 
@@ -143,7 +143,7 @@ def laid_out(rows: np.ndarray, dims: Sequence[int | None]) -> np.ndarray:
     return np.moveaxis(rows.reshape(len(rows), *(d for d in dims if d is not None)), 0, axis)
 
 
-def _turned(editor: Editor, node: Node, dims: Sequence[int | None]) -> None:
+def _move_batch_first(editor: Editor, node: Node, dims: Sequence[int | None]) -> None:
     """An input [B, n] under a name of its own, and what the sampler drew of it, under the sampler's."""
     axis, others = list(dims).index(None), [d for d in dims if d is not None]
     attrs = {"dtype": FLOAT32, "shape": TensorShape((None, math.prod(others)))}
@@ -182,7 +182,7 @@ def without_noise(
             copies[node.name] = editor.const(np.zeros(shape, np.float32), f"{prefix}/zero")
             zeros.add(copies[node.name])
             continue
-        inputs = [_moved(r, copies) for r in node.inputs]
+        inputs = [_copy_of(r, copies) for r in node.inputs]
         zero = next((i for i in inputs if i in zeros), None)
         if node.op == "Mul" and zero is not None:
             copies[node.name] = zero
@@ -198,10 +198,10 @@ def without_noise(
         made_of = inputs if node.op == "Add" else op_of(node).data_operands(inputs) if traits(node).moves else ()
         if made_of and all(i in zeros or graph.is_full_of(i, 0) for i in made_of):
             zeros.add(name)
-    return editor.graph(), [_moved(r, copies) for r in references]
+    return editor.graph(), [_copy_of(r, copies) for r in references]
 
 
-def _moved(reference: str, copies: Mapping[str, str]) -> str:
+def _copy_of(reference: str, copies: Mapping[str, str]) -> str:
     name, colon, index = reference.rpartition(":")
     if colon and index.isdigit() and name in copies:
         return f"{copies[name]}:{index}"

@@ -40,14 +40,14 @@ def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:
             except MISFIT as error:
                 raise misfit(given, error) from error
         else:
-            _take(editor, _completed(node))
+            _take(editor, _complete_attrs(node))
     for name in keep:
         if (now := editor.resolve(name)) != name:
             editor.append(Node(name, "Identity", (now,), origin=graph[name].origin))
     return editor.graph()
 
 
-def _completed(node: Node) -> Node:
+def _complete_attrs(node: Node) -> Node:
     """Attributes filled with defaults, derived ones dropped, unsupported ones refused."""
     attrs: dict[str, Any] = {}
     known = {a.name: a for a in op_of(node).attrs}

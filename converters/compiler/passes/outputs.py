@@ -98,7 +98,7 @@ def add_companions(
         editor.keep(node)
     if meaning.role is Role.SAMPLED and LOG_PROBS not in fetches:
         parts = [editor.add("LogSoftmax", [b], f"{LOG_PROBS}/branch_{i}") for i, b in enumerate(meaning.branches)]
-        added[LOG_PROBS] = _joined(editor, parts, LOG_PROBS)
+        added[LOG_PROBS] = _concat(editor, parts, LOG_PROBS)
     if name not in fetches:
         if scores:
             added[name] = _argmax(editor, graph, scores, name)
@@ -107,7 +107,7 @@ def add_companions(
     return editor.graph(), added
 
 
-def _joined(editor: Editor, parts: Sequence[str], name: str) -> str:
+def _concat(editor: Editor, parts: Sequence[str], name: str) -> str:
     if len(parts) == 1:
         return parts[0]
     axis = editor.ints(1, f"{name}/axis")
@@ -125,7 +125,7 @@ def _argmax(editor: Editor, graph: Graph, branches: Sequence[str], name: str) ->
         axis = editor.ints(1, f"{prefix}/axis")
         best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
         columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))
-    return _joined(editor, columns, name)
+    return _concat(editor, columns, name)
 
 
 def _as_columns(editor: Editor, graph: Graph, action: str, name: str) -> str:

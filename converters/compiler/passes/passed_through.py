@@ -40,12 +40,12 @@ def drop_passed_through(graph: Graph, options: CompileOptions, facts: SourceFact
     return replace(
         facts,
         outputs={n: role for n, role in facts.outputs.items() if n not in dropped},
-        roles={**facts.roles, **_misnamed(graph, dropped, read)},
+        roles={**facts.roles, **_misnamed_observations(graph, dropped, read)},
         notes=(*facts.notes, *notes),
     )
 
 
-def _misnamed(graph: Graph, dropped: Mapping[str, str], read: set[str]) -> dict[str, Role]:
+def _misnamed_observations(graph: Graph, dropped: Mapping[str, str], read: set[str]) -> dict[str, Role]:
     """Observations that bear the name of the state that was dropped.
 
     With two observations, the two names that godot_rl gives, ``obs`` and ``state_ins``, fall on these.

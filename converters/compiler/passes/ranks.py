@@ -34,7 +34,7 @@ def settle_ranks(graph: Graph) -> Graph:
             made = over_last_axis(b, node.op, node.inputs[0])
         else:
             sides = zip(node.inputs, _SIDES, strict=True)
-            made = matmul(b, *(_turned(b, r) if node.attrs.get(key) else r for r, key in sides))
+            made = matmul(b, *(_transpose(b, r) if node.attrs.get(key) else r for r, key in sides))
         b.rename(made, node.name, node.origin)
         b.prefix = ""
     return b.graph()
@@ -49,6 +49,6 @@ def _is_odd(types: Types, node: Node) -> bool:
     return shapes[0][:-2] != shapes[1][:-2]
 
 
-def _turned(b: Builder, matrix: str) -> str:
+def _transpose(b: Builder, matrix: str) -> str:
     rank = b.rank(matrix)
     return b.transpose(matrix, [*range(rank - 2), rank - 1, rank - 2])

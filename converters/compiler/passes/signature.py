@@ -117,11 +117,11 @@ def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, s
         notes=tuple(dict.fromkeys(notes)),
     )
     if facts.labels:
-        signature = replace(signature, labels=remaining(_renamed(facts.labels, feeds), signature))
+        signature = replace(signature, labels=remaining(_rename_labels(facts.labels, feeds), signature))
     return signature, feeds, named
 
 
-def _renamed(labels: Mapping[str, Any], feeds: Mapping[str, str]) -> dict[str, Any]:
+def _rename_labels(labels: Mapping[str, Any], feeds: Mapping[str, str]) -> dict[str, Any]:
     """Labels whose observations are placeholders, under the names that the inputs have now."""
     named = labels.get("observations", {})
     return {**labels, "observations": {name: named[node] for name, node in feeds.items() if node in named}}

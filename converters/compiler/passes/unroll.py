@@ -63,11 +63,13 @@ def unroll(graph: Graph) -> Graph:
     for node in flow:
         wanted = _INPUTS.get(CONTROL_FLOW[node.op])
         if not node.inputs or (wanted is not None and len(node.inputs) != wanted):
-            raise _broken(node, f"it has {len(node.inputs)} inputs")
+            raise _malformed_loop(node, f"it has {len(node.inputs)} inputs")
     try:
         return _Unroller(graph).run() if flow else graph
     except RecursionError as error:
-        raise _broken(flow[0], "its loop or branch is deeper than any of a policy, or contains itself") from error
+        raise _malformed_loop(
+            flow[0], "its loop or branch is deeper than any of a policy, or contains itself"
+        ) from error
 
 
 class _Unroller:
@@ -89,7 +91,9 @@ class _Unroller:
         for node in self.graph.nodes:
             if node.name in self.frames:  # loop bodies are made on demand, once per turn
                 if node.name not in read:  # an output
-                    raise _broken(node, f"the output {node.origin!r} lies inside it, which no Exit leads out of")
+                    raise _malformed_loop(
+                        node, f"the output {node.origin!r} lies inside it, which no Exit leads out of"
+                    )
                 continue
             try:
                 self.tensor(node.name, None)
@@ -171,7 +175,7 @@ class _Unroller:
             return self.tensor(node.inputs[0], turn)
         predicate = self._number(node, node.inputs[1], turn)
         if predicate is None:
-            raise _undecided(node, "the condition of a branch")
+            raise _undecided_loop(node, "the condition of a branch")
         if bool(predicate) != bool(index):
             raise _DeadError
         return self.tensor(node.inputs[0], turn)
@@ -195,12 +199,12 @@ class _Unroller:
                     self.tensor(variable, turn)
                 predicate = self._number(condition, condition.inputs[0], turn)
                 if predicate is None:
-                    raise _undecided(condition, "a loop's condition")
+                    raise _undecided_loop(condition, "a loop's condition")
                 if not bool(predicate):
                     self.turns[frame] = turn
                     break
             else:
-                raise _undecided(condition, f"more than {MAX_TURNS} turns of a loop, or a number of them")
+                raise _undecided_loop(condition, f"more than {MAX_TURNS} turns of a loop, or a number of them")
         return self.turns[frame]
 
     def _variables(self, frame: str) -> list[str]:
@@ -225,22 +229,22 @@ class _Unroller:
         if value is None:
             return None
         if value.size != 1 or value.dtype.kind not in "biu":
-            raise _broken(node, f"{reference!r} is {value.dtype} {list(value.shape)}, no single whole number")
+            raise _malformed_loop(node, f"{reference!r} is {value.dtype} {list(value.shape)}, no single whole number")
         return int(value.item())
 
     def _indices(self, node: Node, reference: str, turn: int | None) -> list[int]:
         value = self.constant(self.plain(reference, turn))
         if value is None:
-            raise _undecided(node, "the indices of a tensor array")
+            raise _undecided_loop(node, "the indices of a tensor array")
         self._room(value.size)  # each becomes nodes
         if value.ndim > 1 or value.dtype.kind not in "iu":
-            raise _broken(node, f"{reference!r} is {value.dtype} {list(value.shape)}, no row of indices")
+            raise _malformed_loop(node, f"{reference!r} is {value.dtype} {list(value.shape)}, no row of indices")
         return [int(i) for i in np.atleast_1d(value)]
 
     def _index(self, node: Node, turn: int | None) -> int:
         found = self._indices(node, node.inputs[1], turn)
         if len(found) != 1:
-            raise _broken(node, f"its index is {len(found)} numbers")
+            raise _malformed_loop(node, f"its index is {len(found)} numbers")
         return found[0]
 
     def _scatter(self, node: Node, index: int, turn: int | None) -> _Flow:
@@ -274,7 +278,7 @@ class _Unroller:
     def _size(self, node: Node, index: int, turn: int | None) -> str:
         flow = self._flow(node.inputs[1], turn)
         if flow.size is None:
-            raise _undecided(node, "the size of a tensor array")
+            raise _undecided_loop(node, "the size of a tensor array")
         return self._const(np.array(flow.size, INT32), f"{node.name}/size")
 
     def _with(self, flow: _Flow, index: int, value: str) -> _Flow:
@@ -297,7 +301,7 @@ class _Unroller:
                 self.memo[key] = self._element(flow.source, index, f"{node.name}/{index}")
             item = self.memo[key]  # type: ignore[assignment]
         if item is None:
-            raise _broken(node, f"element {index} of its tensor array was never written")
+            raise _malformed_loop(node, f"element {index} of its tensor array was never written")
         return item
 
     # ---- tensor lists, the arrays of TensorFlow 2: values, where a tensor array is a resource with a flow
@@ -323,13 +327,13 @@ class _Unroller:
             return flow.source
         size = len(flow.items) if flow.size is None else flow.size
         if size > MAX_TURNS:
-            raise _undecided(node, f"the number of elements, or one above {MAX_TURNS},")
+            raise _undecided_loop(node, f"the number of elements, or one above {MAX_TURNS},")
         return self._add("Pack", [self._item(node, flow, i) for i in range(size)], f"{node.name}/pack", axis=0)
 
     def _list_length(self, node: Node, index: int, turn: int | None) -> str:
         size = self._flow(node.inputs[0], turn).size
         if size is None:
-            raise _undecided(node, "the length of a tensor list")
+            raise _undecided_loop(node, "the length of a tensor list")
         return self._const(np.array(size, INT32), f"{node.name}/length")
 
     # ---- new nodes
@@ -401,7 +405,7 @@ def _frames(graph: Graph) -> dict[str, str]:
     return frames
 
 
-def _broken(node: Node, why: str) -> GraphError:
+def _malformed_loop(node: Node, why: str) -> GraphError:
     return GraphError(
         f"node {node.name!r} ({node.op}) does not belong to a loop or branch as TensorFlow writes them",
         why=why,
@@ -409,7 +413,7 @@ def _broken(node: Node, why: str) -> GraphError:
     )
 
 
-def _undecided(node: Node, meaning: str) -> UnsupportedOpError:
+def _undecided_loop(node: Node, meaning: str) -> UnsupportedOpError:
     return UnsupportedOpError(
         f"cannot convert {node.op} (node {node.name!r}): {meaning} is not known before the graph runs",
         issues=[(node.name, node.op)],

@@ -61,9 +61,9 @@ class _Turned(Rows):
         dims, axis = self.shape(node.name), self.inputs[node.name]
         self.own.add(node.name)
         if axis is None:
-            self.at[node.name] = self.b.append(_shaped(node, (None, *dims)))
+            self.at[node.name] = self.b.append(_with_shape(node, (None, *dims)))
             return
-        given = self.b.append(_shaped(node, (*dims[:axis], None, *dims[axis + 1 :])))
+        given = self.b.append(_with_shape(node, (*dims[:axis], None, *dims[axis + 1 :])))
         if axis:
             known = tuple(BATCH if i == axis else d for i, d in enumerate(dims))
             self.b.types[given] = TensorType(self.b.dtype(given), known)
@@ -97,5 +97,5 @@ class _Turned(Rows):
         self.at.update((ref(node.name, i), result) for i, result in enumerate(results))
 
 
-def _shaped(node: Node, dims: tuple[int | None, ...]) -> Node:
+def _with_shape(node: Node, dims: tuple[int | None, ...]) -> Node:
     return replace(node, attrs={**node.attrs, "shape": TensorShape(dims)})

@@ -32,7 +32,7 @@ def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
     axes = {name: _free(kind) for name, kind in types.items()}
     feeds = {n.name: _rows(n.attrs["shape"], n.attrs["dtype"]) for n in graph.nodes if n.op == "Placeholder"}
     draws = _Draws()
-    together = _values(graph, feeds, draws.made)
+    together = _values(graph, feeds, draws.draw_node)
     for row in range(ROWS):
         alone = _values(graph, {name: _row(a, row, axes[name]) for name, a in feeds.items()}, partial(draws.of, row))
         for name in outputs:
@@ -84,7 +84,7 @@ class _Draws:
         #: (what a sampler draws, its first operand)
         self._all: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
-    def made(self, node: Node, operands: Sequence[np.ndarray]) -> np.ndarray:
+    def draw_node(self, node: Node, operands: Sequence[np.ndarray]) -> np.ndarray:
         shape, sampler = _drawn_shape(node, operands), op_of(node).sampler
         if sampler == "categorical":
             drawn = self._generator.integers(0, operands[0].shape[1], shape).astype(node.attrs["output_dtype"])

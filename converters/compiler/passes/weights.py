@@ -28,18 +28,18 @@ LEAST = 256
 _STEPS, _STEP_BITS = 127, 16
 
 
-def rounded(graph: Graph, storage: Storage) -> Graph:
+def round_weights(graph: Graph, storage: Storage) -> Graph:
     """The graph with its weights rounded; one that would overflow, or is whole numbers, stays as it is."""
     readers = graph.consumers()
     editor = Editor(graph)
     for node in graph.nodes:
         axis = _channels(node, readers[node.name])
-        found = None if axis is None or node.value is None else _rounded(node.value, storage, axis)
+        found = None if axis is None or node.value is None else _round_array(node.value, storage, axis)
         editor.keep(node if found is None else Node(node.name, node.op, value=found, origin=node.origin))
     return editor.graph()
 
 
-def stored(graph: Graph, storage: Storage) -> Graph:
+def store_compactly(graph: Graph, storage: Storage) -> Graph:
     """The graph with weights that were rounded as constants of fewer bytes, widened under the weights' own names."""
     if storage == "float32":
         return graph
@@ -95,7 +95,7 @@ def _channels(node: Node, readers: Sequence[Node]) -> int | None:
     return None if len(turned) > 1 else value.ndim - 2 if turned.pop() else value.ndim - 1
 
 
-def _rounded(array: np.ndarray, storage: Storage, axis: int) -> np.ndarray | None:
+def _round_array(array: np.ndarray, storage: Storage, axis: int) -> np.ndarray | None:
     if not np.isfinite(array).all() or (array == np.rint(array)).all():
         return None
     if storage == "float16":

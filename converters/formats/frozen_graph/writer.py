@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from converters.compiler.passes.weights import Storage, stored
+from converters.compiler.passes.weights import Storage, store_compactly
 from converters.files import tensorflow_messages as schema
 from converters.files.chunks import Pieces
 from converters.files.external_data import Detached, is_readable
@@ -33,7 +33,7 @@ def frozen(policy: Policy, contract: str = "{}", weights: Storage = "float32") -
     made: dict[Any, Pieces] = policy.graph.made
     key = frozen, contract, weights
     if key not in made:
-        graph = with_contract(stored(policy.graph, weights), contract)
+        graph = with_contract(store_compactly(policy.graph, weights), contract)
         detached = Detached.of(graph.values())
         made[key] = schema.pieces(encode(graph, detached=detached), detached)
     return made[key]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.weights import stored
+from converters.compiler.passes.weights import store_compactly
 from converters.files import tensorflow_messages as schema
 from converters.files.chunks import Pieces
 from converters.files.external_data import Detached, is_readable
@@ -79,7 +79,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     detached = Detached()
     about.MergeFrom(signed)
     about.graph_def.CopyFrom(
-        encode(with_contract(stored(policy.graph, options.weights), options.contract), detached=detached)
+        encode(with_contract(store_compactly(policy.graph, options.weights), options.contract), detached=detached)
     )
     version.meta_graphs.append(about)
     files = files_of(version, detached, sha256_hex(options.contract.encode()))
