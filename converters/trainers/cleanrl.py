@@ -112,7 +112,7 @@ def _to_graph(
 # ------------------------------------------------------------------ layers
 
 
-def _observed(making: _Making, first: str) -> str:
+def _observation_input(making: _Making, first: str) -> str:
     """The input that the layer ``first`` reads: numbers, or an image, whose size the user says; divided by 255."""
     net = making.net
     shape = net.state.shape(f"{first}.weight")
@@ -155,12 +155,12 @@ def _layers(making: _Making, x: str, module: str, *, ends: bool) -> str:
             kernel = state.length(f"{name}.weight", 2)
             place = images.index(index)
             if len(images) != len(_WINDOWS) or kernel != _WINDOWS[place][0]:
-                raise state.unknown(
+                raise state.unsupported_error(
                     name, "its strides are not in the file, and its kernels are not those of CleanRL's scripts"
                 )
             x = net.convolution(x, name, _WINDOWS[place][1])
         elif ranks[index] in (1, 3):
-            x = _normalised(net, x, name)
+            x = _layer_norm(net, x, name)
         else:
             x = net.linear(net.flat(x) if net.rank(x) == 4 else x, name)
         if after is None:
@@ -173,19 +173,21 @@ def _layers(making: _Making, x: str, module: str, *, ends: bool) -> str:
             x = making.activation(net, x)
         elif between != 1:
             what = "nothing stands" if between == 0 else f"{between} modules without weights stand"
-            raise state.unknown(
+            raise state.unsupported_error(
                 module, f"{what} between its layers {index} and {after}, and one activation is expected"
             )
-    raise state.unknown(module, "it has no layers")
+    raise state.unsupported_error(module, "it has no layers")
 
 
-def _normalised(net: Network, x: str, name: str) -> str:
+def _layer_norm(net: Network, x: str, name: str) -> str:
     """``nn.LayerNorm``, of a row or of a whole image [C, H, W]."""
     rank, shape = net.rank(x), net.type_of(x).shape
     assert shape is not None
     sizes = [shape[i] for i in ((3, 1, 2) if rank == 4 else (1,))]
     if len(net.state.shape(f"{name}.weight")) != len(sizes):
-        raise net.state.unknown(name, "it is no LayerNorm: what it takes together (groups, a batch) is not in the file")
+        raise net.state.unsupported_error(
+            name, "it is no LayerNorm: what it takes together (groups, a batch) is not in the file"
+        )
     scale, bias = (net.state.array(f"{name}.{part}", *map(int, sizes)) for part in ("weight", "bias"))
     if rank == 4:
         scale, bias = scale.transpose(1, 2, 0), bias.transpose(1, 2, 0)
@@ -195,14 +197,14 @@ def _normalised(net: Network, x: str, name: str) -> str:
 
 def _trunk(making: _Making) -> str:
     """fc1, fc2 … of SAC, TD3 and DDPG."""
-    net, x, number = making.net, _observed(making, "fc1"), 1
+    net, x, number = making.net, _observation_input(making, "fc1"), 1
     while f"fc{number}.weight" in net.state:
         x = making.activation(net, net.linear(x, f"fc{number}"))
         number += 1
     return x
 
 
-def _scaled(net: Network, value: str) -> str:
+def _squash_to_bounds(net: Network, value: str) -> str:
     """tanh, to the bounds of the action space."""
     net.at("action")
     value = net.add("Tanh", [value])
@@ -219,7 +221,7 @@ def _scaled(net: Network, value: str) -> str:
 
 def _ppo_continuous(making: _Making) -> str:
     net = making.net
-    mean = _layers(making, _observed(making, "actor_mean.0"), "actor_mean", ends=True)
+    mean = _layers(making, _observation_input(making, "actor_mean.0"), "actor_mean", ends=True)
     net.output("action", mean)
     per_action(net, mean, net.state.array("actor_logstd", 1, net.width(mean)).reshape(-1), "action_log_std")
     making.outputs.update(action=Role.ACTION, action_log_std=Role.LOG_STD)
@@ -232,10 +234,10 @@ def _ppo_discrete(making: _Making) -> str:
     shared = bool(net.state.under("network."))
     alone = "actor.weight" in net.state
     if shared:
-        x = _layers(making, _observed(making, "network.0"), "network", ends=False)
+        x = _layers(making, _observation_input(making, "network.0"), "network", ends=False)
     else:
         first = "" if alone else ".0"
-        x = _observed(making, f"actor{first}")
+        x = _observation_input(making, f"actor{first}")
         critic = f"critic{first}.weight"
         if critic in net.state and net.state.length(critic, 1) != net.width(x):
             raise SourceError(
@@ -256,7 +258,7 @@ def _ppo_discrete(making: _Making) -> str:
 def _values(making: _Making) -> str:
     """Values per action, or (C51) probabilities of values per action."""
     net = making.net
-    x = _layers(making, _observed(making, "network.0"), "network", ends=True)
+    x = _layers(making, _observation_input(making, "network.0"), "network", ends=True)
     if "atoms" in net.state:
         atoms = net.state.array("atoms", None)
         actions, rest = divmod(net.width(x), max(len(atoms), 1))
@@ -280,14 +282,14 @@ def _sac(making: _Making) -> str:
     share = net.add("Mul", [net.add("Add", [logarithm, net.floats(1)]), net.floats((_HIGHEST - _LOWEST) / 2)])
     spread = net.add("Exp", [net.add("Add", [share, net.floats(_LOWEST)])])
     noise = net.add("Mul", [net.normals_like(mean, "action"), spread])
-    net.output("action", _scaled(net, net.add("Add", [mean, noise])))
+    net.output("action", _squash_to_bounds(net, net.add("Add", [mean, noise])))
     making.outputs["action"] = Role.ACTION
     return "the action is drawn, squashed by tanh and scaled"
 
 
 def _td3(making: _Making) -> str:
     net = making.net
-    net.output("action", _scaled(net, net.linear(_trunk(making), "fc_mu")))
+    net.output("action", _squash_to_bounds(net, net.linear(_trunk(making), "fc_mu")))
     making.outputs["action"] = Role.ACTION
     return "the action is squashed by tanh and scaled"
 

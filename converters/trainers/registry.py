@@ -38,10 +38,10 @@ def rebuild(saved: Saved) -> Rebuilt:
         found = trainer.recognise(saved)
         if found is not None:
             return trainer.rebuild(saved, found)
-    raise _unknown(saved.value)
+    raise _unknown_error(saved.value)
 
 
-def _unknown(value: Any) -> NotAPolicyError:
+def _unknown_error(value: Any) -> NotAPolicyError:
     if maker := _other_trainer(value):
         return NotAPolicyError(
             f"is a checkpoint of {maker}, whose networks are not rebuilt",
@@ -72,9 +72,9 @@ def _other_trainer(value: Any) -> str:
 def _content(value: Any) -> str:
     if not isinstance(value, dict):
         return f"a {type(value).__name__.lower()}" if not isinstance(value, Tensor) else "one tensor"
-    return _listed(k for k in value if isinstance(k, str)) or "nothing that has a name"
+    return _first_names(k for k in value if isinstance(k, str)) or "nothing that has a name"
 
 
-def _listed(names: Iterable[str]) -> str:
+def _first_names(names: Iterable[str]) -> str:
     found = [n[:60] for n in names]
     return ", ".join(found[:6]) + (f" and {len(found) - 6} more" if len(found) > 6 else "")

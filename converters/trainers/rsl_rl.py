@@ -76,7 +76,7 @@ def _to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tupl
     first = f"{layout.memory}.weight_ih_l0" if recurrent else f"{layout.actor}.0.weight"
     x = net.input("obs", weights.length(first, 1))
     for module in (layout.normaliser, _NORMALISER):
-        x = _normalised(net, x, module)
+        x = _normalise(net, x, module)
     memory: tuple[str, ...] = ()
     if recurrent:
         x, memory = net.remembering(x, layout.memory)
@@ -98,7 +98,7 @@ def _to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tupl
     return net.graph(), facts
 
 
-def _normalised(net: Network, x: str, module: str) -> str:
+def _normalise(net: Network, x: str, module: str) -> str:
     """``EmpiricalNormalization``: (x − mean) / (deviation + 0.01); x where there is none."""
     state = net.state
     if f"{module}._mean" not in state:

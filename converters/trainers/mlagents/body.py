@@ -25,7 +25,7 @@ _LAYER_NORM = 1e-5
 # ------------------------------------------------------------------ attention over entities
 
 
-def attended(net: Network, own: str | None, entities: Sequence[tuple[str, str]], encoder: str) -> str:
+def attend(net: Network, own: str | None, entities: Sequence[tuple[str, str]], encoder: str) -> str:
     """The mean of what the entities are after attention to each other, [B, embedding].
 
     ``own`` is what the agent observes else, ``entities`` are (module, [B, n, size]); rows of zeros are no entities.
@@ -102,7 +102,7 @@ def hidden_layers(net: Network, x: str, goal: str | None, body: str) -> str:
     for index in net.state.indices(f"{body}.{names}."):
         module = f"{body}.{names}.{index}"
         if goal is not None and f"{module}.hypernet.0.weight" in net.state:
-            x = swish(net, _conditioned(net, x, goal, module))
+            x = swish(net, _hyper_layer(net, x, goal, module))
         else:
             x = swish(net, net.linear(x, module))
     return x
@@ -112,7 +112,7 @@ def _layers_of(state: Weights, module: str) -> list[int]:
     return state.indices(f"{module}.hypernet.")
 
 
-def _conditioned(net: Network, x: str, goal: str, module: str) -> str:
+def _hyper_layer(net: Network, x: str, goal: str, module: str) -> str:
     """``HyperNetwork``: x·W(goal) + b; W comes out of layers of its own, normalised before the last."""
     *inner, last = _layers_of(net.state, module)
     for index in inner:

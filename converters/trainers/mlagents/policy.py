@@ -29,7 +29,7 @@ from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
 from converters.policy.rules import Decision
-from converters.trainers.mlagents.body import attended, body_width, goal_width, hidden_layers
+from converters.trainers.mlagents.body import attend, body_width, goal_width, hidden_layers
 from converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
 from converters.trainers.mlagents.state import LET_IT_EXPORT, State
 from converters.trainers.pytorch.activations import LEAKY_SLOPE
@@ -117,7 +117,7 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
     sensors, joined = find_sensors(state, generation.lists, generation.encoder, width, told)
     goals = find_goals(state, sensors, condition, goals, joined=joined)
     net = Network(state)
-    x, goal = _observed(net, generation, sensors, goals)
+    x, goal = _encode_sensors(net, generation, sensors, goals)
     x = hidden_layers(net, x, goal, generation.body)
     memory = None
     if f"{_BODY}.lstm.lstm.weight_hh_l0" in state:
@@ -205,7 +205,7 @@ def _reasons(generation: _Generation, sensors: Sequence[Sensor]) -> dict[str, De
     return {name: Decision(name, _SENSOR_ROLES.get(len(s.shape), Role.VECTOR), s.says) for name, s in pairs}
 
 
-def _observed(
+def _encode_sensors(
     net: Network, generation: _Generation, sensors: Sequence[Sensor], goals: Sequence[int]
 ) -> tuple[str, str | None]:
     """All sensors, encoded and joined: what the first layer reads; and the goals alone, where there are some."""
@@ -233,12 +233,12 @@ def _observed(
         if image and sensor.module is not None:
             x = _image(net, x, sensor.module)
         elif sensor.module is not None:
-            x = net.normalised(x, f"{sensor.module}.normalizer")
+            x = net.normalise(x, f"{sensor.module}.normalizer")
         parts[index] = x
     net.at(_BODY)
     columns = [net.concat(list(parts.values()), 1)] if parts else []
     if entities:
-        columns.append(attended(net, columns[0] if columns else None, entities, generation.encoder))
+        columns.append(attend(net, columns[0] if columns else None, entities, generation.encoder))
     net.at(_BODY)
     return net.concat(columns, 1), net.concat([parts[i] for i in goals], 1) if goals else None
 

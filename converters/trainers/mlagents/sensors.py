@@ -172,7 +172,7 @@ def find_sensors(
             f"its sensors have {width - layout.rest} columns, and its first layer takes {width}",
             "the checkpoint is of a network that ML-Agents did not build, or damaged",
         )
-    return _arranged(state, layout, width)
+    return _arrange(state, layout, width)
 
 
 def _modules(state: Weights, lists: Sequence[str]) -> list[str | None]:
@@ -191,14 +191,14 @@ def _kind(state: Weights, module: str) -> Rule[Module, str]:
     """The rule that says what a module encodes. Raises SourceError."""
     rule = first(_KINDS, Module(state, module))
     if rule is None:
-        raise state.unknown(
+        raise state.unsupported_error(
             f"{module} ({', '.join(state.under(module + '.')[:3])})",
             "it encodes a sensor as no ML-Agents does; a plugin may have made it",
         )
     return rule
 
 
-def _arranged(state: Weights, layout: Layout, width: int) -> tuple[list[Sensor], bool]:
+def _arrange(state: Weights, layout: Layout, width: int) -> tuple[list[Sensor], bool]:
     """The sensors, and whether vectors stand joined. Raises SourceError."""
     rule, rest = first(_LAYOUTS, layout), layout.rest
     if rule is None:

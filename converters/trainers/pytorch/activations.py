@@ -42,14 +42,14 @@ _KNOWN: dict[str, Activation] = {
 }
 
 
-def named(name: str) -> Activation | None:
+def activation_named(name: str) -> Activation | None:
     """The activation of a name, however it is written; None where it is not known."""
     return _KNOWN.get(name.lower().replace("_", "").replace("-", ""))
 
 
-def told(name: str) -> Activation:
+def activation_from_user(name: str) -> Activation:
     """The one that the user names. Raises UsageError."""
-    found = named(name)
+    found = activation_named(name)
     if found is None:
         raise UsageError(
             f"--activation {name}: there is no such activation", fix=f"one of: {', '.join(sorted(_KNOWN))}"
@@ -75,21 +75,21 @@ def activation_of(
     """
     for name in _FILES:
         file = given.path.parent / name
-        found = _said(given, file)
-        known = [named(word) for word in found]
+        found = _activations_in(given, file)
+        known = [activation_named(word) for word in found]
         if len(found) != 1 or known[0] is None:
             continue
         (word,) = found
-        if wanted is not None and told(wanted) is not known[0]:
+        if wanted is not None and activation_from_user(wanted) is not known[0]:
             raise UsageError(
                 f"--activation {wanted} contradicts {name}", why=f"it says {word}", fix="leave --activation out"
             )
         return known[0], (file,), (f"its activation is {word}, as {name} says",)
     if wanted is not None:
-        return told(wanted), (), ()
+        return activation_from_user(wanted), (), ()
     if default is not None:
         name, note = default
-        return told(name), (), (note,)
+        return activation_from_user(name), (), (note,)
     raise SourceError(
         "the checkpoint does not tell what stands between the layers of its network",
         why="a state dictionary has weights, and an activation has none",
@@ -98,7 +98,7 @@ def activation_of(
     )
 
 
-def _said(given: Fetched, file: Path) -> set[str]:
+def _activations_in(given: Fetched, file: Path) -> set[str]:
     """The activations of the policy that a file names."""
     try:
         if not file.is_file() or file.stat().st_size > _LARGEST:

@@ -62,7 +62,7 @@ class Network(Builder):
         product = matmul(self, x, self.const(weight.T, "kernel"))
         return product if bias is None else self.add("BiasAdd", [product, self.const(bias, "bias")])
 
-    def normalised(self, x: str, module: str) -> str:
+    def normalise(self, x: str, module: str) -> str:
         """``Normalizer``: clamp((x − mean) / sqrt(variance / steps), −5, 5)."""
         self.at(module)
         mean, variance = (self.state.array(f"{module}.running_{k}", self.width(x)) for k in ("mean", "variance"))
@@ -75,7 +75,7 @@ class Network(Builder):
         """One step of ``nn.LSTM``. ``memory`` is [B, 1, 2H], h before c. Returns the output [B, H] and the memory."""
         hidden, *kind = rnn_sizes(self.state, module)
         if kind != [4, 1]:
-            raise self.state.unknown(module, "its weights are not those of an LSTM with one layer")
+            raise self.state.unsupported_error(module, "its weights are not those of an LSTM with one layer")
         self.at(module)
         x, after = self.recurrent(x, self.reshape(memory, (-1, 2 * hidden)), module)
         return x, self.reshape(after, (-1, 1, 2 * hidden))
@@ -87,7 +87,7 @@ class Network(Builder):
         """
         found = self.state.indices(f"{module}.")
         if found != list(range(0, 2 * len(found), 2)):
-            raise self.state.unknown(
+            raise self.state.unsupported_error(
                 f"{module} (with weights at {', '.join(map(str, found[:8]))})",
                 "a linear layer and an activation by turns are expected",
             )
@@ -225,8 +225,10 @@ def rnn_sizes(state: Weights, module: str) -> tuple[int, int, int]:
     hidden = state.length(f"{module}.weight_hh_l0", 1)
     gates, rest = divmod(state.length(f"{module}.weight_hh_l0", 0), max(hidden, 1))
     if rest or gates not in (3, 4):
-        raise state.unknown(module, "its weights are no LSTM's and no GRU's")
+        raise state.unsupported_error(module, "its weights are no LSTM's and no GRU's")
     names = state.under(f"{module}.")
     if any(name.endswith("_reverse") for name in names):
-        raise state.unknown(module, "it reads its history backwards, too, and an agent has none of what comes")
+        raise state.unsupported_error(
+            module, "it reads its history backwards, too, and an agent has none of what comes"
+        )
     return hidden, gates, sum(name.startswith("weight_hh_l") for name in names)

@@ -81,13 +81,13 @@ class Weights:
         if self._left:
             names = sorted(self._left)
             shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-            raise self.unknown(shown, f"it is part of no network that {self._maker} builds without plugins")
+            raise self.unsupported_error(shown, f"it is part of no network that {self._maker} builds without plugins")
 
     def damaged(self, what: str, why: str) -> DamagedFileError:
         """The refusal of weights that do not fit together."""
         return DamagedFileError(what, why=why, fix=self._fix)
 
-    def unknown(self, what: str, why: str) -> SourceError:
+    def unsupported_error(self, what: str, why: str) -> SourceError:
         """The refusal of a network that is not built here."""
         return SourceError(f"its network has a part that is not read from a checkpoint: {what}", why=why, fix=self._fix)
 

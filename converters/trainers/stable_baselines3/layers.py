@@ -19,7 +19,7 @@ def renormalised_mlp(net: Network, x: str, module: str, activation: Activation, 
     if not norms:
         return net.mlp(x, module, activation)
     if norms != list(range(0, 3 * len(norms), 3)) or found != sorted([*norms, *(i + 1 for i in norms[:-1])]):
-        raise net.state.unknown(
+        raise net.state.unsupported_error(
             f"{module} (with weights at {', '.join(map(str, found[:8]))})",
             "a batch renormalisation, a linear layer and an activation by turns are expected",
         )

@@ -19,7 +19,7 @@ from converters.graph.nn.activations import Activation, clip
 from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32, INT64
 from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.activations import named, told
+from converters.trainers.pytorch.activations import activation_from_user, activation_named
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights, pytorch_alone
 from converters.trainers.stable_baselines3.layers import renormalised_mlp
@@ -161,9 +161,9 @@ def _activation(kwargs: Mapping[str, Any], family: _Family, wanted: str | None) 
     """The one that the policy was made with; what ``data`` cannot tell (a function of one's own) the user says."""
     text = str(kwargs.get("activation_fn", family.activation))
     match = re.fullmatch(r"(?:<class ')?(?:[\w.]*\.)?(\w+)(?:'>)?", text)
-    said = None if match is None else named(match[1])
+    said = None if match is None else activation_named(match[1])
     if wanted is not None:
-        given = told(wanted)
+        given = activation_from_user(wanted)
         if said is not None and said is not given and match is not None:
             raise UsageError(
                 f"--activation {wanted} contradicts the file", why=f"it says {match[1]}", fix="leave --activation out"
