@@ -10,7 +10,7 @@ import pytest
 
 from converters.compiler.passes.slice_of_concat import parts_for_slices
 from converters.formats.onnx import messages
-from converters.formats.onnx.peephole import pooled_first, shortened
+from converters.formats.onnx.peephole import pooled_first, simplify_nodes
 from converters.graph.nodes import Graph
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import value
@@ -86,7 +86,7 @@ def test_two_nodes_are_one_where_onnx_has_it(
         messages.node(kind, [name for name in (one, other) if name], [made], made, **attributes)
         for (kind, one, other, attributes), made in zip(pair, "my", strict=True)
     ]
-    made = shortened(nodes, values, {"m": 1}, ["y"])
+    made = simplify_nodes(nodes, values, {"m": 1}, ["y"])
     assert [n.op_type for n in made] == expected
     assert list(made[-1].output) == ["y"]
     if expected == ["Clip"]:
@@ -95,9 +95,9 @@ def test_two_nodes_are_one_where_onnx_has_it(
         assert (list(made[0].input), made[0].attribute[0].f) == (["x"], 0.5)
     if expected == ["ArgMax"]:
         assert {a.name: a.i for a in made[0].attribute} == {"axis": 1, "keepdims": 1}
-        assert len(shortened(nodes, values, {"m": 2}, ["y"])) == 2
-    assert len(shortened(nodes, values, {"m": 1}, ["m", "y"])) == 2
-    assert len(shortened([*nodes, messages.node("Neg", ["m"], ["z"])], values, {"m": 1}, ["y", "z"])) == 3
+        assert len(simplify_nodes(nodes, values, {"m": 2}, ["y"])) == 2
+    assert len(simplify_nodes(nodes, values, {"m": 1}, ["m", "y"])) == 2
+    assert len(simplify_nodes([*nodes, messages.node("Neg", ["m"], ["z"])], values, {"m": 1}, ["y", "z"])) == 3
 
 
 def test_an_elu_comes_behind_the_pool_that_alone_reads_it() -> None:

@@ -20,7 +20,7 @@ from converters.files.protobuf_messages import message_classes
 from converters.formats.frozen_graph.tensors import to_array
 from converters.formats.onnx.half_precision import widen
 from converters.formats.onnx.messages import ModelProto
-from converters.formats.onnx.proto import array_of, decoded
+from converters.formats.onnx.proto import array_of, decode_model
 from exporter.export.sources import read_source
 from signatures.bounded import MAX_VALUES, loads
 from signatures.contract import json_of
@@ -164,7 +164,7 @@ def test_weights_of_16_bits_that_are_kept_as_numbers_are_no_parts() -> None:
     numbers = packed(halves.view(np.uint16))
     assert len(numbers) > 8 * MAX_FIELDS
     kind = TensorProto(dims=[halves.size], data_type=TensorProto.FLOAT16).SerializeToString()
-    model = decoded(onnx_policy() + inside(7, inside(5, kind, inside(5, numbers))))
+    model = decode_model(onnx_policy() + inside(7, inside(5, kind, inside(5, numbers))))
     widen(model)
     assert (array_of(model.graph.initializer[-1], None) == halves.astype(np.float32)).all()
     like = schema.TensorProto(dtype=19)

@@ -12,7 +12,7 @@ import pytest
 
 from converters.files.children.memory_limits import Memory
 from converters.formats.keras.model import tensors_in
-from converters.formats.onnx.functions import inlined
+from converters.formats.onnx.functions import inline_functions
 from converters.trainers.stable_baselines3.spaces import space_of
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
@@ -147,9 +147,9 @@ def test_ops_that_onnx_defines_by_others_are_counted_before_they_are_written_out
         graph = helper.make_graph(nodes, "g", ends[:1], ends[1:])
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)])
 
-    assert len(inlined(model(9)).graph.node) > 9
+    assert len(inline_functions(model(9)).graph.node) > 9
     with pytest.raises(UnsupportedOpError, match="600 nodes that ONNX defines by others"):
-        inlined(model(600))
+        inline_functions(model(600))
 
 
 def test_a_child_is_allowed_for_the_models_that_it_has() -> None:

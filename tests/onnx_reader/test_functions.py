@@ -12,7 +12,7 @@ import onnx
 import onnx.parser
 import pytest
 
-from converters.formats.onnx.functions import inlined
+from converters.formats.onnx.functions import inline_functions
 from signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import Bench, floats, helper, imported, model, node, read
 
@@ -162,7 +162,7 @@ def test_functions_are_refused_by_what_they_unfold_to(make: Callable[[], Any], m
     """Before onnx unfolds them; whatever hides their size."""
     monkeypatch.setattr("onnx.inliner.inline_local_functions", None)
     with pytest.raises(UnsupportedOpError, match=r"functions (unfold|call one another)"):
-        inlined(make())
+        inline_functions(make())
 
 
 def test_a_function_is_told_from_another_of_its_name(bench: Bench) -> None:

@@ -14,7 +14,7 @@ import onnx
 import pytest
 from onnx import helper
 
-from converters.formats.onnx.vetted import COMPUTING, contained
+from converters.formats.onnx.vetted import COMPUTING, self_contained_model
 from signatures.errors import UnsupportedOpError
 from tests.onnx_reader.models import floats, model, node
 
@@ -60,14 +60,14 @@ def write(tmp_path: Path, *nodes: Any, domains: dict[str, int] | None = None) ->
 
 def test_an_operator_that_computes_is_handed_over(tmp_path: Path) -> None:
     path = write(tmp_path, node("FusedMatMul", ["obs", "w"], "action", domain="com.microsoft", alpha=2.0))
-    assert [n.op_type for n in contained(path).graph.node] == ["FusedMatMul"]
+    assert [n.op_type for n in self_contained_model(path).graph.node] == ["FusedMatMul"]
 
 
 @pytest.mark.parametrize("kind", [*sorted(LEFT_OUT), "EPContext", "PythonOp", "ExternalOp", "Snpe", "NotYetThere"])
 def test_any_other_is_refused(kind: str, tmp_path: Path) -> None:
     path = write(tmp_path, node(kind, ["obs"], "action", domain="com.microsoft", name="n"))
     with pytest.raises(UnsupportedOpError, match=rf"onnxruntime's operator com\.microsoft::{kind} \(node 'n'\)"):
-        contained(path)
+        self_contained_model(path)
 
 
 def test_a_function_of_the_file_does_not_stand_for_an_operator_of_the_runtime(tmp_path: Path) -> None:
@@ -79,14 +79,14 @@ def test_a_function_of_the_file_does_not_stand_for_an_operator_of_the_runtime(tm
     )
     (tmp_path / "m.onnx").write_bytes(made.SerializeToString())
     with pytest.raises(UnsupportedOpError, match="EPContext"):
-        contained(tmp_path / "m.onnx")
+        self_contained_model(tmp_path / "m.onnx")
 
 
 @pytest.mark.parametrize("domain", ["com.microsoft.nchwc", "com.ms.internal.nhwc"])
 def test_what_was_laid_out_for_a_processor_says_what_to_do(domain: str, tmp_path: Path) -> None:
     path = write(tmp_path, node("Conv", ["obs", "w"], "action", domain=domain), domains={domain: 1})
     with pytest.raises(UnsupportedOpError, match=r"laid out for one kind of processor") as refused:
-        contained(path)
+        self_contained_model(path)
     assert "ORT_ENABLE_EXTENDED" in str(refused.value)
 
 
@@ -117,9 +117,9 @@ def test_what_the_optimiser_saved_is_handed_over_or_said(tmp_path: Path) -> None
     (tmp_path / "m.onnx").write_bytes(made.SerializeToString())
     for level in ("ORT_ENABLE_EXTENDED", "ORT_ENABLE_ALL"):
         asked(OPTIMISE, str(tmp_path / "m.onnx"), str(tmp_path / f"{level}.onnx"), level)
-    saved = contained(tmp_path / "ORT_ENABLE_EXTENDED.onnx")
+    saved = self_contained_model(tmp_path / "ORT_ENABLE_EXTENDED.onnx")
     assert "com.microsoft" in {n.domain for n in saved.graph.node}
     laid_out = {n.domain for n in onnx.load(tmp_path / "ORT_ENABLE_ALL.onnx").graph.node}
     if "com.microsoft.nchwc" in laid_out:  # as on every x86 processor; others have layouts of their own, or none
         with pytest.raises(UnsupportedOpError, match="laid out for one kind of processor"):
-            contained(tmp_path / "ORT_ENABLE_ALL.onnx")
+            self_contained_model(tmp_path / "ORT_ENABLE_ALL.onnx")

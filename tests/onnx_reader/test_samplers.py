@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from converters.formats.onnx import edit
-from converters.formats.onnx.vetted import contained
+from converters.formats.onnx.vetted import self_contained_model
 from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
 from exporter.verify.statistics import fit
@@ -128,7 +128,7 @@ def test_inner_values_are_fetched_and_needless_inputs_are_not_asked_for(fetch: S
 
 
 def test_what_is_cut_keeps_only_what_is_needed(bench: Bench) -> None:
-    part = edit.cut(contained(bench.place(two_outputs())), ["y"])
+    part = edit.cut(self_contained_model(bench.place(two_outputs())), ["y"])
     assert [n.op_type for n in part.graph.node] == ["Constant", "Mul", "Relu"]
     assert [i.name for i in part.graph.input] == ["x"]
 

@@ -13,7 +13,7 @@ from onnx import helper, numpy_helper
 from converters.files.fetch import Fetched
 from converters.formats.onnx import proto
 from converters.formats.onnx.reader import read_onnx
-from converters.formats.onnx.vetted import contained, vetted
+from converters.formats.onnx.vetted import self_contained_model, vetted
 from signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import constant, floats, model, node
 
@@ -99,7 +99,7 @@ def test_functions_that_name_one_file_hold_it_once(tmp_path: Path, monkeypatch: 
         message.functions.append(helper.make_function("own", f"f{number}", [], ["w"], [held], opsets))
     (tmp_path / "m.onnx").write_bytes(message.SerializeToString())
     with pytest.raises(DamagedFileError, match="again and again"):
-        contained(tmp_path / "m.onnx")
+        self_contained_model(tmp_path / "m.onnx")
 
 
 @pytest.mark.parametrize("field", ["t", "tensors", "sparse_tensor"])
@@ -111,7 +111,7 @@ def test_a_default_of_a_functions_attribute_names_no_file_elsewhere(field: str, 
     place.append(held) if field == "tensors" else (place if field == "t" else place.values).CopyFrom(held)
     (tmp_path / "m.onnx").write_bytes(message.SerializeToString())
     with pytest.raises(DamagedFileError, match=r"elsewhere\.bin"):
-        contained(tmp_path / "m.onnx")
+        self_contained_model(tmp_path / "m.onnx")
 
 
 def test_a_default_of_a_functions_attribute_has_no_custom_operator(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_default_of_a_functions_attribute_has_no_custom_operator(tmp_path: Pat
     default.g.node.append(node("Evil", ["obs"], "z", domain="evil.lib"))
     (tmp_path / "m.onnx").write_bytes(message.SerializeToString())
     with pytest.raises(UnsupportedOpError, match="evil"):
-        contained(tmp_path / "m.onnx")
+        self_contained_model(tmp_path / "m.onnx")
 
 
 def with_default(folder: Path) -> tuple[Any, Any]:

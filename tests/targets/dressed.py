@@ -24,7 +24,7 @@ from converters.formats.barracuda.format import NnModel, parse
 from converters.formats.barracuda.vocabulary import LayerType
 from converters.formats.format import WriteOptions
 from converters.formats.onnx import messages
-from converters.formats.onnx.edit import lifted
+from converters.formats.onnx.edit import lift_draws
 from converters.formats.registry import written
 from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
@@ -155,7 +155,7 @@ class Pair:
         fed = len(self._draws) == 1 and len(self.policy.signature.noise) == 1
         model = _copied(self.made)
         if fed:
-            own = lifted(messages.ModelProto.FromString(model.SerializeToString()), self._draws)
+            own = lift_draws(messages.ModelProto.FromString(model.SerializeToString()), self._draws)
             model = onnx.ModelProto.FromString(own.SerializeToString())
         known = {o.name for o in model.graph.output}
         inner = (n for n in dict.fromkeys(self._scores) if n not in known)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from converters.files.fetch import read_bytes
-from converters.formats.onnx.messages import packaged
-from converters.formats.onnx.proto import array_of, decoded, load_external
+from converters.formats.onnx.messages import as_onnx_message
+from converters.formats.onnx.proto import array_of, decode_model, load_external
 from signatures.errors import DamagedFileError, ExportModelError
 from signatures.records import dataclass
 
@@ -150,13 +150,13 @@ class OnnxFile:
 
 def parsed_onnx(data: bytes) -> OnnxFile:
     """The model of an ONNX that we wrote: its weights are where they are, and not looked at."""
-    return OnnxFile(packaged(decoded(data)))
+    return OnnxFile(as_onnx_message(decode_model(data)))
 
 
 def read_onnx_file(path: Path) -> OnnxFile:
     """Read the messages of a model. Raises SourceError, DamagedFileError."""
     try:
-        model = decoded(read_bytes(path))
+        model = decode_model(read_bytes(path))
     except DamagedFileError as error:
         raise error.at(str(path)) from error.__cause__
     beside = next((t.name for t in model.graph.initializer if t.data_location == _EXTERNAL), "")
@@ -169,7 +169,7 @@ def read_onnx_file(path: Path) -> OnnxFile:
                 why="no length is negative",
                 fix="export or download it again",
             )
-    return OnnxFile(packaged(model), beside)
+    return OnnxFile(as_onnx_message(model), beside)
 
 
 def attributes(node: Any) -> Mapping[str, Any]:

@@ -19,14 +19,14 @@ from converters.files.memory_mapped import Mapped
 from converters.formats.format import Port, Ports
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
 from converters.formats.onnx.messages import files_of
-from converters.formats.onnx.proto import array_of, decoded, dtype_name, load_external
+from converters.formats.onnx.proto import array_of, decode_model, dtype_name, load_external
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
 from signatures.contract import EMBEDDED
 
 
 def ports(path: Path) -> Ports:
     """The ports of a file. Raises SourceError, DamagedFileError."""
-    graph = decoded(read_bytes(path), Detached()).graph
+    graph = decode_model(read_bytes(path), Detached()).graph
     stored = {t.name for t in graph.initializer}
     inputs = tuple(_port(v) for v in graph.input if v.name not in stored)
     return Ports(path, inputs, tuple(_port(v) for v in graph.output))
@@ -41,7 +41,7 @@ def _port(value: Any) -> Port:
 
 def held(path: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
-    model = decoded(read_bytes(path), Detached())
+    model = decode_model(read_bytes(path), Detached())
     return next((str(p.value) for p in model.metadata_props if p.key == EMBEDDED), None)
 
 
@@ -49,7 +49,7 @@ def held(path: Path) -> str | None:
 def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     """Those of a model, in the same runtime; its values are found by the map that the writer left in it."""
     detached, files = Detached(), Mapped()
-    model = decoded(files.read(loaded.path), detached)
+    model = decode_model(files.read(loaded.path), detached)
     load_external([model.graph], loaded.path.parent, detached, files.read)
     graph = model.graph
     names = loads({p.key: p.value for p in model.metadata_props}.get(TENSORS_KEY, ""))
@@ -86,5 +86,5 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
 
 def origins(path: Path) -> Mapping[str, str]:
     """Tensor of the graph → tensor of the source, where they are called differently, as our .onnx notes it."""
-    model = decoded(read_bytes(path), Detached())
+    model = decode_model(read_bytes(path), Detached())
     return loads(next((p.value for p in model.metadata_props if p.key == TENSORS_KEY), "")).sources

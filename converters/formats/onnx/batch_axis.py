@@ -59,11 +59,11 @@ def read_rows(
     ``state_ins`` alone to one number. Raises what ``imported`` raises, SignatureError where the model gives one row
     only and no reading gives more.
     """
-    asked, judged = _computed(declared, outputs, nodes)
+    asked, judged = _without_echoes(declared, outputs, nodes)
     batch = _fixed_batch(asked, axes)
     importer = imported(batch, False)
     if batch is None and not _static(asked):
-        if not _baked(importer, judged):
+        if not _has_baked_batch(importer, judged):
             return Reading(importer, importer.graph(), importer.types)
         importer, batch = imported(1, False), 1
         fault = _fault(importer, judged)
@@ -76,21 +76,21 @@ def read_rows(
     has_rows = batch is not None and _has_rows(importer, judged)
     fault = _fault(importer, judged, said=True) if has_rows else None
     plain = Reading(importer, importer.graph(), importer.types, batch)
-    if has_rows and fault is None and not _broken(importer, outputs):
+    if has_rows and fault is None and not _broken_count(importer, outputs):
         return plain
     try:
         alone = _alone(imported, declared, outputs, axes, ends, leading=batch == 1)
     except ExportModelError:
         if fault is not None:
             raise fault from None
-        if has_rows or _broken(importer, outputs):
+        if has_rows or _broken_count(importer, outputs):
             return plain
         raise
-    same = has_rows and fault is None and _broken(alone.importer, outputs) == _broken(importer, outputs)
+    same = has_rows and fault is None and _broken_count(alone.importer, outputs) == _broken_count(importer, outputs)
     return plain if same else alone
 
 
-def _computed(
+def _without_echoes(
     declared: Sequence[Any], outputs: Sequence[Any], nodes: Sequence[Any]
 ) -> tuple[Sequence[Any], Sequence[Any]]:
     """Return the inputs and outputs but for those that Identities alone connect, where any others are there."""
@@ -121,7 +121,7 @@ def _alone(
     UnsupportedOpError where it cannot be.
     """
     importer = imported(None, True)
-    made = _made(importer, outputs)
+    made = _imported_outputs(importer, outputs)
     inputs: dict[str, int | None] = {}
     for value in declared:
         node, axis = importer.values[value.name], axes.get(value.name, 0 if leading else None)
@@ -135,17 +135,17 @@ def _alone(
     return Reading(importer, graph, infer_types(graph), 1, alone=True)
 
 
-def _made(importer: Importer, outputs: Sequence[Any]) -> list[str]:
+def _imported_outputs(importer: Importer, outputs: Sequence[Any]) -> list[str]:
     return [v.name for v in outputs if v.name in importer.values]
 
 
-def _broken(importer: Importer, outputs: Sequence[Any]) -> int:
+def _broken_count(importer: Importer, outputs: Sequence[Any]) -> int:
     return sum(v.name in importer.broken for v in outputs)
 
 
 def _has_rows(importer: Importer, outputs: Sequence[Any]) -> bool:
     """Whether any output has the free axis in front."""
-    shapes = [importer.type_of(importer.values[name]).shape for name in _made(importer, outputs)]
+    shapes = [importer.type_of(importer.values[name]).shape for name in _imported_outputs(importer, outputs)]
     return any(shape and isinstance(shape[0], str) for shape in shapes)
 
 
@@ -190,7 +190,7 @@ def _bearable(batch: int, shapes: Sequence[Dims]) -> int:
     return batch
 
 
-def _baked(importer: Importer, outputs: Sequence[Any]) -> bool:
+def _has_baked_batch(importer: Importer, outputs: Sequence[Any]) -> bool:
     """Whether a model that says it takes any number of rows takes one: a Reshape inside kept the 1 of its export."""
     made = {v.name: importer.type_of(importer.values[v.name]).shape for v in outputs if v.name in importer.values}
     free = [v.name for v in outputs if (dims_of(v) or (0,))[0] is None]
@@ -222,7 +222,7 @@ def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) ->
             fix="export it again with the batch left free everywhere",
         )
     try:
-        check_rows(importer.graph(), [importer.values[name] for name in _made(importer, outputs)])
+        check_rows(importer.graph(), [importer.values[name] for name in _imported_outputs(importer, outputs)])
     except SignatureError as error:
         return error
     return None

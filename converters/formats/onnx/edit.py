@@ -19,7 +19,7 @@ _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.D
 _NORMAL = ("RandomNormal", "RandomNormalLike")
 
 
-def lifted(model: Any, draws: Collection[str]) -> Any:
+def lift_draws(model: Any, draws: Collection[str]) -> Any:
     """The model with N(0, 1) draws as inputs, and integer seeds (tf2onnx 1.5.5) as the floats that ONNX asks for.
 
     A sampler of N(mean, scale²) becomes the input times ``scale`` plus ``mean``.

@@ -10,7 +10,7 @@ from typing import Any
 
 from converters.formats.onnx.importer.node import STANDARD
 from converters.formats.onnx.importer.table import TABLE
-from converters.formats.onnx.messages import packaged
+from converters.formats.onnx.messages import as_onnx_message
 from converters.formats.onnx.proto import bodies
 from converters.graph.builder import MAX_NODES
 from signatures.errors import DamagedFileError, UnsupportedOpError
@@ -29,12 +29,12 @@ _MAX_LOOKED_AT = 1 << 18
 _ATTRIBUTE = 64
 
 
-def inlined(model: Any) -> Any:
+def inline_functions(model: Any) -> Any:
     """The model without functions: its own, and those of ONNX's ops that are defined by others and not in the table."""
     if model.functions:
         import onnx.inliner
 
-        model = packaged(model)
+        model = as_onnx_message(model)
         functions = {_identity(f, f.name): f for f in model.functions}
         called = _Unfolding(functions, int(model.ByteSize())).check(model.graph)
         bodies = (model.graph, *(functions[name] for name in called))
@@ -48,12 +48,12 @@ def inlined(model: Any) -> Any:
                 why=str(error).strip().splitlines()[0],
                 fix="export it with functions inlined (onnx.inliner.inline_local_functions)",
             ) from error
-    defined = _defined(model)
+    defined = _schemas_of_unknown(model)
     if not defined:
         return model
     import onnx.inliner
 
-    model = packaged(model)
+    model = as_onnx_message(model)
     everything = all_nodes(model.graph)
     nodes = [n for n in everything if n.domain in STANDARD and n.op_type in defined]
     typed = [n for n in nodes if defined[n.op_type].has_context_dependent_function]
@@ -72,7 +72,7 @@ def inlined(model: Any) -> Any:
         return model  # an op whose definition needs more than is known stays, and is refused by its name
 
 
-def _defined(model: Any) -> dict[str, Any]:
+def _schemas_of_unknown(model: Any) -> dict[str, Any]:
     """Op → schema, of the model's ops that are in no table here and that ONNX defines by others."""
     known, version = {kind for domain, kind in TABLE if not domain}, opsets_of(model)[""]
     unknown = {n.op_type for n in all_nodes(model.graph) if n.domain in STANDARD} - known

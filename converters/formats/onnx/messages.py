@@ -170,7 +170,7 @@ def model(
     return made
 
 
-def packaged(model: Any) -> Any:
+def as_onnx_message(model: Any) -> Any:
     """A ModelProto as the message of the package ``onnx``, for what that package is asked."""
     import onnx
 

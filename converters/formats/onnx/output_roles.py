@@ -41,31 +41,31 @@ class Output:
         return len(self.shape) in (1, 2) and self.shape[1:] in ((), (1,)) and self.shape != (1,)
 
 
-def _called(pattern: re.Pattern[str]) -> Callable[[Output], bool]:
+def _name_matches(pattern: re.Pattern[str]) -> Callable[[Output], bool]:
     return lambda o: pattern.fullmatch(o.base) is not None
 
 
-def _named(name: str, role: Role) -> Rule[Output, Role | None]:
+def _rule_for_name(name: str, role: Role) -> Rule[Output, Role | None]:
     return Rule(role, lambda o: o.base == name, f"its name is that of {role} in ML-Agents' files and this tool's")
 
 
 _Rules = tuple[Rule[Output, Role | None], ...]
 #: By the name alone.
 _BY_NAME: _Rules = (
-    *(_named(name, role) for name, role in OUTPUT_NAMES.items() if role is not Role.Q_VALUES),
+    *(_rule_for_name(name, role) for name, role in OUTPUT_NAMES.items() if role is not Role.Q_VALUES),
     Rule(
         Role.VALUE,
         lambda o: STATE_VALUE_NAMES.fullmatch(o.base) is not None and o.shape[-1:] == (1,),
         "its name is that of a state's value, and it is one number a row",
     ),
-    Rule(Role.ACTION, _called(_ACTION), "its name is that of an action, or of the mean or the scores of one"),
+    Rule(Role.ACTION, _name_matches(_ACTION), "its name is that of an action, or of the mean or the scores of one"),
     Rule(
         Role.Q_VALUES,
         lambda o: is_q_name(o.node) and len(o.shape) == 2 and o.shape[1] != 1,
         "its name is that of values of actions, and it has several a row",
     ),
     Rule(None, lambda o: is_q_name(o.node), "its name is that of values of actions, and its shape is not"),
-    *(_named(name, role) for name, role in OUTPUT_NAMES.items() if role is Role.Q_VALUES),
+    *(_rule_for_name(name, role) for name, role in OUTPUT_NAMES.items() if role is Role.Q_VALUES),
 )
 #: Which of several that are called as actions is the action: the only one that the first of these holds for.
 _PLAINEST: _Rules = (

@@ -15,7 +15,7 @@ import numpy as np
 from converters.formats.onnx import messages
 
 
-def shortened(
+def simplify_nodes(
     nodes: Sequence[Any], constants: Mapping[str, np.ndarray], ranks: Mapping[str, int], outputs: Collection[str]
 ) -> list[Any]:
     """The nodes with Clip for a Max of a Min, LeakyRelu for the larger of a tensor and a part of it, and ArgMax as a
@@ -59,7 +59,7 @@ def pooled_first(nodes: Sequence[Any], outputs: Collection[str], fresh: Callable
     return made
 
 
-def _bounded(node: Any, kind: str, constants: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
+def _scalar_operand(node: Any, kind: str, constants: Mapping[str, np.ndarray]) -> tuple[str, str] | None:
     """(value, number) of a Min, Max or Mul with a scalar."""
     if node is None or node.op_type != kind or len(node.input) != 2:
         return None
@@ -70,8 +70,8 @@ def _bounded(node: Any, kind: str, constants: Mapping[str, np.ndarray]) -> tuple
 
 
 def _clip(node: Any, makers: Mapping[str, Any], constants: Mapping[str, np.ndarray]) -> tuple[Any, str] | None:
-    above = _bounded(node, "Max", constants)
-    below = None if above is None else _bounded(makers.get(above[0]), "Min", constants)
+    above = _scalar_operand(node, "Max", constants)
+    below = None if above is None else _scalar_operand(makers.get(above[0]), "Min", constants)
     if above is None or below is None or not constants[above[1]] <= constants[below[1]]:
         return None
     clip = messages.node("Clip", [below[0], above[1], below[1]], node.output, node.name)
@@ -82,7 +82,7 @@ def _leaky(node: Any, makers: Mapping[str, Any], constants: Mapping[str, np.ndar
     if node.op_type != "Max" or len(node.input) != 2:
         return None
     for value, part in (node.input, node.input[::-1]):
-        slope = _bounded(makers.get(part), "Mul", constants)
+        slope = _scalar_operand(makers.get(part), "Mul", constants)
         if slope is not None and slope[0] == value and 0 < constants[slope[1]] < 1:
             alpha = float(constants[slope[1]])
             return messages.node("LeakyRelu", [value], node.output, node.name, alpha=alpha), part

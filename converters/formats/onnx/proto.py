@@ -41,7 +41,7 @@ _STORED = {t.onnx: (t.dtype, _FIELD.get(t.onnx, "int32_data")) for t in DATA_TYP
 _FIELDS = {1: "f", 2: "i", 3: "s", 4: "t", 5: "g", 6: "floats", 7: "ints", 8: "strings"}
 
 
-def decoded(data: bytes | memoryview, detached: Detached | None = None) -> Any:
+def decode_model(data: bytes | memoryview, detached: Detached | None = None) -> Any:
     """The ModelProto in ``data``, all of whose names are text. Of a large one ``detached`` is given the weights' bytes.
 
     Raises DamagedFileError, NotAPolicyError where it has too many parts.

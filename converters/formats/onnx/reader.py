@@ -13,13 +13,13 @@ import numpy as np
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched
 from converters.formats.onnx.batch_axis import Reading, dims_of, read_rows
-from converters.formats.onnx.functions import all_nodes, inlined, opsets_of
+from converters.formats.onnx.functions import all_nodes, inline_functions, opsets_of
 from converters.formats.onnx.half_precision import widen
 from converters.formats.onnx.importer.importer import Importer, joined_errors
 from converters.formats.onnx.importer.node import DTYPES
 from converters.formats.onnx.importer.table import TABLE
 from converters.formats.onnx.memories import FoundMemories, OnnxMemory, separate_memories
-from converters.formats.onnx.proto import array_of, decoded, load_external, tensors
+from converters.formats.onnx.proto import array_of, decode_model, load_external, tensors
 from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import BATCH, Dim, TensorType
 from converters.policy.memories import looks_like_state
@@ -88,7 +88,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
     memories, axes = found.memories, found.axes
     _check_names([*(v.name for v in declared), *(t.name for t in graph.initializer)])
     ends = {m.output: m.axis for m in memories}
-    imported = partial(_imported, graph, detached, opsets, declared, axes)
+    imported = partial(_import_nodes, graph, detached, opsets, declared, axes)
     reading = read_rows(imported, declared, graph.output, axes, ends, graph.node)
     importer, types = reading.importer, reading.types
     outputs, left_out = _outputs(importer, [v.name for v in graph.output])
@@ -121,7 +121,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
     )
 
 
-def _imported(
+def _import_nodes(
     graph: Any,
     detached: Detached,
     opsets: Mapping[str, int],
@@ -144,14 +144,14 @@ def _imported(
 
 def parse(given: Fetched, detached: Detached | None = None) -> tuple[Any, list[Path]]:
     """(ModelProto without functions and with all its data, the files of that data). Raises DamagedFileError."""
-    model = decoded(given.data, detached)
+    model = decode_model(given.data, detached)
     if not model.graph.node and not model.graph.output:
         raise NotAPolicyError("the model has no nodes", fix="give the model that training exported")
     if model.graph.sparse_initializer:
         raise UnsupportedOpError(
             "the model has sparse weights", issues=[(model.graph.sparse_initializer[0].values.name, "Constant")]
         )
-    model = inlined(model)
+    model = inline_functions(model)
     return model, load_external([model.graph], given.path.parent, detached)
 
 
@@ -226,11 +226,11 @@ def _outputs(importer: Importer, names: Sequence[str]) -> tuple[dict[str, str], 
                 f"nothing makes the output {name!r}", why="the model was cut or edited", fix="export the model again"
             )
     needed = [n for n in broken if n.split(":")[0] in ACTION_NAMES]
-    if broken and (needed or all(map(looks_like_state, _computed(outputs, importer)))):
+    if broken and (needed or all(map(looks_like_state, _computed_outputs(outputs, importer)))):
         raise joined_errors([broken[n] for n in needed or broken])
     return outputs, {**missing, **{name: error.what for name, error in broken.items()}}
 
 
-def _computed(outputs: Mapping[str, str], importer: Importer) -> Collection[str]:
+def _computed_outputs(outputs: Mapping[str, str], importer: Importer) -> Collection[str]:
     """The outputs that are no constants of the model."""
     return [name for name, node in outputs.items() if importer.constant(node) is None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from converters.files.fetch import Fetched
 from converters.formats.onnx.reader import read_onnx
-from converters.formats.onnx.trainers import understood
+from converters.formats.onnx.trainers import understand
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 
 
@@ -14,7 +14,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     The model itself is run by onnxruntime, the draws of its samplers fed from outside (``lift``).
     """
     model = read_onnx(given)
-    graph, facts = understood(model)
+    graph, facts = understand(model)
     original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)})
     producer = f"{model.producer}, opset {model.opset}" if model.producer else f"opset {model.opset}"
     return [SourceModel(graph, model.files, facts, original=original, producer=producer)]

@@ -32,7 +32,7 @@ _COLOURS = (1, 3, 4)
 _IMAGE = 4
 
 
-def understood(model: OnnxModel) -> tuple[Graph, SourceFacts]:
+def understand(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     """The graph, faults of old exporters repaired where the repair is the same at batch 1, and the facts."""
     text = model.metadata.get(EMBEDDED)
     if text is not None:
@@ -105,7 +105,7 @@ def _of_torch(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts
     if "action" in outputs and "discrete_actions" in outputs:
         notes.append("discrete_actions stands for the same as action; it is exported once")
     raw = outputs.get("deterministic_continuous_actions")
-    if raw is not None and "continuous_actions" in outputs and _squashed(model.graph, outputs["continuous_actions"]):
+    if raw is not None and "continuous_actions" in outputs and _is_squashed(model.graph, outputs["continuous_actions"]):
         notes.append(SAC_MEAN)
     return replace(
         facts,
@@ -115,7 +115,7 @@ def _of_torch(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts
     )
 
 
-def _squashed(graph: Graph, name: str) -> bool:
+def _is_squashed(graph: Graph, name: str) -> bool:
     """Whether an action is a tanh (SAC)."""
     node = graph[name]
     while passes_on(node) or traits(node).moves == "join":

@@ -15,7 +15,7 @@ from typing import Any
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched, read_bytes
 from converters.formats.onnx.messages import files_of
-from converters.formats.onnx.proto import decoded, inside, load_external
+from converters.formats.onnx.proto import decode_model, inside, load_external
 from signatures.errors import UnsupportedOpError
 
 #: Domains of ONNX, all of whose operators compute.
@@ -51,21 +51,21 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     """
     copy = folder / path.name
     detached = Detached()
-    for name, data in files_of(contained(path, detached), detached, path.name).items():
+    for name, data in files_of(self_contained_model(path, detached), detached, path.name).items():
         data.write(folder / name)
     return copy
 
 
-def contained(path: Path, detached: Detached | None = None) -> Any:
+def self_contained_model(path: Path, detached: Detached | None = None) -> Any:
     """The ModelProto with the data of all its files, or ``detached`` with it. Raises what ``vetted`` raises."""
-    model = decoded(read_bytes(path), detached)
+    model = decode_model(read_bytes(path), detached)
     own = {(f.domain, f.name) for f in model.functions}
     parts = (model.graph, *model.functions)
     load_external(parts, path.parent, detached)
     for part in parts:
         for node in inside(part, "NodeProto"):
             if not _computes(node.domain, node.op_type, own):
-                raise _refused(node)
+                raise _op_error(node)
     for value in (*model.graph.input, *model.graph.output):
         for length in value.type.tensor_type.shape.dim:
             if length.HasField("dim_value") and length.dim_value <= 0:  # free, as the importer has it
@@ -83,7 +83,7 @@ def flat(path: Path, wanted: Sequence[str]) -> bytes:
     from converters.formats.onnx.reader import read_onnx
 
     read_onnx(Fetched(path))
-    model = contained(path)
+    model = self_contained_model(path)
     if model.functions or any(a.HasField("g") or a.graphs for n in model.graph.node for a in n.attribute):
         raise UnsupportedOpError(
             "the model has functions, or graphs inside its operators",
@@ -114,7 +114,7 @@ def _computes(domain: str, kind: str, own: Set[tuple[str, str]]) -> bool:
     return domain in _ONNX or (domain not in _LAYOUTS and (domain, kind) in own)
 
 
-def _refused(node: Any) -> UnsupportedOpError:
+def _op_error(node: Any) -> UnsupportedOpError:
     issues = [(node.name, node.op_type)]
     if node.domain in _LAYOUTS:
         return UnsupportedOpError(

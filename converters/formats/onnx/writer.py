@@ -21,7 +21,7 @@ from converters.formats.format import WriteOptions
 from converters.formats.intermediate_tensors import View
 from converters.formats.onnx import messages
 from converters.formats.onnx.messages import files_of
-from converters.formats.onnx.peephole import pooled_first, shortened
+from converters.formats.onnx.peephole import pooled_first, simplify_nodes
 from converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
 from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.table import op_of, unsupported_error
@@ -150,7 +150,7 @@ class _Builder:
         """One node for two, where ONNX has one."""
         constants = {name: array for alike in self._constants.values() for array, name in alike}
         ranks = {self._values.get(r, r): len(t.shape) for r, t in self.types.items() if t.shape is not None}
-        self.nodes = pooled_first(shortened(self.nodes, constants, ranks, wanted), wanted, self.fresh)
+        self.nodes = pooled_first(simplify_nodes(self.nodes, constants, ranks, wanted), wanted, self.fresh)
 
     def store(self, storage: Storage) -> None:
         """Keep initializers in fewer bytes where each of their numbers comes back as it was."""

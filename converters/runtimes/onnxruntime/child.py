@@ -63,13 +63,13 @@ def main() -> None:
         def __init__(self, path: str, draws: Sequence[str]) -> None:
             from converters.formats.onnx import edit
             from converters.formats.onnx.half_precision import widen
-            from converters.formats.onnx.vetted import contained
+            from converters.formats.onnx.vetted import self_contained_model
 
             self.cut = edit.cut
             self.detached = Detached()
-            model = contained(Path(path), self.detached)
+            model = self_contained_model(Path(path), self.detached)
             widen(model, self.detached)
-            self.model = edit.lifted(model, draws)
+            self.model = edit.lift_draws(model, draws)
             self.sessions: dict[tuple[str, ...], Any] = {}
 
         def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:

@@ -32,7 +32,7 @@ def _constant(op: Op, net: Importer) -> str:
             if value.dtype.kind not in "biuf":  # an attribute that says to be a graph, or a text
                 break
             return net.const(value, "value")
-    raise op.refused("it holds no numbers", "strings and sparse tensors are no part of a policy")
+    raise op.op_error("it holds no numbers", "strings and sparse tensors are no part of a policy")
 
 
 def _constant_of_shape(op: Op, net: Importer) -> str:
@@ -53,7 +53,7 @@ def _range(op: Op, net: Importer) -> str:
     if all(v is not None and v.size == 1 for v in values):
         start, limit, delta = (float(v.reshape(())) for v in values if v is not None)
         if delta == 0 or (limit - start) / delta > MAX_ELEMENTS:
-            raise op.refused(f"it counts from {start:g} to {limit:g} by {delta:g}", "the model is damaged")
+            raise op.op_error(f"it counts from {start:g} to {limit:g} by {delta:g}", "the model is damaged")
     return net.add("Range", operands)
 
 
@@ -79,9 +79,9 @@ def _reshape(op: Op, net: Importer) -> str:
         return net.add("Reshape", [x, net.shape_operand(operand)])
     wanted: list[Dim] = [d if isinstance(d, str) else int(d) for d in target.reshape(-1).tolist()]
     if op.integer("allowzero", 0) and 0 in wanted:
-        raise op.refused("it makes a tensor without elements")
+        raise op.op_error("it makes a tensor without elements")
     if any(d == 0 and i >= len(shape) for i, d in enumerate(wanted)):
-        raise op.refused(f"the target {wanted} copies the length of an axis that is not there", "the model is damaged")
+        raise op.op_error(f"the target {wanted} copies the length of an axis that is not there", "the model is damaged")
     dims = [shape[i] if d == 0 else d for i, d in enumerate(wanted)]
     numbers = [d for d in dims if isinstance(d, int)]
     if net.fixed is not None and len(numbers) == len(dims):
@@ -90,10 +90,10 @@ def _reshape(op: Op, net: Importer) -> str:
             return net.reshape(x, freed)
     if net.constant(operand) is None and dims == wanted:
         return net.add("Reshape", [x, net.shape_operand(operand)])
-    return net.reshape(x, _closed(dims, shape))
+    return net.reshape(x, _resolve_open_dim(dims, shape))
 
 
-def _closed(dims: Sequence[Dim], shape: Sequence[Dim]) -> list[Dim]:
+def _resolve_open_dim(dims: Sequence[Dim], shape: Sequence[Dim]) -> list[Dim]:
     """-1 as a number where the other lengths tell it, so that the batch may be the open axis."""
     closed = list(dims)
     names = sorted(d for d in shape if isinstance(d, str))
@@ -116,7 +116,7 @@ def _flatten(op: Op, net: Importer) -> str:
         return net.reshape(x, (sizes[0] if axis == 1 else -1, sizes[1]))
     if isinstance(sizes[0], int):
         return net.reshape(x, (sizes[0], -1))
-    raise op.refused("neither its rows nor its columns have a known number")
+    raise op.op_error("neither its rows nor its columns have a known number")
 
 
 def _given_axes(op: Op, net: Importer) -> tuple[int, ...] | None:
@@ -138,11 +138,11 @@ def _unsqueeze(op: Op, net: Importer) -> str:
     """Axes count in the result."""
     x, axes = op.need(0), _given_axes(op, net)
     if axes is None:
-        raise op.refused("it has no axes", "the model is damaged")
+        raise op.op_error("it has no axes", "the model is damaged")
     rank = net.rank(x) + len(axes)
     places = {net.axis_of(a, rank) for a in axes}
     if len(places) < len(axes):
-        raise op.refused(f"its axes are {list(axes)}", "each must be another one")
+        raise op.op_error(f"its axes are {list(axes)}", "each must be another one")
     for axis in sorted(places):
         x = net.expand_dims(x, axis)
     return x
@@ -161,7 +161,7 @@ def _expand(op: Op, net: Importer) -> str:
     x, operand = op.need(0), op.need(1)
     value = net.type_of(operand).value
     if value is None or net.type_of(x).shape is None:
-        raise op.refused("its shape is computed from the values of an input", "it must follow from shapes alone")
+        raise op.op_error("its shape is computed from the values of an input", "it must follow from shapes alone")
     dims = [d if isinstance(d, str) else int(d) for d in value.reshape(-1).tolist()]
     return net.broadcast(x, net.common_shape([net.shape(x), tuple(dims)]))
 

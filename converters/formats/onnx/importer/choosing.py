@@ -25,7 +25,7 @@ def _top_k(op: Op, net: Importer) -> list[str | None]:
     return [nn.moved_back(net, best, axis), nn.moved_back(net, place, axis)]
 
 
-def _cumulated(op: Op, net: Importer) -> str:
+def _cumulate(op: Op, net: Importer) -> str:
     x = op.need(0)
     axis = net.axis(x, int(net.needed_constant(op.need(1), "the axis").reshape(-1)[0]))
     exclusive, reverse = bool(op.integer("exclusive", 0)), bool(op.integer("reverse", 0))
@@ -42,12 +42,12 @@ def _gather_elements(op: Op, net: Importer) -> str:
     x, indices = op.need(0), op.need(1)
     axis = net.axis(x, op.integer("axis", 0))
     if net.dtype(x) == BOOL:
-        raise op.refused("it gathers booleans")
+        raise op.op_error("it gathers booleans")
     dims, wanted = net.shape(x), net.shape(indices)
     for i, (have, want) in enumerate(zip(dims, wanted, strict=True)):
         if i != axis and have != want:
             if not isinstance(want, int) or (isinstance(have, int) and want > have):
-                raise op.refused("its indices leave out rows")
+                raise op.op_error("its indices leave out rows")
             x = net.slice(x, i, None, want)
     value = nn.gather_elements(net, nn.last(net, x, axis), nn.last(net, indices, axis))
     return nn.moved_back(net, value, axis)
@@ -59,16 +59,16 @@ def _scatter_elements(op: Op, net: Importer) -> str:
     axis = net.axis(x, op.integer("axis", 0))
     lengths = zip(net.shape(x), net.shape(indices), strict=True)
     if any(a != b for i, (a, b) in enumerate(lengths) if i != axis):
-        raise op.refused("its indices leave out rows")
+        raise op.op_error("its indices leave out rows")
     table, places, given = (nn.last(net, r, axis) for r in (x, indices, updates))
     _check_apart(op, net, places)
-    return nn.moved_back(net, nn.scatter_elements(net, table, places, given, _combined(op)), axis)
+    return nn.moved_back(net, nn.scatter_elements(net, table, places, given, _reduction_of(op)), axis)
 
 
-def _combined(op: Op) -> nn.Combined:
+def _reduction_of(op: Op) -> nn.Combined:
     found = op.text("reduction", "none")
     if found not in _COMBINED:
-        raise op.refused(f"its reduction is {found!r}", "the model is damaged")
+        raise op.op_error(f"its reduction is {found!r}", "the model is damaged")
     return cast(nn.Combined, found)
 
 
@@ -79,7 +79,7 @@ def _check_apart(op: Op, net: Importer, indices: str) -> None:
         return
     rows = value.reshape(-1, value.shape[-1])
     if any(len(set(row.tolist())) != len(row) for row in rows):
-        raise op.refused("it writes twice to one place", "which of both values stays is not defined")
+        raise op.op_error("it writes twice to one place", "which of both values stays is not defined")
 
 
 # ------------------------------------------------------------------ elements by all their indices
@@ -96,7 +96,7 @@ def _gather_nd(op: Op, net: Importer) -> str:
         lengths = [net.length(x, batch + i) for i in range(count)]
         flat = _flat(net, indices, lengths)
         if net.dtype(x) == BOOL or rest:
-            raise op.refused("it gathers parts of each row by indices of its own")
+            raise op.op_error("it gathers parts of each row by indices of its own")
         table = net.reshape(x, (*dims[:batch], int(np.prod(lengths))))
         chosen = net.reshape(flat, (*places[:batch], int(np.prod([_number(op, d) for d in places[batch:-1]] or [1]))))
         return net.reshape(nn.gather_elements(net, table, chosen), (*places[:-1],))
@@ -107,7 +107,7 @@ def _gather_nd(op: Op, net: Importer) -> str:
 
 def _number(op: Op, dim: Dim) -> int:
     if not isinstance(dim, int):
-        raise op.refused("a length of its indices is not known")
+        raise op.op_error("a length of its indices is not known")
     return dim
 
 
@@ -147,7 +147,7 @@ def _scatter_nd(op: Op, net: Importer) -> str:
     columns = int(np.prod(rest or [1]))
     table = net.transpose(net.reshape(x, (int(np.prod(lengths)), columns)), (1, 0))
     given = net.transpose(net.reshape(updates, (places, columns)), (1, 0))
-    value = nn.scatter_elements(net, table, flat, given, _combined(op))
+    value = nn.scatter_elements(net, table, flat, given, _reduction_of(op))
     return net.reshape(net.transpose(value, (1, 0)), dims)
 
 
@@ -163,8 +163,8 @@ def _compress(op: Op, net: Importer) -> str:
 
 OPS: Mapping[str, Translate] = {
     "TopK": _top_k,
-    "CumSum": _cumulated,
-    "CumProd": _cumulated,
+    "CumSum": _cumulate,
+    "CumProd": _cumulate,
     "GatherElements": _gather_elements,
     "GatherND": _gather_nd,
     "Scatter": _scatter_elements,

@@ -11,7 +11,7 @@ from converters.formats.onnx.importer.node import Op, Translate
 def _if(op: Op, net: Importer) -> list[str | None]:
     condition = net.constant_of(op.need(0))
     if condition is None:
-        raise op.refused(
+        raise op.op_error(
             "its condition is not known before the graph runs",
             "which branch is taken would differ from run to run",
             "if an input decides it, give it a value: --set NAME=VALUE; else export the model with fixed shapes",
@@ -29,7 +29,7 @@ def _scan(op: Op, net: Importer) -> list[str | None]:
     walked = op.integer("num_scan_inputs", 0)
     states = len(op.inputs) - walked
     if op.opset < 9 or walked < 1 or states < 0 or len(body.input) != len(op.inputs):
-        raise op.refused("its inputs do not fit its body", "opset 9 and later are read")
+        raise op.op_error("its inputs do not fit its body", "opset 9 and later are read")
     given = op.integers("scan_input_axes", (0,) * walked) or ()
     made = len(body.output) - states
     stacked = op.integers("scan_output_axes", (0,) * made) or (0,) * made
@@ -39,7 +39,7 @@ def _scan(op: Op, net: Importer) -> list[str | None]:
         if position >= states:
             axis = net.axis(tensor, given[position - states])
             if net.shape(tensor)[axis] != 1:
-                raise op.refused(
+                raise op.op_error(
                     f"it runs over {net.shape(tensor)[axis]} steps",
                     "a policy is run for one step, its memory fed back by the caller",
                     "if an input gives the number of steps, fix it: --set NAME=1",
@@ -55,7 +55,7 @@ def _scan(op: Op, net: Importer) -> list[str | None]:
 
 def _loop(op: Op, net: Importer) -> list[str | None]:
     """Refused: no exporter of policies writes one (tf2onnx writes Scan, PyTorch LSTM)."""
-    raise op.refused(
+    raise op.op_error(
         "it is a loop",
         "how often it runs is decided while the graph runs",
         "export the model with sequences of length 1, without a loop over time",

@@ -34,15 +34,15 @@ def _window(op: Op, net: Importer, size: Sequence[int]) -> Window:
     """The window over the first input; what auto_pad and ceil_mode ask for stands in ``_resolved``."""
     spatial = net.rank(op.need(0)) - 2
     if spatial not in (1, 2):
-        raise op.refused(f"it works on {spatial} spatial axes", "policies see images and rows of pixels")
+        raise op.op_error(f"it works on {spatial} spatial axes", "policies see images and rows of pixels")
     if len(size) != spatial:
-        raise op.refused(f"its window {list(size)} does not fit {spatial} spatial axes", "the model is damaged")
+        raise op.op_error(f"its window {list(size)} does not fit {spatial} spatial axes", "the model is damaged")
     ones = (1,) * spatial
     strides, dilations = op.integers("strides", ones) or ones, op.integers("dilations", ones) or ones
     pads = op.integers("pads", (0,) * (2 * spatial)) or (0,) * (2 * spatial)
     fitting = len(strides) == len(dilations) == spatial and len(pads) == 2 * spatial
     if not fitting or min(*size, *strides, *dilations) < 1:
-        raise op.refused("its window, strides, dilations and pads do not fit together", "the model is damaged")
+        raise op.op_error("its window, strides, dilations and pads do not fit together", "the model is damaged")
     pairs = tuple(zip(pads[:spatial], pads[spatial:], strict=True))
     if op.text("auto_pad", "NOTSET") != "NOTSET":
         pairs = ((0, 0),) * spatial
@@ -51,7 +51,7 @@ def _window(op: Op, net: Importer, size: Sequence[int]) -> Window:
     return Window((size[0], size[1]), (strides[0], strides[1]), (dilations[0], dilations[1]), (pairs[0], pairs[1]))
 
 
-def _resolved(op: Op, net: Importer, image: str, window: Window, *, plainly: bool = False) -> Window:
+def _resolve_padding(op: Op, net: Importer, image: str, window: Window, *, plainly: bool = False) -> Window:
     """With the paddings that auto_pad and ceil_mode name, for an NHWC image; ``plainly``: SAME as numbers, too."""
     padding = op.text("auto_pad", "NOTSET")
     if padding == "SAME_UPPER" and not plainly:
@@ -59,10 +59,10 @@ def _resolved(op: Op, net: Importer, image: str, window: Window, *, plainly: boo
     if padding in ("SAME_UPPER", "SAME_LOWER"):
         top, left = window.same_pads([net.length(image, axis) for axis in (1, 2)])
         return replace(window, pads=(top, left) if padding == "SAME_UPPER" else (top[::-1], left[::-1]))
-    return _ceiled(net, image, window) if op.integer("ceil_mode", 0) else window
+    return _pad_for_ceil(net, image, window) if op.integer("ceil_mode", 0) else window
 
 
-def _ceiled(net: Importer, image: str, window: Window) -> Window:
+def _pad_for_ceil(net: Importer, image: str, window: Window) -> Window:
     """``ceil_mode`` as more padding at the end; a window that would begin in it is left out (opset 19)."""
     pairs: list[Pair] = []
     for axis, ((before, after), span, stride) in enumerate(zip(window.pads, window.span, window.strides, strict=True)):
@@ -82,7 +82,7 @@ def _kernel(op: Op, net: Importer) -> np.ndarray:
     return kernel[:, :, None, :] if kernel.ndim == _IMAGE - 1 else kernel
 
 
-def _biased(op: Op, net: Importer, value: str) -> str:
+def _add_bias(op: Op, net: Importer, value: str) -> str:
     bias = op.get(2)
     return value if bias is None else net.add("BiasAdd", [value, bias])
 
@@ -92,8 +92,8 @@ def _conv(op: Op, net: Importer) -> str:
     kernel = _kernel(op, net).transpose(2, 3, 1, 0)
     window = _window(op, net, [int(k) for k in net.shape(op.need(1))[2:]])
     image = _image(net, op.need(0))
-    window = _resolved(op, net, image, window)
-    return _back(op, net, _biased(op, net, nn.conv2d(net, image, kernel, window, op.integer("group", 1))))
+    window = _resolve_padding(op, net, image, window)
+    return _back(op, net, _add_bias(op, net, nn.conv2d(net, image, kernel, window, op.integer("group", 1))))
 
 
 def _conv_transpose(op: Op, net: Importer) -> str:
@@ -101,12 +101,12 @@ def _conv_transpose(op: Op, net: Importer) -> str:
     kernel = _kernel(op, net).transpose(2, 3, 0, 1)
     window = _window(op, net, [int(k) for k in net.shape(op.need(1))[2:]])
     if op.text("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or "output_shape" in op.attrs:
-        raise op.refused("its padding follows from the size of its result", "give pads and output_padding instead")
+        raise op.op_error("its padding follows from the size of its result", "give pads and output_padding instead")
     image = _image(net, op.need(0))
     given = op.integers("output_padding") or ()
     extra = (*(0,) * (2 - len(given)), *given)
     value = nn.conv2d_transposed(net, image, kernel, window, (extra[0], extra[1]), op.integer("group", 1))
-    return _back(op, net, _biased(op, net, value))
+    return _back(op, net, _add_bias(op, net, value))
 
 
 # ------------------------------------------------------------------ pools
@@ -116,7 +116,7 @@ def _max_pool(op: Op, net: Importer) -> list[str | None]:
     """The indices of the largest elements (the second output) are not made."""
     window = _window(op, net, op.integers("kernel_shape") or ())
     image = _image(net, op.need(0))
-    window = _resolved(op, net, image, window)
+    window = _resolve_padding(op, net, image, window)
     return [_back(op, net, pooling.max_pool(net, image, window)), None]
 
 
@@ -125,7 +125,7 @@ def _average_pool(op: Op, net: Importer) -> str:
     window = _window(op, net, op.integers("kernel_shape") or ())
     image = _image(net, op.need(0))
     counted = bool(op.integer("count_include_pad", 0))
-    padded = _resolved(op, net, image, window, plainly=counted)
+    padded = _resolve_padding(op, net, image, window, plainly=counted)
     counts = window.pads if op.text("auto_pad", "NOTSET") == "NOTSET" else padded.pads
     return _back(op, net, pooling.average_pool(net, image, padded, counts if counted else None))
 
@@ -136,7 +136,7 @@ def _lp_pool(op: Op, net: Importer) -> str:
     window = _window(op, net, op.integers("kernel_shape") or ())
     image = _image(net, net.add("Abs", [op.need(0)]))
     raised = net.add("Pow", [image, net.number(image, power)])
-    padded = _resolved(op, net, raised, window, plainly=True)
+    padded = _resolve_padding(op, net, raised, window, plainly=True)
     mean = pooling.average_pool(net, raised, padded, padded.pads)
     total = net.add("Mul", [mean, net.number(mean, window.size[0] * window.size[1])])
     return _back(op, net, net.add("Pow", [total, net.number(total, 1 / power)]))

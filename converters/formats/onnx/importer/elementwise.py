@@ -39,7 +39,7 @@ def _same(kind: str) -> Translate:
     return function
 
 
-def _folded(op: Op, net: Importer) -> str:
+def _fold_operands(op: Op, net: Importer) -> str:
     value = op.need(0)
     for position in range(1, len(op.inputs)):
         value = net.add(_FOLDED[op.kind], [value, op.need(position)])
@@ -157,7 +157,7 @@ def _dropout(op: Op, net: Importer) -> list[str | None]:
     if mode is not None:
         value = net.constant_of(mode)
         if value is None or bool(value.reshape(-1)[0]):
-            raise op.refused(
+            raise op.op_error(
                 "it is in training mode", "its output would be random", "call model.eval() before the export"
             )
     return [op.need(0), None]
@@ -165,7 +165,7 @@ def _dropout(op: Op, net: Importer) -> list[str | None]:
 
 OPS: Mapping[str, Translate] = {
     **{kind: _same(name) for kind, name in _SAME.items()},
-    **dict.fromkeys(_FOLDED, _folded),
+    **dict.fromkeys(_FOLDED, _fold_operands),
     "Identity": _identity,
     "Dropout": _dropout,
     "Add": _add,

@@ -35,11 +35,11 @@ class FixedBatch:
             return None
         place, inner = shape.index(names[0]), self.axes[names[0]]
         lengths = [inner.length if isinstance(d, str) else d for d in shape]
-        dims = _closed(target, math.prod(lengths))
+        dims = _resolve_open_dim(target, math.prod(lengths))
         if dims is None:
             return None
         before = math.prod(lengths[:place]) * inner.before
-        axis = _chosen(dims, before, lengths, place)
+        axis = _batch_place(dims, before, lengths, place)
         begin = math.prod(dims[:axis])
         if before % begin:
             return None
@@ -53,14 +53,14 @@ class FixedBatch:
         return known
 
 
-def _closed(target: Sequence[int], total: int) -> list[int] | None:
+def _resolve_open_dim(target: Sequence[int], total: int) -> list[int] | None:
     """The target with -1 as a number; None where it does not fit."""
     known = math.prod(d for d in target if d != -1)
     dims = [total // known if d == -1 and known else d for d in target]
     return dims if dims and math.prod(dims) == total else None
 
 
-def _chosen(dims: Sequence[int], before: int, lengths: Sequence[int], place: int) -> int:
+def _batch_place(dims: Sequence[int], before: int, lengths: Sequence[int], place: int) -> int:
     """The axis that has the batch: one that begins after ``before`` elements, else the one that they end in.
 
     Axes of length 1 leave a choice: the same axes in front, the same axes behind, or the first. The last axis holds

@@ -96,7 +96,7 @@ class Importer(Builder):
         when the outputs are known.
         """
         function = self.table.get((op.domain.removeprefix("ai.onnx"), op.kind))
-        errors = [op.refused(*_unknown(op))] if function is None else []
+        errors = [op.op_error(*_unknown_op_reason(op))] if function is None else []
         missing = [n for n in names if n and n not in self.values]
         if function is None or missing:
             self._break(op, joined_errors([*self._causes(op, missing), *errors]))
@@ -106,18 +106,18 @@ class Importer(Builder):
         try:
             results = function(op, self)
         except UnsupportedOpError as error:
-            self._break(op, error if error.issues else op.refused(error.what, error.why, error.fix))
+            self._break(op, error if error.issues else op.op_error(error.what, error.why, error.fix))
             return
         except MISFIT as error:
             why = f"{type(error).__name__}: {error}"
-            self._break(op, op.refused("it has inputs or attributes that its operator does not allow", why))
+            self._break(op, op.op_error("it has inputs or attributes that its operator does not allow", why))
             return
         made = [results] if isinstance(results, str) else list(results)
         bound = [(v, m) for v, m in zip(op.outputs, made, strict=False) if v and m is not None]
         for value, result in bound:
             self.bind(value, result, rename=len(bound) == 1)
         for value in (v for v in op.outputs if v and v not in self.values):
-            self.broken[value] = op.refused(f"its output {value!r} is not made", "no policy reads it")
+            self.broken[value] = op.op_error(f"its output {value!r} is not made", "no policy reads it")
 
     def bind(self, value: str, reference: str, *, rename: bool = False) -> None:
         """Let a node that is called after ``value`` (and carries its name as origin) stand for it.
@@ -222,7 +222,7 @@ _QUANTISED = frozenset(
 )
 
 
-def _unknown(op: Op) -> tuple[str, str, str]:
+def _unknown_op_reason(op: Op) -> tuple[str, str, str]:
     if op.domain not in STANDARD:
         return (
             "its domain is not ONNX's own",

@@ -54,7 +54,7 @@ def _einsum(op: Op, net: Importer) -> str:
         for label, dim in labels_of(term, net.shape(tensor)):
             lengths.setdefault(label, set()).add(dim)
     if repeated := [label for label, dims in lengths.items() if 1 in dims and len(dims) > 1]:
-        raise op.refused(f"{repeated[0]!r} has length 1 in one operand, and is repeated", "no policy needs that")
+        raise op.op_error(f"{repeated[0]!r} has length 1 in one operand, and is repeated", "no policy needs that")
     return einsum(net, equation, tensors, shape_of=net.shape)
 
 
@@ -109,7 +109,7 @@ def _softmax(op: Op, net: Importer) -> str:
     if whole and axis < len(dims) - 1:
         size = product(dims[axis:], net.symbols)
         if not isinstance(size, int):
-            raise op.refused("it is taken over axes whose lengths are not known")
+            raise op.op_error("it is taken over axes whose lengths are not known")
         return net.reshape(net.add(op.kind, [net.reshape(x, (-1, size))]), dims)
     return moved_back(net, reduction.over_last_axis(net, op.kind, last(net, x, axis)), axis)
 
@@ -119,7 +119,7 @@ def _hardmax(op: Op, net: Importer) -> str:
     x = op.need(0)
     axis = net.axis(x, op.integer("axis", 1 if op.opset < 13 else -1))
     if op.opset < 13 and axis != net.rank(x) - 1:
-        raise op.refused("it is taken over several axes")
+        raise op.op_error("it is taken over several axes")
     return moved_back(net, reduction.hardmax(net, last(net, x, axis)), axis)
 
 

@@ -52,12 +52,12 @@ class Op:
         """A required input; raises UnsupportedOpError."""
         found = self.get(position)
         if found is None:
-            raise self.refused(f"input {position} is missing", "the op cannot be computed without it")
+            raise self.op_error(f"input {position} is missing", "the op cannot be computed without it")
         return found
 
     def integer(self, name: str, default: int) -> int:
         """An integer attribute."""
-        return int(self._given(name, default, int))
+        return int(self._attribute(name, default, int))
 
     def integer_or_none(self, name: str) -> int | None:
         """An integer attribute that may be left out."""
@@ -65,24 +65,24 @@ class Op:
 
     def number(self, name: str, default: float) -> float:
         """A float attribute."""
-        return float(self._given(name, default, (int, float)))
+        return float(self._attribute(name, default, (int, float)))
 
     def text(self, name: str, default: str) -> str:
         """A string attribute."""
-        return str(self._given(name, default, str))
+        return str(self._attribute(name, default, str))
 
     def body(self, name: str) -> Any:
         """A subgraph."""
         found = self.attrs.get(name)
         if not hasattr(found, "initializer"):
-            raise self.refused(f"its attribute {name} is no graph", "the op cannot be computed without it")
+            raise self.op_error(f"its attribute {name} is no graph", "the op cannot be computed without it")
         return found
 
-    def _given(self, name: str, default: Any, kind: type | tuple[type, ...]) -> Any:
+    def _attribute(self, name: str, default: Any, kind: type | tuple[type, ...]) -> Any:
         """An attribute as the file has it; raises UnsupportedOpError where it is of another kind than ``kind``."""
         value = self.attrs.get(name, default)
         if not isinstance(value, kind):
-            raise self.refused(f"its attribute {name} is {str(value)[:80]!r}", "the operator has it of another kind")
+            raise self.op_error(f"its attribute {name} is {str(value)[:80]!r}", "the operator has it of another kind")
         return value
 
     def integers(self, name: str, default: Sequence[int] | None = None) -> tuple[int, ...] | None:
@@ -91,7 +91,7 @@ class Op:
         if value is None:
             return None
         if not isinstance(value, Sequence) or not all(isinstance(v, int) for v in value):
-            raise self.refused(f"its attribute {name} is {str(value)[:80]!r}", "the operator has it of another kind")
+            raise self.op_error(f"its attribute {name} is {str(value)[:80]!r}", "the operator has it of another kind")
         return tuple(value)
 
     def dtype(self, name: str, default: int) -> np.dtype:
@@ -99,10 +99,10 @@ class Op:
         number = self.integer(name, default)
         if number not in DTYPES:
             kind = _UNREAD.get(number, number)
-            raise self.refused(f"{name} {kind} is a data type that is not converted", "policies compute in float32")
+            raise self.op_error(f"{name} {kind} is a data type that is not converted", "policies compute in float32")
         return DTYPES[number]
 
-    def refused(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:
+    def op_error(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:
         """The error that this node cannot be converted."""
         domain = f" of {self.domain}" if self.domain not in STANDARD else ""
         return UnsupportedOpError(

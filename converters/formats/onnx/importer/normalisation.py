@@ -16,7 +16,7 @@ def _epsilon(op: Op) -> float:
 def _batch(op: Op, net: Importer) -> list[str | None]:
     """Statistics of a batch are no policy's business."""
     if op.integer("training_mode", 0):
-        raise op.refused(
+        raise op.op_error(
             "it is in training mode",
             "its statistics would come from the batch, so an agent's action would depend on the other agents",
             "call model.eval() before the export",
@@ -51,7 +51,7 @@ def _length(op: Op, net: Importer) -> str:
 def _local(op: Op, net: Importer) -> str:
     size = op.integer("size", 1)
     if size < 1 or size % 2 == 0:
-        raise op.refused(f"it sums over {size} channels", "onnxruntime takes odd numbers alone")
+        raise op.op_error(f"it sums over {size} channels", "onnxruntime takes odd numbers alone")
     return nn.local(net, op.need(0), size, op.number("alpha", 1e-4), op.number("beta", 0.75), op.number("bias", 1.0))
 
 

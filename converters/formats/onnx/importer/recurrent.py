@@ -56,27 +56,27 @@ def _steps(op: Op, net: Importer) -> _Steps:
     shape = net.shape(x)
     batch_first = bool(op.integer("layout", 0))
     if len(shape) != 3:
-        raise op.refused(f"its input has {len(shape)} axes instead of three", "the model is damaged")
+        raise op.op_error(f"its input has {len(shape)} axes instead of three", "the model is damaged")
     time, rows = (shape[1], shape[0]) if batch_first else (shape[0], shape[1])
     if not isinstance(time, int):
-        raise op.refused(
+        raise op.op_error(
             "it runs over any number of steps",
             "a policy is exported for one step, its memory fed back by the caller, or for a history of a fixed length",
             "export it with sequences of length 1 and the memory as input and output",
         )
     lengths = op.get(4)
     if time > 1 and lengths is not None and (net.needed_constant(lengths, "the length of each row") != time).any():
-        raise op.refused("its rows are of other lengths than its input")
+        raise op.op_error("its rows are of other lengths than its input")
     direction = op.text("direction", "forward")
     if direction not in ("forward", "reverse") or net.shape(op.need(1))[0] != 1:
-        raise op.refused(
+        raise op.op_error(
             f"its direction is {direction!r}", "layers that run one way are read: forward, or reverse over a history"
         )
     given = tuple(a.lower() for a in op.attrs.get("activations", _DEFAULTS[op.kind]))
     if given != _DEFAULTS[op.kind] or op.attrs.get("activation_alpha") or op.attrs.get("activation_beta"):
-        raise op.refused(f"its activations are {', '.join(given)}", f"only {', '.join(_DEFAULTS[op.kind])} occur")
+        raise op.op_error(f"its activations are {', '.join(given)}", f"only {', '.join(_DEFAULTS[op.kind])} occur")
     if op.number("clip", 0.0) or op.integer("input_forget", 0):
-        raise op.refused("it clips its gates or couples them", "no trainer writes such a layer")
+        raise op.op_error("it clips its gates or couples them", "no trainer writes such a layer")
     hidden, axis = net.length(op.need(2), -1), 1 if batch_first else 0
     turns = [x] if time == 1 else [net.slice(x, axis, i, i + 1) for i in range(time)]
     inputs = [net.reshape(turn, (-1, net.length(x, -1))) for turn in turns]
@@ -106,7 +106,7 @@ def _weights(op: Op, net: Importer, gates: int, hidden: int) -> tuple[np.ndarray
     if {kernel.shape[1], inner.shape[1]} != {gates * hidden} or (
         biases is not None and len(biases) != 2 * gates * hidden
     ):
-        raise op.refused("its kernels and biases do not fit together", "the model is damaged")
+        raise op.op_error("its kernels and biases do not fit together", "the model is damaged")
     return kernel, inner, biases
 
 
@@ -138,7 +138,7 @@ def _lstm(op: Op, net: Importer) -> list[str | None]:
     steps = _steps(op, net)
     peepholes = op.get(7)
     if peepholes is not None and net.needed_constant(peepholes, "what its gates see of the cell").any():
-        raise op.refused("it has peepholes", "no trainer writes such a layer")
+        raise op.op_error("it has peepholes", "no trainer writes such a layer")
     kernel, inner, bias = _kernels(op, net, 4, steps)
     products = [net.add("MatMul", [x, kernel]) for x in steps.inputs]
 

@@ -14,7 +14,7 @@ from converters.graph.types import Dim
 _IMAGE = 4
 
 
-def _known(op: Op, net: Importer, position: int, meaning: str) -> np.ndarray | None:
+def _constant_operand(op: Op, net: Importer, position: int, meaning: str) -> np.ndarray | None:
     operand = op.get(position)
     if operand is None or 0 in net.shape(operand):
         return None
@@ -25,15 +25,15 @@ def _resize(op: Op, net: Importer) -> str:
     """Scales are an input in opset 10, beside a region and sizes from 11 on; ``axes`` from 18 on."""
     x = op.need(0)
     old = op.opset < 11
-    scales = _known(op, net, 1 if old else 2, "how much larger it gets")
-    sizes = None if old else _known(op, net, 3, "how large it gets")
+    scales = _constant_operand(op, net, 1 if old else 2, "how much larger it gets")
+    sizes = None if old else _constant_operand(op, net, 3, "how large it gets")
     given = op.integers("axes")
     axes = list(range(net.rank(x))) if given is None else [net.axis(x, a) for a in given]
     numbers = sizes if sizes is not None else scales
     if numbers is None or len(numbers) != len(axes):
-        raise op.refused("neither its scales nor its sizes fit its axes", "the model is damaged")
+        raise op.op_error("neither its scales nor its sizes fit its axes", "the model is damaged")
     coordinates = op.text("coordinate_transformation_mode", "asymmetric" if old else "half_pixel")
-    region = _known(op, net, 1, "the region") if coordinates == "tf_crop_and_resize" else None
+    region = _constant_operand(op, net, 1, "the region") if coordinates == "tf_crop_and_resize" else None
     dims = net.shape(x)
     policy = op.text("keep_aspect_ratio_policy", "stretch")
     if sizes is not None and policy != "stretch":
@@ -42,7 +42,7 @@ def _resize(op: Op, net: Importer) -> str:
         scales, sizes = np.full(len(axes), ratio), None
         numbers = np.array([np.floor(ratio * net.length(x, a) + 0.5) for a in axes])
     elif sizes is None:
-        numbers = np.array([_scaled(dims[a], s) for a, s in zip(axes, numbers, strict=True)])
+        numbers = np.array([_scaled_length(dims[a], s) for a, s in zip(axes, numbers, strict=True)])
     for i, axis in enumerate(axes):
         if (
             _stays(dims[axis], numbers[i], None if sizes is not None or scales is None else scales[i])
@@ -65,7 +65,7 @@ def _resize(op: Op, net: Importer) -> str:
     return x
 
 
-def _scaled(dim: Dim, scale: float) -> float:
+def _scaled_length(dim: Dim, scale: float) -> float:
     """The length that comes out, in float32 as onnxruntime: 5 times 1.4 is 7 there, 6.999… in float64."""
     return float(np.floor(np.float32(dim) * np.float32(scale))) if isinstance(dim, int) else scale
 
@@ -78,13 +78,13 @@ def _stays(dim: Dim, number: float, scale: float | None) -> bool:
 def _upsample(op: Op, net: Importer) -> str:
     """The deprecated Resize of opsets 7 and 9, whose scales were an attribute before."""
     x = op.need(0)
-    scales = op.attrs.get("scales") if op.opset < 9 else _known(op, net, 1, "how much larger it gets")
+    scales = op.attrs.get("scales") if op.opset < 9 else _constant_operand(op, net, 1, "how much larger it gets")
     if scales is None or len(scales) != net.rank(x):
-        raise op.refused("its scales do not fit its axes", "the model is damaged")
+        raise op.op_error("its scales do not fit its axes", "the model is damaged")
     how = Resampling(op.text("mode", "nearest"), "asymmetric", "floor")
     for axis, scale in enumerate(scales):
         if scale != 1:
-            x = resample(net, x, axis, int(_scaled(net.length(x, axis), scale)), float(scale), how)
+            x = resample(net, x, axis, int(_scaled_length(net.length(x, axis), scale)), float(scale), how)
     return x
 
 
@@ -96,7 +96,7 @@ def _depth_to_space(op: Op, net: Importer) -> str:
     x, size = op.need(0), op.integer("blocksize", 0)
     n, channels, height, width = _blocks(op, net, x, size)
     if channels % (size * size):
-        raise op.refused(f"it parts {channels} channels into blocks of {size}×{size}", "the model is damaged")
+        raise op.op_error(f"it parts {channels} channels into blocks of {size}×{size}", "the model is damaged")
     deep = channels // (size * size)
     if op.text("mode", "DCR") == "DCR":
         parted, order = net.reshape(x, (n, size, size, deep, height, width)), (0, 3, 4, 1, 5, 2)
@@ -110,7 +110,7 @@ def _space_to_depth(op: Op, net: Importer) -> str:
     x, size = op.need(0), op.integer("blocksize", 0)
     n, channels, height, width = _blocks(op, net, x, size)
     if height % size or width % size:
-        raise op.refused(f"{height}×{width} pixels do not part into blocks of {size}", "the model is damaged")
+        raise op.op_error(f"{height}×{width} pixels do not part into blocks of {size}", "the model is damaged")
     parted = net.reshape(x, (n, channels, height // size, size, width // size, size))
     order = (0, 3, 5, 1, 2, 4) if op.text("mode", "DCR") == "DCR" else (0, 1, 3, 5, 2, 4)
     return net.reshape(net.transpose(parted, order), (n, channels * size * size, height // size, width // size))
@@ -118,7 +118,7 @@ def _space_to_depth(op: Op, net: Importer) -> str:
 
 def _blocks(op: Op, net: Importer, x: str, size: int) -> tuple[Dim, int, int, int]:
     if net.rank(x) != _IMAGE or size < 1:
-        raise op.refused(f"it makes blocks of {size} in {net.rank(x)} axes", "the model is damaged")
+        raise op.op_error(f"it makes blocks of {size} in {net.rank(x)} axes", "the model is damaged")
     return net.shape(x)[0], net.length(x, 1), net.length(x, 2), net.length(x, 3)
 
 

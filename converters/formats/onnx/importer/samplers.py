@@ -15,7 +15,7 @@ def _shape(op: Op, net: Importer) -> str:
     dims = op.integers("shape")
     if not op.kind.endswith("Like"):
         if dims is None:
-            raise op.refused("it has no shape", "the model is damaged")
+            raise op.op_error("it has no shape", "the model is damaged")
     else:
         known = net.type_of(op.need(0)).shape
         if known is None or any(isinstance(d, str) for d in known):
@@ -28,7 +28,7 @@ def _shape(op: Op, net: Importer) -> str:
 def _float(op: Op) -> None:
     """Draws are float32 in every target; ``dtype`` is the input's where it is left out."""
     if op.integer("dtype", 1) not in (1, 11):
-        raise op.refused("it draws numbers that are no float32")
+        raise op.op_error("it draws numbers that are no float32")
 
 
 def _normal(op: Op, net: Importer) -> str:

@@ -36,12 +36,12 @@ def _split(op: Op, net: Importer) -> list[str | None]:
     if sizes is None:
         count = op.integer("num_outputs", len(op.outputs))
         if not 1 <= count <= len(op.outputs):
-            raise op.refused(f"it cuts into {count} parts for {len(op.outputs)} outputs", "the model is damaged")
+            raise op.op_error(f"it cuts into {count} parts for {len(op.outputs)} outputs", "the model is damaged")
         length = net.length(x, axis)
         each = -(-length // count)
         sizes = tuple(min(each, length - i * each) for i in range(count))
     if min(sizes) < 0:
-        raise op.refused(f"it cuts into lengths {list(sizes)}", "the model is damaged")
+        raise op.op_error(f"it cuts into lengths {list(sizes)}", "the model is damaged")
     if len(sizes) == 1:
         return [x]
     split = net.add("SplitV", [x, net.ints(sizes, "sizes"), net.ints(axis, "axis")], num_split=len(sizes))
@@ -65,11 +65,11 @@ def _slice(op: Op, net: Importer) -> str:
         given, steps = numbers[2], numbers[3] or (1,) * len(starts)
     axes = [net.axis(x, a) for a in (range(len(starts)) if given is None else given)]
     if not len(starts) == len(ends) == len(axes) == len(steps) or 0 in steps:
-        raise op.refused("its bounds do not fit together", "the model is damaged")
-    return _sliced(net, x, {a: b for a, *b in zip(axes, starts, ends, steps, strict=True)}, net.type_of(x).shape)
+        raise op.op_error("its bounds do not fit together", "the model is damaged")
+    return _strided_slice(net, x, {a: b for a, *b in zip(axes, starts, ends, steps, strict=True)}, net.type_of(x).shape)
 
 
-def _sliced(net: Importer, x: str, bounds: Mapping[int, Sequence[int]], shape: Sequence[Dim] | None) -> str:
+def _strided_slice(net: Importer, x: str, bounds: Mapping[int, Sequence[int]], shape: Sequence[Dim] | None) -> str:
     """A strided slice over the axes up to the last one that is cut; a bound at or beyond an end is left open."""
     count = max(bounds, default=-1) + 1
     begin, end, steps = [0] * count, [0] * count, [1] * count
@@ -124,13 +124,13 @@ def _gather(op: Op, net: Importer) -> str:
     length = net.shape(x)[axis]
     value = net.constant(indices)
     if value is not None and isinstance(length, int) and ((value < -length) | (value >= length)).any():
-        raise op.refused(f"it takes an element that an axis of {length} does not have")
+        raise op.op_error(f"it takes an element that an axis of {length} does not have")
     if value is not None and value.ndim == 0 and (isinstance(length, int) or int(value) >= 0):
         index = int(value) % length if isinstance(length, int) else int(value)
         return net.slice(x, axis, index, index + 1, dropped=True)
     if value is not None:
         if (value < 0).any() and not isinstance(length, int):
-            raise op.refused("its indices count from the end of an axis whose length is not known")
+            raise op.op_error("its indices count from the end of an axis whose length is not known")
         plain = value if not isinstance(length, int) else np.where(value < 0, value + length, value)
         indices = net.const(plain.astype(INT32), "indices")
     elif isinstance(length, int):
@@ -156,22 +156,22 @@ def _pad(op: Op, net: Importer) -> str:
             given = net.needed_constant(operand, "the list of axes").reshape(-1)
             axes = [net.axis(x, int(a)) for a in given]
     if len(pads) != 2 * len(axes):
-        raise op.refused("it does not give two paddings for each axis", "the model is damaged")
+        raise op.op_error("it does not give two paddings for each axis", "the model is damaged")
     pairs = dict(zip(axes, zip(pads[: len(axes)], pads[len(axes) :], strict=True), strict=True))
     if mode in ("reflect", "edge", "wrap"):
         for axis in (a for a in axes if any(pairs[a])):
-            x = net.take(x, _mirrored(op, net, net.length(x, axis), pairs[axis], mode), axis)
+            x = net.take(x, _padded_indices(op, net, net.length(x, axis), pairs[axis], mode), axis)
         return x
     if mode != "constant":
-        raise op.refused(f"mode {mode!r}", "the model is damaged")
+        raise op.op_error(f"mode {mode!r}", "the model is damaged")
     return net.pad(x, [pairs.get(i, (0, 0)) for i in range(rank)], fill)
 
 
-def _mirrored(op: Op, net: Importer, length: int, pair: tuple[int, int], mode: str) -> list[int]:
+def _padded_indices(op: Op, net: Importer, length: int, pair: tuple[int, int], mode: str) -> list[int]:
     """Which elements of an axis stand where once it is padded with its own; a negative padding cuts off."""
     before, after = (max(n, 0) for n in pair)
     if not length:
-        raise op.refused("it pads an axis of no elements with its own", "the model is damaged")
+        raise op.op_error("it pads an axis of no elements with its own", "the model is damaged")
     net.room(before + length + after)
     cut = np.arange(length)[max(-pair[0], 0) : length - max(-pair[1], 0)]
     padded: list[int] = np.pad(cut, (before, after), mode=cast(Literal["reflect", "edge", "wrap"], mode)).tolist()
