@@ -263,7 +263,7 @@ def _values(making: _Making) -> str:
         atoms = net.state.array("atoms", None)
         actions, rest = divmod(net.width(x), max(len(atoms), 1))
         if rest or not actions:
-            raise net.state.damaged(
+            raise net.state.damaged_error(
                 f"its network has {net.width(x)} outputs for {len(atoms)} values", "each action has all"
             )
         net.at("q_values")

@@ -122,7 +122,7 @@ def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
         if module in net.state:
             per_action(net, mean, net.state.array(module, net.width(mean)), name)
             return {name: role}
-    raise net.state.damaged(
+    raise net.state.damaged_error(
         "its policy has no deviation of its own",
         "it has none, or one that depends on the observation, or is no Gaussian: which, the weights do not tell",
     )

@@ -22,7 +22,7 @@ from typing import Any
 
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.keras.config import config_of, refuse_code
-from converters.formats.keras.source import layered
+from converters.formats.keras.source import build_layered
 from converters.formats.keras.weights import Groups
 from converters.formats.read import ports_of
 from converters.formats.registry import WRITTEN
@@ -96,7 +96,7 @@ def _configuration(path: Path, out: Path) -> None:
     with naming(path):
         config = config_of(path)
         refuse_code(config)
-        layered((path,), config, Groups({}), "3.0.0")
+        build_layered((path,), config, Groups({}), "3.0.0")
 
 
 COMMANDS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {

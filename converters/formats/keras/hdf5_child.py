@@ -34,7 +34,7 @@ _SHOWN = 20
 _MAX_RATIO, _FREE = 8, 1 << 20
 
 
-def _opened(path: str) -> tuple[io.BytesIO, int, bool]:
+def _open_weights(path: str) -> tuple[io.BytesIO, int, bool]:
     """(the HDF5 file's bytes, their number, whether they lie in a ``.keras``)."""
     data = Path(path).read_bytes()
     if not data.startswith(b"PK"):
@@ -49,7 +49,7 @@ class _Weights:
         import h5py
 
         self.h5py = h5py
-        stream, self.left, zipped = _opened(path)
+        stream, self.left, zipped = _open_weights(path)
         self.entries = _MAX_ENTRIES
         with h5py.File(stream, "r") as file:
             said = ("model_config", "keras_version", "training_config")
@@ -63,7 +63,7 @@ class _Weights:
 
     def _arrays(self, file: Any) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
         root = self._group(file, "model_weights") or file
-        return self._listed(root) if "layer_names" in root.attrs else self._found(root, "", 0)
+        return self._h5_arrays(root) if "layer_names" in root.attrs else self._keras_arrays(root, "", 0)
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
         return self.tensors
@@ -97,7 +97,7 @@ class _Weights:
         member = self._member(group, key) if key in group else None
         return member if isinstance(member, self.h5py.Group) else None
 
-    def _listed(self, root: Any) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+    def _h5_arrays(self, root: Any) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
         """The arrays of an ``.h5``, in the order of the layers and of each layer's weights."""
         for layer in self._names(root, "layer_names"):
             group = self._group(root, layer)
@@ -116,7 +116,7 @@ class _Weights:
             found += [n.decode() if isinstance(n, bytes) else str(n) for n in np.ravel(group.attrs[name])]
         return found
 
-    def _found(self, group: Any, path: str, depth: int) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+    def _keras_arrays(self, group: Any, path: str, depth: int) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
         """The arrays of a ``.keras``, by their paths."""
         for key in group:
             if depth > _MAX_DEPTH:
@@ -125,7 +125,7 @@ class _Weights:
                 continue
             value = self._member(group, key)
             if isinstance(value, self.h5py.Group):
-                yield from self._found(value, f"{path}{key}/", depth + 1)
+                yield from self._keras_arrays(value, f"{path}{key}/", depth + 1)
             else:
                 yield ("", path + key), self._array(value)
 

@@ -112,12 +112,12 @@ class Network(Builder):
         arrays = weights.among(model.layers)
         results: Results = {(place.layer, place.call): [reference] for place, reference in given.items()}
         first = _first_calls(model)
-        for layer, number in _ordered(model, results, first):
-            made = self._called(layer, number, results, arrays, prefix, depth)
+        for layer, number in _order_calls(model, results, first):
+            made = self._call_layer(layer, number, results, arrays, prefix, depth)
             results[layer.name, number + first.get(layer.name, 0)] = made
         return [results[p.layer, p.call][p.tensor] for p in model.outputs.values()]
 
-    def _called(
+    def _call_layer(
         self,
         layer: Layer,
         number: int,
@@ -142,7 +142,7 @@ class Network(Builder):
         self._check(layer, path, args, kwargs)
         table = OPERATIONS if layer.operation else LAYERS
         if layer.kind not in table:
-            raise unknown(layer, path)
+            raise unknown_layer_error(layer, path)
         step = Step(self, layer, () if weights is None else weights.arrays(layer), args, kwargs, path)
         try:
             made = table[layer.kind](step)
@@ -150,7 +150,7 @@ class Network(Builder):
             raise UnknownLayerError(
                 f"its layer {path!r} ({layer.kind}) is not read: {error.what}", why=error.why, fix=error.fix
             ) from error
-        if layer.operation and (unread := step.unread()):
+        if layer.operation and (unread := step.unread_settings()):
             raise UnknownLayerError(f"its operation {path!r} ({layer.kind}) has {', '.join(unread)}")
         if step.left:
             raise DamagedFileError(
@@ -204,7 +204,7 @@ def _first_calls(model: LayeredModel) -> dict[str, int]:
     return {p.layer: 1 for p in places if p.layer in counts and p.call == counts[p.layer]}
 
 
-def _ordered(model: LayeredModel, given: Results, first: Mapping[str, int]) -> list[tuple[Layer, int]]:
+def _order_calls(model: LayeredModel, given: Results, first: Mapping[str, int]) -> list[tuple[Layer, int]]:
     """The calls of a model, each behind those that it reads; layers are gone through again and again, as Keras does.
 
     Raises DamagedFileError where one waits for what no layer gives.
@@ -238,7 +238,7 @@ def _ordered(model: LayeredModel, given: Results, first: Mapping[str, int]) -> l
     return [calls[at] for at in sorted(ready, key=lambda at: (turn[at], at))]
 
 
-def unknown(layer: Layer, path: str) -> UnknownLayerError:
+def unknown_layer_error(layer: Layer, path: str) -> UnknownLayerError:
     """A layer that the table does not have."""
     kind = layer.kind if layer.kind.isprintable() else repr(layer.kind)
     return UnknownLayerError(f"its layer {path[:200]!r} is {kind[:200]}, which is not read as data")

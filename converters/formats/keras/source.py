@@ -38,14 +38,14 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     RuntimeUnavailableError without h5py; SourceError and its kinds.
     """
     try:
-        config, weights, version, loss = _stored(given)
+        config, weights, version, loss = _read_stored(given)
     except RuntimeUnavailableError:
         if options.trust_source:
             return [_through_keras(given.path)]
         raise
     stateful = stateful_layer(config)
     try:
-        model = layered((given.path,), config, weights, version, loss)
+        model = build_layered((given.path,), config, weights, version, loss)
     except UnknownLayerError as error:
         if not options.trust_source:
             fix = "--trust-source (trust_source=True) has Keras itself load it, if you know where it comes from"
@@ -66,7 +66,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return [replace(model, facts=replace(model.facts, notes=(*model.facts.notes, note)))]
 
 
-def _stored(given: Fetched) -> tuple[Any, Weights, str, str]:
+def _read_stored(given: Fetched) -> tuple[Any, Weights, str, str]:
     """Return the configuration, the weights, Keras' version and the loss of a file.
 
     Raises NotAPolicyError where it names code.
@@ -90,7 +90,7 @@ def _stored(given: Fetched) -> tuple[Any, Weights, str, str]:
     return config, weights, stored.version or "", loss_of(_configuration(stored.training or "null"))
 
 
-def layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str, loss: str = "") -> SourceModel:
+def build_layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str, loss: str = "") -> SourceModel:
     """The model of a configuration with its weights; ``loss`` is what it was compiled with.
 
     Raises UnknownLayerError, SourceError and its kinds.
@@ -129,7 +129,7 @@ def of_web_model(
     config = topology.get("model_config") or topology
     loss = loss_of(training) or loss_of(topology.get("training_config"))
     version = str(topology.get("keras_version") or "tfjs-layers")
-    return layered(files, _configuration(config) if isinstance(config, str) else config, weights, version, loss)
+    return build_layered(files, _configuration(config) if isinstance(config, str) else config, weights, version, loss)
 
 
 def _configuration(text: str) -> Any:

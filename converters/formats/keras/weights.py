@@ -50,7 +50,7 @@ class Groups:
             return []
         own = sorted((int(k[5:]), a) for k, a in self.stored.items() if re.fullmatch(r"vars/\d{1,4}", k))
         found = [a for _, a in own]
-        for part in (*_PARTS, *(f"cells/{name}" for name in _numbered(cells))):
+        for part in (*_PARTS, *(f"cells/{name}" for name in _group_names(cells))):
             for name in (part, f"_{part}"):
                 found += self._inside(name)._own(cells)
         return found
@@ -62,11 +62,11 @@ class Groups:
         """See Weights; layers of one class are numbered in the order of the configuration."""
         folder = next((f for f in _FOLDERS if any(k.startswith(f"{f}/") for k in self.stored)), _FOLDERS[0])
         inside, held = self._inside(folder), [x for x in layers if not x.operation]
-        names = _numbered([x.kind for x in held])
+        names = _group_names([x.kind for x in held])
         return {layer.name: inside._inside(name) for layer, name in zip(held, names, strict=True)}
 
 
-def _numbered(kinds: Sequence[str]) -> list[str]:
+def _group_names(kinds: Sequence[str]) -> list[str]:
     """What the groups of several objects of these classes are called."""
     seen, names = Counter[str](), []
     for name in map(_snake_case, kinds):

@@ -56,18 +56,18 @@ def frozen_function(path: str, form: str, signature: str | None = None) -> Froze
             names = list(function._arg_keywords)
     frozen = convert_variables_to_constants_v2(function, lower_control_flow=True)
     return FrozenFunction(
-        _ordered(frozen.graph.as_graph_def(), [t.op.name for t in frozen.inputs]),
-        dict(zip(names, map(_typed, frozen.inputs), strict=True)),
-        dict(zip(keys, map(_typed, frozen.outputs), strict=True)),
+        _order_nodes(frozen.graph.as_graph_def(), [t.op.name for t in frozen.inputs]),
+        dict(zip(names, map(_typed_tensor, frozen.inputs), strict=True)),
+        dict(zip(keys, map(_typed_tensor, frozen.outputs), strict=True)),
         used,
     )
 
 
-def _typed(tensor: Any) -> TypedTensor:
+def _typed_tensor(tensor: Any) -> TypedTensor:
     return tensor.name, tensor.dtype.name, None if tensor.shape.rank is None else tensor.shape.as_list()
 
 
-def _ordered(graph_def: Any, first: Sequence[str]) -> Any:
+def _order_nodes(graph_def: Any, first: Sequence[str]) -> Any:
     """The nodes ``first``, then the others by name: the order that TensorFlow gives them differs from run to run."""
     places = {name: i for i, name in enumerate(first)}
     nodes = sorted(graph_def.node, key=lambda n: (places.get(n.name, len(places)), n.name))
@@ -78,7 +78,7 @@ def _ordered(graph_def: Any, first: Sequence[str]) -> Any:
     return ordered
 
 
-def flattened(graph: Any) -> bytes:
+def flatten_graph(graph: Any) -> bytes:
     """The GraphDef of a ``tf.Graph``, deterministic; function calls and functional control flow are inlined.
 
     The graph is not changed. Control flow becomes Switch and Merge, as in TensorFlow 1.
@@ -87,12 +87,12 @@ def flattened(graph: Any) -> bytes:
     calls = FUNCTIONAL | {f.signature.name for f in graph_def.library.function}
     if any(node.op in calls for node in graph_def.node):
         places = [node.name for node in graph_def.node if node.op == "Placeholder"]
-        graph_def = _ordered(_inlined(graph_def, calls), places)
+        graph_def = _order_nodes(_inline_functions(graph_def, calls), places)
     data: bytes = graph_def.SerializeToString(deterministic=True)
     return data
 
 
-def _inlined(graph_def: Any, calls: Collection[str]) -> Any:
+def _inline_functions(graph_def: Any, calls: Collection[str]) -> Any:
     """As ``convert_variables_to_constants_v2`` does it: Grappler, with nothing but its function optimizer."""
     from tensorflow.core.protobuf import config_pb2, meta_graph_pb2  # noqa: TID251  the graph proves that it is loaded
     from tensorflow.python.grappler import tf_optimizer  # noqa: TID251
@@ -164,8 +164,8 @@ def named_function(call: Callable[..., Any], specs: Sequence[Any], keys: Callabl
     """The ConcreteFunction of ``call`` whose results are a dictionary; ``keys`` gives their names by their number."""
     import tensorflow as tf  # noqa: TID251  the model proves that it is loaded
 
-    def named(*tensors: Any) -> dict[str, Any]:
+    def call_by_name(*tensors: Any) -> dict[str, Any]:
         results = tf.nest.flatten(call(*tensors))
         return dict(zip(keys(len(results)), results, strict=True))
 
-    return tf.function(named).get_concrete_function(*specs)
+    return tf.function(call_by_name).get_concrete_function(*specs)

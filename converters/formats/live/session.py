@@ -17,7 +17,7 @@ from converters.formats.checkpoint.freeze import freeze, wanted_variables
 from converters.formats.checkpoint.policy_nodes import policy_nodes
 from converters.formats.checkpoint.tensor_bundle import Extents, several
 from converters.formats.checkpoint.training_graph import Saved, TrainingGraph, training_graph
-from converters.formats.live.freeze import flattened
+from converters.formats.live.freeze import flatten_graph
 from converters.formats.source import OriginalRun, SourceModel
 from converters.graph.ops.table import VARIABLES
 from converters.policy.facts import SourceFacts
@@ -59,7 +59,7 @@ def read_session(tensorflow: Any, session: Any, folder: Path) -> SourceModel:
             f"session is {type(session).__name__}, which is no tf.compat.v1.Session",
             fix="give the session that the policy was trained in; of a MonitoredSession, its raw session",
         )
-    data = flattened(session.graph)
+    data = flatten_graph(session.graph)
     graph = training_graph(schema.parse(schema.GraphDef, data, "TensorFlow graph")).graph
     values = _values(tensorflow, session, wanted_variables(graph))
     # By the nodes' own names: what a saver in the graph calls them does not matter here.

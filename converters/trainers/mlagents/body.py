@@ -52,7 +52,7 @@ def _self_attention(net: Network, x: str, mask: str, module: str) -> str:
     x, _, _ = standardise(net, x, [2], _LAYER_NORM)
     count, size = net.length(x, 1), net.width(x)
     if size % HEADS:
-        raise net.state.damaged(f"its attention has {size} numbers for {HEADS} heads", "ML-Agents cannot run it")
+        raise net.state.damaged_error(f"its attention has {size} numbers for {HEADS} heads", "ML-Agents cannot run it")
     batch = net.shape(x)[0]
 
     def heads(name: str, order: Sequence[int]) -> str:
@@ -86,7 +86,7 @@ def body_width(state: Weights, body: str) -> int:
         if f"{first}.hypernet.0.weight" in state:
             made = state.length(f"{first}.hypernet.{_layers_of(state, first)[-1]}.weight", 0)
             return made // max(1, state.length(f"{first}.bias", 0))
-    raise state.damaged("its Policy has no hidden layer", f"{body}.seq_layers.0.weight is not in it")
+    raise state.damaged_error("its Policy has no hidden layer", f"{body}.seq_layers.0.weight is not in it")
 
 
 def goal_width(state: Weights, body: str) -> int:

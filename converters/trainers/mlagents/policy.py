@@ -309,7 +309,7 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
             net.fact("discrete_action_output_shape", shape)
             names += ["discrete_actions", "discrete_action_output_shape"]
     if not made:
-        raise net.state.damaged("its Policy has no action", "neither a mean nor a branch is in it")
+        raise net.state.damaged_error("its Policy has no action", "neither a mean nor a branch is in it")
     if not generation.by_sensor and len(made) == 1:  # 0.22 to 0.25 called the one action by its old name, too
         kind, value = next(iter(made.items()))
         net.output("action", value)

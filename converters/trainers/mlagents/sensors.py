@@ -168,7 +168,7 @@ def find_sensors(
     images = [m for m, kind in kinds.items() if kind == _IMAGE]
     layout = Layout(modules, known, images, width - sum(known.values()), len(lists) > 1)
     if layout.rest < 0:
-        raise state.damaged(
+        raise state.damaged_error(
             f"its sensors have {width - layout.rest} columns, and its first layer takes {width}",
             "the checkpoint is of a network that ML-Agents did not build, or damaged",
         )

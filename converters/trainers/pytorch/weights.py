@@ -31,7 +31,7 @@ class Weights:
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of a tensor; raises DamagedFileError where there is none of that name."""
         if name not in self._tensors:
-            raise self.damaged(
+            raise self.damaged_error(
                 f"{self._holder} has no {name}", "what stands beside it belongs to a network that has one"
             )
         return self._tensors[name].shape
@@ -40,7 +40,7 @@ class Weights:
         """The length of an axis of a tensor; raises DamagedFileError where it has none."""
         shape = self.shape(name)
         if not -len(shape) <= axis < len(shape):
-            raise self.damaged(f"{name} has the shape {list(shape)}", "it lacks an axis that such a weight has")
+            raise self.damaged_error(f"{name} has the shape {list(shape)}", "it lacks an axis that such a weight has")
         return shape[axis]
 
     def array(self, name: str, *shape: int | None) -> np.ndarray:
@@ -48,13 +48,13 @@ class Weights:
         found = self.shape(name)
         if len(found) != len(shape) or any(w is not None and w != n for w, n in zip(shape, found, strict=False)):
             wanted = ", ".join("?" if n is None else str(n) for n in shape)
-            raise self.damaged(
+            raise self.damaged_error(
                 f"{name} has the shape {list(found)}, and [{wanted}] fits the network",
                 f"it is of a network that {self._maker} did not build, or damaged",
             )
         array = self._archive.array(self._tensors[name], name)
         if array.dtype.kind not in "fiu":
-            raise self.damaged(f"{name} holds no numbers", f"its dtype is {array.dtype}")
+            raise self.damaged_error(f"{name} holds no numbers", f"its dtype is {array.dtype}")
         self._left.discard(name)
         return array.astype(np.float32)
 
@@ -83,7 +83,7 @@ class Weights:
             shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
             raise self.unsupported_error(shown, f"it is part of no network that {self._maker} builds without plugins")
 
-    def damaged(self, what: str, why: str) -> DamagedFileError:
+    def damaged_error(self, what: str, why: str) -> DamagedFileError:
         """The refusal of weights that do not fit together."""
         return DamagedFileError(what, why=why, fix=self._fix)
 

@@ -78,7 +78,7 @@ def activation_of(step: Step, spec: Any) -> Activation:
     return _ACTIVATIONS[name]
 
 
-def activated(step: Step, value: str, key: str = "activation") -> str:
+def apply_activation(step: Step, value: str, key: str = "activation") -> str:
     """``value`` behind the layer's activation."""
     return activation_of(step, step.get(key))(step.net, value)
 
@@ -135,7 +135,7 @@ def softmax(b: Builder, x: str, axis: int, op: str = "Softmax") -> str:
 
 
 LAYERS: Mapping[str, Translate] = {
-    "Activation": lambda s: activated(s, s.x),
+    "Activation": lambda s: apply_activation(s, s.x),
     "ReLU": _relu,
     "LeakyReLU": lambda s: nn.leaky_relu(s.net, s.x, _slope(s, "negative_slope", "alpha", default=0.3)),
     "ELU": lambda s: nn.elu(s.net, s.x, _slope(s, "alpha", default=1.0)),

@@ -18,7 +18,7 @@ from signatures.errors import UnsupportedOpError
 _HIDDEN = -1e9
 
 
-def _hidden(b: Builder, scores: str, mask: str) -> str:
+def _mask_scores(b: Builder, scores: str, mask: str) -> str:
     """Scores [B, …, T, S] with those at a mask's zeros [B, T, S] far below all others."""
     shown = b.cast(mask, FLOAT32)
     rank = b.rank(scores)
@@ -49,12 +49,12 @@ def _multi_head(step: Step) -> list[str]:
         raise UnsupportedOpError("it looks along several axes")
     width = int(step.get("key_dim"))
     widths = (width, width, int(step.get("value_dim") or width))
-    parts = [_projected(step, t, heads, n) for t, n in zip(sources, widths, strict=True)]
+    parts = [_project_heads(step, t, heads, n) for t, n in zip(sources, widths, strict=True)]
     scaled = b.add("Mul", [parts[0], b.number(parts[0], 1 / math.sqrt(width))])
     scores = matmul(b, scaled, b.transpose(parts[1], [0, 1, 3, 2]))
     mask = step.kwargs.get("attention_mask")
     if mask is not None:
-        scores = _hidden(b, scores, mask)
+        scores = _mask_scores(b, scores, mask)
     if step.kwargs.get("use_causal_mask"):
         scores = _causal(b, scores)
     shares = over_last_axis(b, "Softmax", scores)
@@ -63,11 +63,11 @@ def _multi_head(step: Step) -> list[str]:
     seen = b.reshape(seen, (rows, length, heads * widths[2]))
     kernel = step.take(heads, widths[2], None)
     result = matmul(b, seen, b.const(kernel.reshape(-1, kernel.shape[-1]), "kernel"))
-    result = step.biased(result, kernel.shape[-1])
+    result = step.add_bias(result, kernel.shape[-1])
     return [result, shares] if step.kwargs.get("return_attention_scores") else [result]
 
 
-def _projected(step: Step, x: str, heads: int, width: int) -> str:
+def _project_heads(step: Step, x: str, heads: int, width: int) -> str:
     """[B, T, n] as [B, heads, T, width]."""
     b = step.net
     rows, length, _ = b.shape(x)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.keras.layers.activations import activated
+from converters.formats.keras.layers.activations import apply_activation
 from converters.formats.keras.layers.step import Step, Translate
 from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
 from converters.graph.nn.pooling import average_pool, max_pool
@@ -67,17 +67,17 @@ def _conv(step: Step, axes: int) -> str:
 
     def compute(image: str) -> str:
         kernel = _kernel(step, axes, step.net.length(image, 3) // max(groups, 1), filters)
-        return step.biased(conv2d(step.net, image, kernel, _window(step, "kernel_size", axes), groups), filters)
+        return step.add_bias(conv2d(step.net, image, kernel, _window(step, "kernel_size", axes), groups), filters)
 
-    return activated(step, _on_images(step, axes, compute))
+    return apply_activation(step, _on_images(step, axes, compute))
 
 
 def _depthwise(step: Step, axes: int) -> str:
     def compute(image: str) -> str:
         value = _each_channel(step, image, axes)
-        return step.biased(value, step.net.length(value, 3))
+        return step.add_bias(value, step.net.length(value, 3))
 
-    return activated(step, _on_images(step, axes, compute))
+    return apply_activation(step, _on_images(step, axes, compute))
 
 
 def _each_channel(step: Step, image: str, axes: int) -> str:
@@ -94,12 +94,12 @@ def _separable(step: Step, axes: int) -> str:
         value = _each_channel(step, image, axes)
         pointwise = step.take(*[1] * axes, step.net.length(value, 3), filters)
         pointwise = pointwise.reshape(1, 1, *pointwise.shape[-2:])
-        return step.biased(conv2d(step.net, value, pointwise, Window((1, 1))), filters)
+        return step.add_bias(conv2d(step.net, value, pointwise, Window((1, 1))), filters)
 
-    return activated(step, _on_images(step, axes, compute))
+    return apply_activation(step, _on_images(step, axes, compute))
 
 
-def _transposed(step: Step, axes: int) -> str:
+def _conv_transpose(step: Step, axes: int) -> str:
     """Kernels are [height, width, out, in]. SAME makes stride times as many rows, the odd one cut off behind."""
     step.refuse_unless("output_padding", None)
     window = _window(step, "kernel_size", axes)
@@ -116,9 +116,9 @@ def _transposed(step: Step, axes: int) -> str:
 
     def compute(image: str) -> str:
         kernel = np.swapaxes(_kernel(step, axes, filters, step.net.length(image, 3)), 2, 3)
-        return step.biased(conv2d_transposed(step.net, image, kernel, moved, (extra[0], extra[1])), filters)
+        return step.add_bias(conv2d_transposed(step.net, image, kernel, moved, (extra[0], extra[1])), filters)
 
-    return activated(step, _on_images(step, axes, compute))
+    return apply_activation(step, _on_images(step, axes, compute))
 
 
 def _pool(step: Step, axes: int, pool: Callable[..., str]) -> str:
@@ -142,7 +142,7 @@ LAYERS: Mapping[str, Translate] = {
     **_of_both("Conv#", _conv),
     **_of_both("DepthwiseConv#", _depthwise),
     **_of_both("SeparableConv#", _separable),
-    **_of_both("Conv#Transpose", _transposed),
+    **_of_both("Conv#Transpose", _conv_transpose),
     **_of_both("MaxPooling#", _pool, pool=max_pool),
     **_of_both("AveragePooling#", _pool, pool=average_pool),
     **dict.fromkeys(("GlobalAveragePooling1D", "GlobalAveragePooling2D"), partial(_global_pool, kind="Mean")),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.keras.layers.activations import activated
+from converters.formats.keras.layers.activations import apply_activation
 from converters.formats.keras.layers.step import Step, Translate
 from converters.graph.nn.linear import matmul
 from converters.graph.ops.einsum import einsum
@@ -21,7 +21,7 @@ def _dense(step: Step) -> str:
     b, units = step.net, int(step.get("units"))
     step.refuse_unless("quantization_config", None)
     kernel = step.take(b.length(step.x, -1), units)
-    return activated(step, step.biased(matmul(b, step.x, b.const(kernel, "kernel")), units))
+    return apply_activation(step, step.add_bias(matmul(b, step.x, b.const(kernel, "kernel")), units))
 
 
 def _einsum_dense(step: Step) -> str:
@@ -30,7 +30,7 @@ def _einsum_dense(step: Step) -> str:
     value = einsum(b, equation, [step.x, b.const(step.take(), "kernel")], shape_of=b.shape)
     if step.get("bias_axes"):
         value = b.add("Add", [value, b.const(step.take(), "bias")])
-    return activated(step, value)
+    return apply_activation(step, value)
 
 
 def _embedding(step: Step) -> str:
@@ -59,13 +59,13 @@ def _reshape(step: Step) -> str:
     if target.count(-1) == 1:
         target[target.index(-1)] = size // max(-math.prod(target), 1)
     if math.prod(target) != size or min(target, default=1) < 0:
-        raise step.damaged(f"makes {target} of {size} numbers")
+        raise step.damaged_error(f"makes {target} of {size} numbers")
     return b.reshape(x, (b.shape(x)[0], *target))
 
 
 def _repeat_vector(step: Step) -> str:
     if step.rank != 2:
-        raise step.damaged("takes [B, n]")
+        raise step.damaged_error("takes [B, n]")
     b = step.net
     rows, width = b.shape(step.x)
     return b.broadcast(b.reshape(step.x, (rows, 1, width)), (rows, int(step.get("n")), width))
@@ -80,14 +80,14 @@ def _pairs(value: Any, axes: int) -> list[tuple[int, int]]:
     return [(int(v), int(v)) if isinstance(v, int) else (int(v[0]), int(v[1])) for v in value]
 
 
-def _framed(step: Step, key: str, sign: int) -> str:
+def _pad_or_crop(step: Step, key: str, sign: int) -> str:
     """Paddings (sign 1) or croppings (−1) of the axes between batch and channels."""
     axes = step.rank - 2
     pairs = [(sign * a, sign * z) for a, z in _pairs(step.get(key), axes)]
     first = step.get("data_format") == "channels_first"
     for axis, (a, z) in enumerate(pairs, 2 if first else 1):
         if sign < 0 and -a - z >= step.net.length(step.x, axis):
-            raise step.damaged("leaves nothing of an axis")
+            raise step.damaged_error("leaves nothing of an axis")
     return step.net.pad(step.x, [(0, 0), (0, 0), *pairs] if first else [(0, 0), *pairs, (0, 0)])
 
 
@@ -111,7 +111,7 @@ def _up_sampling(step: Step) -> str:
 # ------------------------------------------------------------------ several tensors
 
 
-def _aligned(step: Step) -> list[str]:
+def _align_ranks(step: Step) -> list[str]:
     """The tensors with as many axes each: new ones stand behind the batch."""
     b = step.net
     rank = max(b.rank(t) for t in step.tensors)
@@ -119,15 +119,15 @@ def _aligned(step: Step) -> list[str]:
     return [t if len(s) == rank else b.reshape(t, (s[0], *[1] * (rank - len(s)), *s[1:])) for t, s in shapes]
 
 
-def _merged(step: Step, op: str) -> str:
-    first, *rest = _aligned(step)
+def _merge_tensors(step: Step, op: str) -> str:
+    first, *rest = _align_ranks(step)
     for other in rest:
         first = step.net.add(op, [first, other])
     return first
 
 
 def _average(step: Step) -> str:
-    total = _merged(step, "Add")
+    total = _merge_tensors(step, "Add")
     return step.net.add("RealDiv", [total, step.net.number(total, len(step.tensors))])
 
 
@@ -187,7 +187,7 @@ _IDENTITIES = (
 _MERGES = {"Add": "Add", "Multiply": "Mul", "Subtract": "Sub", "Maximum": "Maximum", "Minimum": "Minimum"}
 LAYERS: Mapping[str, Translate] = {
     **dict.fromkeys(_IDENTITIES, lambda s: s.x),
-    **{name: partial(_merged, op=op) for name, op in _MERGES.items()},
+    **{name: partial(_merge_tensors, op=op) for name, op in _MERGES.items()},
     "Average": _average,
     "Concatenate": _concatenate,
     "Dot": _dot,
@@ -198,8 +198,8 @@ LAYERS: Mapping[str, Translate] = {
     "Reshape": _reshape,
     "RepeatVector": _repeat_vector,
     "Permute": lambda s: s.net.transpose(s.x, [0, *(int(d) for d in s.get("dims"))]),
-    **dict.fromkeys(("ZeroPadding1D", "ZeroPadding2D"), partial(_framed, key="padding", sign=1)),
-    **dict.fromkeys(("Cropping1D", "Cropping2D"), partial(_framed, key="cropping", sign=-1)),
+    **dict.fromkeys(("ZeroPadding1D", "ZeroPadding2D"), partial(_pad_or_crop, key="padding", sign=1)),
+    **dict.fromkeys(("Cropping1D", "Cropping2D"), partial(_pad_or_crop, key="cropping", sign=-1)),
     **dict.fromkeys(("UpSampling1D", "UpSampling2D"), _up_sampling),
     "Rescaling": _rescaling,
     "Normalization": _normalization,

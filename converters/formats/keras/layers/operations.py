@@ -53,7 +53,7 @@ def _softmax(step: Step, op: str) -> str:
     return softmax(step.net, step.x, int(_argument(step, 1, "axis", -1)), op)
 
 
-def _reduced(step: Step, kind: str) -> str:
+def _reduce(step: Step, kind: str) -> str:
     b, axis = step.net, _argument(step, 1, "axis")
     axes = range(b.rank(step.x)) if axis is None else [axis] if isinstance(axis, int) else axis
     keep = bool(_argument(step, 2, "keepdims", False))
@@ -99,12 +99,12 @@ def _item(step: Step) -> str:
     return value
 
 
-def _transposed(step: Step) -> str:
+def _transpose(step: Step) -> str:
     axes = _argument(step, 1, "axes")
     return step.net.transpose(step.x, [*range(step.rank)][::-1] if axes is None else [int(a) for a in axes])
 
 
-def _squeezed(step: Step) -> str:
+def _squeeze(step: Step) -> str:
     axis = _argument(step, 1, "axis")
     if axis is None:
         raise UnsupportedOpError("it squeezes every axis of length 1")
@@ -113,7 +113,7 @@ def _squeezed(step: Step) -> str:
     )
 
 
-def _expanded(step: Step) -> str:
+def _expand_dims(step: Step) -> str:
     axis = int(_argument(step, 1, "axis"))
     return step.net.expand_dims(step.x, axis % (step.rank + 1))
 
@@ -138,7 +138,7 @@ OPERATIONS: Mapping[str, Translate] = {
     **{name: partial(_binary, op=op) for name, op in _BINARY.items()},
     **{name: partial(_unary, op=op) for name, op in _UNARY.items()},
     **{name.title().replace("_", ""): partial(_activation, name=name) for name in _ACTIVATIONS.split()},
-    **{name: partial(_reduced, kind=kind) for name, kind in _REDUCTIONS.items()},
+    **{name: partial(_reduce, kind=kind) for name, kind in _REDUCTIONS.items()},
     "Elu": lambda s: elu(s.net, s.x, float(_argument(s, 1, "alpha", 1.0))),
     "Gelu": lambda s: activation_of(s, "gelu_new" if _argument(s, 1, "approximate", True) else "gelu")(s.net, s.x),
     "Softmax": partial(_softmax, op="Softmax"),
@@ -148,9 +148,9 @@ OPERATIONS: Mapping[str, Translate] = {
     "Stack": _stack,
     "Reshape": _reshape,
     "GetItem": _item,
-    "Transpose": _transposed,
-    "Squeeze": _squeezed,
-    "ExpandDims": _expanded,
+    "Transpose": _transpose,
+    "Squeeze": _squeeze,
+    "ExpandDims": _expand_dims,
     "Matmul": lambda s: matmul(s.net, *s.tensors[:2]),
     "Einsum": lambda s: einsum(s.net, str(s.get("subscripts")), s.tensors, shape_of=s.net.shape),
 }

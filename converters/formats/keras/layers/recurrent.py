@@ -107,7 +107,7 @@ def _cells(step: Step, width: int) -> list[_Cell]:
 def _recurrent(step: Step) -> list[str]:
     b, x = step.net, step.x
     if step.rank != 3:
-        raise step.damaged(f"is given {step.rank} axes, not [B, T, n]")
+        raise step.damaged_error(f"is given {step.rank} axes, not [B, T, n]")
     if step.kwargs.get("mask") is not None:
         raise UnsupportedOpError("it is given a mask")
     step.refuse_unless("time_major", False, None)
@@ -123,7 +123,7 @@ def _recurrent(step: Step) -> list[str]:
     elif not given:
         states = [b.add("Fill", [b.vector([rows, w]), b.const(np.zeros((), FLOAT32), "zero")]) for w in widths]
     if [b.length(s, -1) for s in states] != widths:
-        raise step.damaged(f"has states of {widths} numbers, and is given others")
+        raise step.damaged_error(f"has states of {widths} numbers, and is given others")
     turns = range(steps - 1, -1, -1) if step.get("go_backwards") else range(steps)
     outputs = []
     for turn in turns:

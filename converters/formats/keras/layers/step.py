@@ -58,7 +58,7 @@ class Step:
         """Whether TensorFlow.js wrote it, whose defaults are others."""
         return self.net.version.startswith("tfjs")
 
-    def damaged(self, what: str, why: str | None = None) -> DamagedFileError:
+    def damaged_error(self, what: str, why: str | None = None) -> DamagedFileError:
         """The error of a layer that cannot be what its file says."""
         return DamagedFileError(f"the layer {self.path!r} {what}", why=why, fix="save the model again")
 
@@ -73,7 +73,7 @@ class Step:
     def x(self) -> str:
         """The one tensor that it is given, the first of several."""
         if not self.tensors:
-            raise self.damaged("is given no tensor")
+            raise self.damaged_error("is given no tensor")
         return self.tensors[0]
 
     @property
@@ -86,7 +86,7 @@ class Step:
     def take(self, *shape: int | None) -> np.ndarray:
         """The next weight, float32. Raises DamagedFileError where there is none, or not of this shape."""
         if not self.left:
-            raise self.damaged("has too few weights")
+            raise self.damaged_error("has too few weights")
         array = self.left.pop(0)
         fits = len(shape) == array.ndim and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
         if shape and not fits:
@@ -97,13 +97,13 @@ class Step:
             )
         return array.astype(FLOAT32)
 
-    def unread(self) -> list[str]:
+    def unread_settings(self) -> list[str]:
         """Settings and named arguments that say something and were never asked for."""
         given = {**self.layer.config, **self.kwargs}
         known = {*self.asked, "name", "trainable"}
         return [f"{k}={str(v)[:60]}" for k, v in given.items() if k not in known and v is not None and v is not False]
 
-    def biased(self, value: str, width: int | None) -> str:
+    def add_bias(self, value: str, width: int | None) -> str:
         """``value`` plus the next weight, where the layer has a bias."""
         if not self.get("use_bias", True):
             return value
