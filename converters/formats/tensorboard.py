@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 
 from converters.files import tensorflow_messages as schema
-from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.crc32c import crc32c, mask_crc
 from converters.formats.frozen_graph.encode import as_read
 from converters.graph.nodes import Graph
 
@@ -36,4 +36,4 @@ def _record(data: bytes) -> bytes:
 
 
 def _checksum(data: bytes) -> bytes:
-    return struct.pack("<I", masked(crc32c(data)))
+    return struct.pack("<I", mask_crc(crc32c(data)))

@@ -22,7 +22,7 @@ from converters.files.children.process import LoadedModel, RunFailedError
 from converters.files.folders import scratch_folder, size_of
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.format import Format, Port, Ports
-from converters.formats.frozen_graph.writer import frozen
+from converters.formats.frozen_graph.writer import frozen_graph
 from converters.formats.read import ports_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
@@ -151,7 +151,7 @@ def compare_artefacts(
         folder = Path(opened.enter_context(scratch_folder()))
         pool = opened.enter_context(RuntimePool()) if pool is None else pool
         reference_file = folder / "reference.bytes"
-        frozen(policy).write(reference_file)
+        frozen_graph(policy).write(reference_file)
         copies = [_safe_copy(m, folder / str(number)) for number, m in enumerate(matched)]
         own = rounded_to(reference)
         kept = [None if (storage := rounded_to(path)) == own else storage for path, *_ in artefacts]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.bundle import Bundle
-from converters.formats.frozen_graph.writer import frozen
+from converters.formats.frozen_graph.writer import frozen_graph
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.export.options import storage_of
@@ -47,7 +47,7 @@ def compare_rounded(
     graph = round_weights(tested.graph, storage)
     reference = folder / f"reference-{storage}.bytes"
     small = replace(tested, graph=graph, reference=reference, source=None)
-    frozen(replace(policy, graph=graph)).write(reference)
+    frozen_graph(replace(policy, graph=graph)).write(reference)
     report = run(small)
     found = decisions(tested, small, storage, runtimes, pool, options or VerifyOptions())
     ran = tested.source.runtime if found and tested.source and tested.source.runtime in runtimes else None

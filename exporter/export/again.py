@@ -12,7 +12,7 @@ import numpy as np
 from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import Bundle, unfit
 from converters.formats.bundle.embed import runnable
-from converters.formats.frozen_graph.writer import frozen
+from converters.formats.frozen_graph.writer import frozen_graph
 from converters.formats.registry import WRITTEN
 from converters.formats.saved_model.writer import signatures_of
 from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
@@ -109,7 +109,7 @@ def verify_folder(
         copies = _safe_copies(artefacts, names, list(keys), scratch)
         if again is not None:
             reference = scratch / "reference.bytes"
-            frozen(again.policy).write(reference)
+            frozen_graph(again.policy).write(reference)
         tested = PolicyUnderTest(
             found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
             made_for, artefacts, contract.tool.get("batch"), read is not None and runs_elsewhere(read),

@@ -126,7 +126,7 @@ def contract_of(
 
 def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     """A policy whose artefacts lie in ``stage``; what else verification needs is put into ``scratch``."""
-    from converters.formats.frozen_graph.writer import frozen
+    from converters.formats.frozen_graph.writer import frozen_graph
     from converters.formats.saved_model.writer import signatures_of
     from exporter.verify.participants import PolicyUnderTest
 
@@ -137,7 +137,7 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
         # The numpy reference reads a .bytes; one is made for it where none was asked for.
         scratch.mkdir(exist_ok=True)
         reference = scratch / "reference.bytes"
-        frozen(policy).write(reference)
+        frozen_graph(policy).write(reference)
     keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     return PolicyUnderTest(
         policy.name,

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.formats.checkpoint import table as module
-from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.crc32c import crc32c, mask_crc
 from converters.formats.checkpoint.table import MAGIC, read_table
 from signatures.errors import DamagedFileError, ExportModelError
 from tests.checkpoint.writing import block, table, varint
@@ -39,8 +39,8 @@ def test_crc32c_of_known_strings() -> None:
     assert crc32c(bytes(32)) == 0x8A9136AA
     assert crc32c(b"\xff" * 32) == 0x62A8AB43
     assert crc32c(bytes(range(32))) == 0x46DD794E
-    assert masked(0) == 0xA282EAD8
-    assert masked(0xFFFFFFFF) == 0xA282EAD7
+    assert mask_crc(0) == 0xA282EAD8
+    assert mask_crc(0xFFFFFFFF) == 0xA282EAD7
 
 
 @given(st.integers(0, 3000), st.binary(min_size=1, max_size=40))
@@ -100,7 +100,7 @@ def test_a_shorter_file_is_refused(pairs: list[tuple[bytes, bytes]], data: st.Da
 
 
 def framed(content: bytes, kind: bytes = b"\0") -> bytes:
-    return content + kind + struct.pack("<I", masked(crc32c(content + kind)))
+    return content + kind + struct.pack("<I", mask_crc(crc32c(content + kind)))
 
 
 def with_index(blocks: bytes, index: bytes) -> bytes:

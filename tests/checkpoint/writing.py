@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.files import tensorflow_messages as schema
-from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.crc32c import crc32c, mask_crc
 from converters.formats.checkpoint.table import MAGIC
 from converters.formats.checkpoint.tensor_bundle import Extents, slice_key
 from converters.formats.frozen_graph.tensors import from_array
@@ -46,7 +46,7 @@ def table(pairs: Pairs, *, per_block: int = 8, interval: int = 4) -> bytes:
     def put(content: bytes) -> bytes:
         handle = varint(len(out)) + varint(len(content))
         content += b"\0"  # not compressed
-        out.extend(content + struct.pack("<I", masked(crc32c(content))))
+        out.extend(content + struct.pack("<I", mask_crc(crc32c(content))))
         return handle
 
     index = []
@@ -77,7 +77,7 @@ def bundle(
         shard = number % shards
         entry = described(array)
         entry.shard_id, entry.offset, entry.size = shard, len(data[shard]), len(raw)
-        entry.crc32c = masked(crc32c(raw))
+        entry.crc32c = mask_crc(crc32c(raw))
         data[shard] += raw
         entries[key] = entry.SerializeToString()
 

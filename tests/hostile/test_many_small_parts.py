@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from converters.files.chunks import Pieces
 from converters.files.file_probe import json_in
 from converters.files.tensorflow_messages import field
-from converters.formats.tfjs.artifact import vetted
+from converters.formats.tfjs.artifact import safe_copy
 from exporter.export.sources import read_source
 from signatures.errors import ExportModelError
 from tests.fuzz.changes import zipped
@@ -112,6 +112,6 @@ def test_a_runtime_gets_no_initialiser_of_a_web_model(tmp_path: Path) -> None:
     model["modelTopology"] |= {"more": 1}
     (tmp_path / "model.json").write_text(json.dumps(model))
     (tmp_path / "copy").mkdir()
-    copy = json.loads((vetted(tmp_path, ["action"], tmp_path / "copy") / "model.json").read_text())
+    copy = json.loads((safe_copy(tmp_path, ["action"], tmp_path / "copy") / "model.json").read_text())
     assert set(copy) == {"format", "modelTopology", "weightsManifest"}
     assert set(copy["modelTopology"]) == {"node"}

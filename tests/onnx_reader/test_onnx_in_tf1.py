@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from converters.files.children.process import RuntimeProcess
-from converters.formats.frozen_graph.writer import frozen
+from converters.formats.frozen_graph.writer import frozen_graph
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.export.sources import read_source
@@ -38,7 +38,7 @@ def legacy(request: pytest.FixtureRequest, processes: RuntimePool) -> RuntimePro
 def test_runs_there_and_agrees(source: Path, legacy: RuntimeProcess, tmp_path: Path) -> None:
     (policy,) = read_source(source).policies()
     path = tmp_path / "policy.bytes"
-    frozen(policy).write(path)
+    frozen_graph(policy).write(path)
     model = legacy.load(str(path))
     outputs = [s for s in policy.signature.outputs if s.role is not Role.SAMPLED]
     for case in draw_cases(policy.signature):

@@ -13,7 +13,7 @@ from onnx import helper, numpy_helper
 from converters.files.fetch import Fetched
 from converters.formats.onnx import proto
 from converters.formats.onnx.reader import read_onnx
-from converters.formats.onnx.vetted import self_contained_model, vetted
+from converters.formats.onnx.vetted import safe_copy, self_contained_model
 from signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import constant, floats, model, node
 
@@ -142,5 +142,5 @@ def test_what_no_reader_knows_is_handed_to_no_runtime(tmp_path: Path) -> None:
     size = len(graph)
     path.write_bytes(message.SerializeToString() + b"\x3a" + bytes([size & 0x7F | 0x80, size >> 7]) + graph + group)
     (tmp_path / "copy").mkdir()
-    copy = onnx.load(vetted(path, [], tmp_path / "copy"))
+    copy = onnx.load(safe_copy(path, [], tmp_path / "copy"))
     np.testing.assert_array_equal(numpy_helper.to_array(copy.graph.initializer[0]).ravel(), np.arange(2048))

@@ -13,7 +13,7 @@ from converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from converters.formats.saved_model.lengths import without_counted
 from converters.formats.saved_model.reader import read_saved_model
 from converters.formats.saved_model.signature import ModelSignature, Tensor, expose
-from converters.formats.saved_model.signature import exposed as with_facts
+from converters.formats.saved_model.signature import expose_signature as with_facts
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types

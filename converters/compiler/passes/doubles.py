@@ -16,14 +16,14 @@ _FLOAT64 = np.dtype(np.float64)
 
 def narrow_doubles(graph: Graph, facts: SourceFacts) -> tuple[Graph, SourceFacts]:
     """Return the graph in float32, and a note where anything was not. Readers that narrow themselves note the same."""
-    nodes = tuple(map(_narrowed, graph.nodes))
+    nodes = tuple(map(_narrow, graph.nodes))
     if all(made is node for made, node in zip(nodes, graph.nodes, strict=True)):
         return graph, facts
     notes = facts.notes if DOUBLES_NARROWED in facts.notes else (*facts.notes, DOUBLES_NARROWED)
     return Graph(nodes), replace(facts, notes=notes)
 
 
-def _narrowed(node: Node) -> Node:
+def _narrow(node: Node) -> Node:
     """The node, or the same in float32; a Cast that has nothing left to do hands on."""
     if node.value is not None and node.value.dtype == _FLOAT64:
         with np.errstate(over="ignore"):

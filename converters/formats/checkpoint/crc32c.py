@@ -66,6 +66,6 @@ def crc32c(data: bytes | memoryview, before: int = 0) -> int:
     return _scalar(state, data[count * length :]) ^ _ONES
 
 
-def masked(crc: int) -> int:
+def mask_crc(crc: int) -> int:
     """A checksum as it is stored: rotated and shifted, so that the checksum of data with checksums is no constant."""
     return ((crc >> 15 | crc << 17) + _MASK_DELTA) & _ONES

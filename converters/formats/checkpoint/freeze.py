@@ -78,8 +78,8 @@ def freeze(
         if checkpoint is None or place is None:
             missing[name] = _key(variables[name], training)
         else:
-            values[name] = _checked(variables[name], checkpoint.read(place.key, place.extents), checkpoint)
-    frozen = _replaced(graph, values)
+            values[name] = _fitting_value(variables[name], checkpoint.read(place.key, place.extents), checkpoint)
+    frozen = _replace_variables(graph, values)
     if missing:
         needed = frozen.ancestors(_roots(frozen) if roots is None else roots)
         names = [name for name in missing if name in needed]
@@ -124,7 +124,7 @@ def _place(node: Node, training: TrainingGraph, checkpoint: Values | None) -> Sa
     return None
 
 
-def _checked(node: Node, value: np.ndarray, checkpoint: Values) -> np.ndarray:
+def _fitting_value(node: Node, value: np.ndarray, checkpoint: Values) -> np.ndarray:
     """The value, if it has the variable's dtype and shape."""
     dtype, dims = node.attrs.get("dtype"), node.dims
     fits = dims is None or (
@@ -153,7 +153,7 @@ def _without_values(keys: Sequence[str], why: str, fix: str) -> NotAPolicyError:
 # ------------------------------------------------------------------ the graph with constants
 
 
-def _replaced(graph: Graph, values: dict[str, np.ndarray]) -> Graph:
+def _replace_variables(graph: Graph, values: dict[str, np.ndarray]) -> Graph:
     handles = _handles(graph, values)
     scope = NameScope(n.name for n in graph.nodes)
     nodes: list[Node] = []

@@ -22,7 +22,7 @@ import numpy as np
 
 from converters.files import tensorflow_messages as schema
 from converters.files.fetch import MAX_WEIGHTS, open_regular_file, read_bytes
-from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.crc32c import crc32c, mask_crc
 from converters.formats.checkpoint.table import read_table
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 
@@ -54,12 +54,12 @@ class Checkpoint:
             raise SourceError("cannot be read", where=self.index.name, why=error.strerror, fix=_FIX) from error
         header = self._entries.pop(b"", None)
         if header is None:
-            raise self._damaged("it has no header", "the table is not the index of a checkpoint")
+            raise self._damaged_error("it has no header", "the table is not the index of a checkpoint")
         if header[:1] == b"\x0a":
             raise version_1(self.index.name)
         self._header = self._message(schema.BundleHeaderProto, header, "header")
         if not 0 < self._header.num_shards < 100000:
-            raise self._damaged(f"its header claims {self._header.num_shards} shards")
+            raise self._damaged_error(f"its header claims {self._header.num_shards} shards")
         self._order: Literal["<", ">"] = ">" if self._header.endianness == 1 else "<"
 
     @property
@@ -104,7 +104,7 @@ class Checkpoint:
         """
         entry = self._entry(name.encode(), name)
         if name not in self._read:
-            self._read[name] = self._joined(name, entry) if entry.slices else self._tensor(name, entry)
+            self._read[name] = self._join_slices(name, entry) if entry.slices else self._tensor(name, entry)
         array = self._read[name]
         if extents is None:
             return array
@@ -118,13 +118,13 @@ class Checkpoint:
     def _shape(self, name: str, entry: Any) -> tuple[int, ...]:
         shape = tuple(int(d.size) for d in entry.shape.dim)
         if entry.shape.unknown_rank or len(shape) > _MAX_AXES or any(n < 0 for n in shape):
-            raise self._damaged(f"the shape of {name!r} is not known")
+            raise self._damaged_error(f"the shape of {name!r} is not known")
         return shape
 
     def _dtype(self, name: str, entry: Any) -> np.dtype:
         dtype = schema.dtype_of(entry.dtype)
         if dtype.kind in "SO":
-            raise self._damaged(f"{name!r} holds no numbers", f"its dtype is number {entry.dtype}")
+            raise self._damaged_error(f"{name!r} holds no numbers", f"its dtype is number {entry.dtype}")
         return dtype.newbyteorder(self._order)
 
     def _tensor(self, name: str, entry: Any) -> np.ndarray:
@@ -132,7 +132,7 @@ class Checkpoint:
         shape, dtype = self._shape(name, entry), self._dtype(name, entry)
         size = math.prod(shape) * dtype.itemsize
         if entry.size != size:
-            raise self._damaged(
+            raise self._damaged_error(
                 f"{name!r} has {entry.size} bytes", f"a {dtype.name} tensor of shape {list(shape)} has {size}"
             )
         data = self._bytes(name, entry)
@@ -154,7 +154,7 @@ class Checkpoint:
 
     def _bytes(self, name: str, entry: Any) -> bytes:
         data = self._raw(name, entry)
-        if masked(crc32c(data)) != entry.crc32c:
+        if mask_crc(crc32c(data)) != entry.crc32c:
             raise self._damaged_values(name, entry)
         return data
 
@@ -168,7 +168,7 @@ class Checkpoint:
 
     def _raw(self, name: str, entry: Any) -> bytes:
         if not 0 <= entry.shard_id < self._header.num_shards:
-            raise self._damaged(f"{name!r} lies in shard {entry.shard_id} of {self._header.num_shards}")
+            raise self._damaged_error(f"{name!r} lies in shard {entry.shard_id} of {self._header.num_shards}")
         shard = self._shard(entry.shard_id)
         if not shard.exists() and not shard.is_symlink():
             raise SourceError(
@@ -197,11 +197,11 @@ class Checkpoint:
 
     # -------------------------------------------------------------- partitioned variables
 
-    def _joined(self, name: str, entry: Any) -> np.ndarray:
+    def _join_slices(self, name: str, entry: Any) -> np.ndarray:
         """The tensor that slices make up; every element must be in one of them."""
         shape, dtype = self._shape(name, entry), self._dtype(name, entry)
         if len(entry.slices) > _MAX_SLICES:
-            raise self._damaged(f"{name!r} claims {len(entry.slices)} slices")
+            raise self._damaged_error(f"{name!r} claims {len(entry.slices)} slices")
         parts: list[tuple[tuple[slice, ...], np.ndarray]] = []
         filled = 0
         for part in entry.slices:
@@ -209,32 +209,34 @@ class Checkpoint:
             window = self._window(name, shape, extents)
             key = slice_key(name, extents)
             if key not in self._entries:
-                raise self._damaged(f"a slice of {name!r} is missing", f"it is at {_extents_text(extents)}")
+                raise self._damaged_error(f"a slice of {name!r} is missing", f"it is at {_extents_text(extents)}")
             array = self._tensor(f"{name} {_extents_text(extents)}", self._entry(key, name))
             if array.shape != tuple(w.stop - w.start for w in window) or array.dtype != dtype.newbyteorder("="):
-                raise self._damaged(f"the slice of {name!r} at {_extents_text(extents)} has another shape or dtype")
+                raise self._damaged_error(
+                    f"the slice of {name!r} at {_extents_text(extents)} has another shape or dtype"
+                )
             parts.append((window, array))
             filled += array.size
         # The parts are in memory already, so the whole is no larger than what the shards hold.
         if filled != math.prod(shape):
-            raise self._damaged(f"{name!r} has {math.prod(shape)} elements and its slices {filled}")
+            raise self._damaged_error(f"{name!r} has {math.prod(shape)} elements and its slices {filled}")
         whole = np.empty(shape, dtype.newbyteorder("="))
         seen = np.zeros(shape, np.bool_)
         for window, array in parts:
             whole[window] = array
             seen[window] = True
         if not seen.all():
-            raise self._damaged(f"the slices of {name!r} do not make up the whole")
+            raise self._damaged_error(f"the slices of {name!r} do not make up the whole")
         return whole
 
     def _window(self, name: str, shape: tuple[int, ...], extents: Extents) -> tuple[slice, ...]:
         if len(extents) != len(shape):
-            raise self._damaged(f"a slice of {name!r} has {len(extents)} axes, the tensor {len(shape)}")
+            raise self._damaged_error(f"a slice of {name!r} has {len(extents)} axes, the tensor {len(shape)}")
         window = []
         for (start, length), size in zip(extents, shape, strict=True):
             stop = start + length if length else size
             if not 0 <= start <= stop <= size or (length == 0 and start):
-                raise self._damaged(f"a slice of {name!r} reaches beyond its shape {list(shape)}")
+                raise self._damaged_error(f"a slice of {name!r} reaches beyond its shape {list(shape)}")
             window.append(slice(start, stop))
         return tuple(window)
 
@@ -246,7 +248,7 @@ class Checkpoint:
         except DamagedFileError as error:
             raise error.at(self.index.name) from error.__cause__
 
-    def _damaged(self, what: str, why: str | None = None) -> DamagedFileError:
+    def _damaged_error(self, what: str, why: str | None = None) -> DamagedFileError:
         return DamagedFileError(f"the checkpoint's index is damaged: {what}", where=self.index.name, why=why, fix=_FIX)
 
 
@@ -287,7 +289,7 @@ def slice_key(name: str, extents: Extents) -> bytes:
     """The key of a slice: 0, the name, the number of axes, and start and length of each (-1: the whole axis)."""
     key = _number(0) + _string(name.encode()) + _number(len(extents))
     for start, length in extents:
-        key += _signed(start) + _signed(length or -1)
+        key += _encode_signed(start) + _encode_signed(length or -1)
     return key
 
 
@@ -302,7 +304,7 @@ def _string(value: bytes) -> bytes:
     return value.replace(b"\xff", b"\xff\x00").replace(b"\x00", b"\x00\xff") + b"\x00\x01"
 
 
-def _signed(value: int) -> bytes:
+def _encode_signed(value: int) -> bytes:
     """A signed integer, sign-extended to the fewest bytes; their count is xored into the first as leading ones."""
     magnitude = ~value if value < 0 else value
     length = magnitude.bit_length() // 7 + 1

@@ -10,7 +10,7 @@ import numpy as np
 from converters.files import tensorflow_messages as schema
 from converters.files.chunks import Pieces
 from converters.files.wire_format import varint
-from converters.formats.checkpoint.crc32c import crc32c, masked
+from converters.formats.checkpoint.crc32c import crc32c, mask_crc
 from converters.formats.checkpoint.table import MAGIC
 
 
@@ -29,7 +29,7 @@ def checkpoint(values: Mapping[str, np.ndarray]) -> dict[str, Pieces]:
         crc = 0
         for chunk in Pieces(array).chunks():
             crc = crc32c(chunk, crc)
-        entry.crc32c = masked(crc)
+        entry.crc32c = mask_crc(crc)
         pairs.append((name.encode(), schema.serialise(entry)))
         at += array.nbytes
     return {".index": Pieces(_table(pairs)), ".data-00000-of-00001": Pieces(*arrays)}
@@ -42,7 +42,7 @@ def _table(pairs: Sequence[tuple[bytes, bytes]]) -> bytes:
     def put(content: bytes) -> bytes:
         handle = varint(len(out)) + varint(len(content))
         content += b"\0"  # not compressed
-        out.extend(content + struct.pack("<I", masked(crc32c(content))))
+        out.extend(content + struct.pack("<I", mask_crc(crc32c(content))))
         return handle
 
     data = put(_block(pairs))

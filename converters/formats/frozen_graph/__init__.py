@@ -24,7 +24,7 @@ FORMATS = (
         default=True,
         narrow=True,
         ports=_artifact.ports,
-        vetted=_artifact.vetted,
+        vetted=_artifact.safe_copy,
         inner=_artifact.inner,
         runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
     ),

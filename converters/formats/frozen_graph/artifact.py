@@ -45,7 +45,7 @@ def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     return contextlib.nullcontext(InnerTensors(own_names(n.name for n in graph.node), run))
 
 
-def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     """A copy in ``folder`` of what the nodes ``wanted`` are computed from; those that are not there are left out.
 
     Raises UnsupportedOpError where an op does more than compute, DamagedFileError, GraphError.

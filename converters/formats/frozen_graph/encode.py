@@ -66,12 +66,12 @@ def attributes(node: Node, types: Types) -> Iterator[tuple[Attr, Any]]:
     """The attributes that a GraphDef has of a node, those that follow from its inputs and outputs included."""
     for attr in op_of(node).attrs:
         if attr.derive is not None:
-            yield attr, _derived(node, attr.derive, types)
+            yield attr, _derive(node, attr.derive, types)
         elif (value := node.attrs.get(attr.name, attr.default)) is not REQUIRED:
             yield attr, value
 
 
-def _derived(node: Node, derive: str, types: Types) -> Any:
+def _derive(node: Node, derive: str, types: Types) -> Any:
     side, _, position = derive.partition(":")
     if side == "count":
         return len(node.inputs) - int(position or 0)

@@ -24,10 +24,10 @@ COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *SPELLINGS))
 
 def check(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) -> None:
     """Raise what ``subgraph`` raises."""
-    _checked(graph_def, fetches, feeds)
+    _checked_nodes(graph_def, fetches, feeds)
 
 
-def _checked(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
+def _checked_nodes(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
     """The nodes by their names, and those that are asked for."""
     nodes = {n.name: n for n in graph_def.node}
     roots = list(dict.fromkeys([*map(node_of, fetches), *(f for f in map(node_of, feeds) if f in nodes)]))
@@ -41,7 +41,7 @@ def subgraph(graph_def: Any, fetches: Iterable[str], feeds: Iterable[str] = ()) 
     Raises UnsupportedOpError that names every node upstream, behind a control input or not, whose op does anything but
     compute; GraphError where a tensor that is asked for, or an input of a node, is not there.
     """
-    nodes, roots = _checked(graph_def, fetches, feeds)
+    nodes, roots = _checked_nodes(graph_def, fetches, feeds)
     looping = any(n.op in CONTROL_FLOW for n in graph_def.node)
     kept = reachable(roots, lambda n: (node_of(i.removeprefix("^")) for i in _inputs(nodes, nodes[n], looping)))
     part = schema.GraphDef()

@@ -36,28 +36,28 @@ def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached 
     dtype = dtype_of(proto.dtype)
     shape = tuple(int(d.size) for d in proto.tensor_shape.dim[: _MAX_AXES + 1])
     if proto.tensor_shape.unknown_rank or any(n < 0 for n in shape):
-        raise _damaged("its shape is not fully known")
+        raise _damaged_error("its shape is not fully known")
     if len(shape) > _MAX_AXES or math.prod(n or 1 for n in shape) > _MAX_ELEMENTS:
-        raise _damaged(f"it claims the shape {_shown(shape)}")
+        raise _damaged_error(f"it claims the shape {_shape_text(shape)}")
     count = math.prod(shape)
     if dtype.kind == "S":
         return _strings(list(proto.string_val) or [b""], shape, count)
     if dtype.kind == "O":
-        raise _damaged("it is a resource, which has no value outside a session")
+        raise _damaged_error("it is a resource, which has no value outside a session")
     if content := proto.tensor_content:
         held = None if detached is None else detached.array(content)
         data = np.frombuffer(content, np.uint8) if held is None else held.reshape(-1).view(np.uint8)
         if data.size != count * dtype.itemsize:
-            raise _damaged(f"it holds {data.size} bytes for {count} elements of {dtype}")
+            raise _damaged_error(f"it holds {data.size} bytes for {count} elements of {dtype}")
         return data.view(dtype.newbyteorder("<")).astype(dtype, copy=False).reshape(shape)
     values = _values(proto, dtype)
     if values.size > count:
-        raise _damaged(f"it holds {values.size} values for {count} elements")
+        raise _damaged_error(f"it holds {values.size} values for {count} elements")
     if values.size < count:
         # TensorFlow's short form: the last value stands for all that are missing, zero if there is none.
         claimed = count - values.size
         if not (allowance or Allowance()).take(claimed):
-            raise _damaged(f"it claims {claimed} elements that the file does not hold")
+            raise _damaged_error(f"it claims {claimed} elements that the file does not hold")
         last = values[-1] if values.size else dtype.type(0)
         values = np.concatenate([values, np.full(count - values.size, last, dtype)])
     return values.reshape(shape)
@@ -69,22 +69,22 @@ def _values(proto: Any, dtype: np.dtype) -> np.ndarray:
             return np.fromiter(proto.half_val, np.uint16, len(proto.half_val)).view(np.float16)
         return np.array(getattr(proto, _VALUE_FIELDS[dtype.name]), dtype)
     except OverflowError as error:
-        raise _damaged(f"it holds a value that {dtype} does not have") from error
+        raise _damaged_error(f"it holds a value that {dtype} does not have") from error
 
 
 def _strings(values: list[bytes], shape: tuple[int, ...], count: int) -> np.ndarray:
     """Strings, each as wide as the longest; a list of them where there are not as many as the shape says."""
     if len(values) * max(len(v) for v in values) > _MAX_STRING_BYTES:
-        raise _damaged(f"its {len(values)} strings are too long")
+        raise _damaged_error(f"its {len(values)} strings are too long")
     array = np.array(values, np.bytes_)
     return array.reshape(shape) if count == array.size else array
 
 
-def _shown(shape: tuple[int, ...]) -> str:
+def _shape_text(shape: tuple[int, ...]) -> str:
     return f"[{', '.join(map(str, shape[:8]))}{', …' if len(shape) > 8 else ''}]"
 
 
-def _damaged(why: str) -> DamagedFileError:
+def _damaged_error(why: str) -> DamagedFileError:
     return DamagedFileError("the tensor cannot be read", why=why, fix="freeze the graph again; this file is damaged")
 
 

@@ -17,7 +17,7 @@ from signatures.errors import TooLargeError
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The ``.bytes`` artefact. Raises TooLargeError where no TensorFlow could read it."""
-    made = frozen(policy, options.contract, options.weights)
+    made = frozen_graph(policy, options.contract, options.weights)
     if not is_readable(made):
         raise TooLargeError(
             f"a .bytes of {made.size} bytes cannot be read",
@@ -28,10 +28,10 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     return {f"{policy.name}.bytes": made}
 
 
-def frozen(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
+def frozen_graph(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
     """The policy's GraphDef with its contract, made once; without one, as the numpy reference needs it."""
     made: dict[Any, Pieces] = policy.graph.made
-    key = frozen, contract, weights
+    key = frozen_graph, contract, weights
     if key not in made:
         graph = with_contract(store_compactly(policy.graph, weights), contract)
         detached = Detached.of(graph.values())

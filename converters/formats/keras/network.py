@@ -127,7 +127,7 @@ class Network(Builder):
         depth: int,
     ) -> list[str]:
         call = layer.calls[number]
-        args, kwargs = _resolved(list(call.args), results), _resolved(dict(call.kwargs), results)
+        args, kwargs = _resolve(list(call.args), results), _resolve(dict(call.kwargs), results)
         path = f"{prefix}{layer.name}"[:MAX_NAME]
         weights = arrays.get(layer.name)
         if layer.model is not None:
@@ -257,12 +257,12 @@ def _carries_state(model: LayeredModel) -> bool:
     return False
 
 
-def _resolved(value: Any, results: Results) -> Any:
+def _resolve(value: Any, results: Results) -> Any:
     """Arguments with references in place of their tensors."""
     if isinstance(value, Place):
         return results[value.layer, value.call][value.tensor]
     if isinstance(value, dict):
-        return {k: _resolved(v, results) for k, v in value.items()}
+        return {k: _resolve(v, results) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_resolved(v, results) for v in value]
+        return [_resolve(v, results) for v in value]
     return value

@@ -20,7 +20,7 @@ from converters.formats.keras.config import config_of, loss_of, no_configuration
 from converters.formats.keras.model import model_of
 from converters.formats.keras.network import Network, UnknownLayerError
 from converters.formats.keras.weights import Groups, Listed, Weights
-from converters.formats.saved_model.signature import declared, expose, exposed, output_names
+from converters.formats.saved_model.signature import declared_outputs, expose, expose_signature, output_names
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from converters.graph.nodes import Graph
 from converters.graph.ops.base import MISFIT
@@ -110,7 +110,7 @@ def build_layered(files: tuple[Path, ...], config: Any, weights: Weights, versio
     names = output_names(signature)
     facts = SourceFacts(
         roles=roles,
-        outputs=declared(signature),
+        outputs=declared_outputs(signature),
         memories=net.memories(names) or None,
         notes=tuple(net.notes),
         model_name=model.name,
@@ -160,5 +160,5 @@ def _through_keras(path: Path) -> SourceModel:
     """What TensorFlow freezes of the model that Keras builds."""
     data, signature = frozen_by_tensorflow(path)
     definition = schema.parse(schema.GraphDef, data, "TensorFlow graph")
-    graph, facts = exposed(from_graph_def(definition), signature)
+    graph, facts = expose_signature(from_graph_def(definition), signature)
     return SourceModel(graph, (path,), facts, None, OriginalRun("tensorflow", path, definition=definition))

@@ -13,7 +13,7 @@ from typing import Any
 
 from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.live.freeze import keras_call, keras_outputs, named_function, saved_function
-from converters.formats.saved_model.signature import exposed, signature_of
+from converters.formats.saved_model.signature import expose_signature, signature_of
 from converters.formats.source import OriginalRun, SourceModel
 from signatures.errors import SourceError, UsageError
 
@@ -119,6 +119,6 @@ def _read(tensorflow: Any, concrete: Callable[[], Any], folder: Path, name: str)
             "tf.saved_model.save writes it",
         ) from error
     graph = read_graph(frozen.graph_def.SerializeToString(deterministic=True))
-    graph, facts = exposed(graph, signature_of(frozen.inputs, frozen.outputs, frozen.signature))
+    graph, facts = expose_signature(graph, signature_of(frozen.inputs, frozen.outputs, frozen.signature))
     options = {"kind": "function", "form": "saved_model", "signature": frozen.signature}
     return SourceModel(graph, (), facts, name, OriginalRun("tensorflow", folder, options))

@@ -39,7 +39,7 @@ def _port(value: Any) -> Port:
     return Port(value.name, dtype_name(tensor.elem_type), dims if tensor.HasField("shape") else None)
 
 
-def held(path: Path) -> str | None:
+def embedded_contract(path: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     model = decode_model(read_bytes(path), Detached())
     return next((str(p.value) for p in model.metadata_props if p.key == EMBEDDED), None)

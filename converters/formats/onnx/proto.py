@@ -112,18 +112,18 @@ def array_of(tensor: Any, detached: Detached | None) -> np.ndarray:
     shape = tuple(int(d) for d in tensor.dims)
     count = math.prod(shape)
     if len(shape) > _MAX_AXES or any(d < 0 for d in shape) or math.prod(d or 1 for d in shape) > _MAX_ELEMENTS:
-        raise _damaged(name, f"its shape is {list(shape[:8])}")
+        raise _damaged_error(name, f"its shape is {list(shape[:8])}")
     array: np.ndarray
     if tensor.HasField("raw_data"):
         size = count * dtype.itemsize
         data = raw_of(tensor, detached)
         if data.size != size:
-            raise _damaged(name, f"it holds {data.size} bytes where its shape needs {size}")
+            raise _damaged_error(name, f"it holds {data.size} bytes where its shape needs {size}")
         array = data.view(dtype.newbyteorder("<")).astype(dtype, copy=False)
     else:
         values = getattr(tensor, field)
         if len(values) != count:
-            raise _damaged(name, f"it holds {len(values)} values where its shape needs {count}")
+            raise _damaged_error(name, f"it holds {len(values)} values where its shape needs {count}")
         # Of whole numbers no object is kept each: those of int32_data are counted by their bytes (counting).
         array = (np.fromiter(values, np.int64, count) if field == "int32_data" else np.array(values)).astype(dtype)
     array = array.reshape(shape)
@@ -145,7 +145,7 @@ def dtype_name(kind: int) -> str | None:
     return _STORED[kind][0].name if kind in _STORED else None
 
 
-def _damaged(name: str, why: str) -> DamagedFileError:
+def _damaged_error(name: str, why: str) -> DamagedFileError:
     return DamagedFileError(
         f"the tensor {name!r} cannot be read", why=why, fix="export the model again; this file is damaged"
     )
@@ -231,9 +231,11 @@ def load_external(
         if tensor.data_location == _EXTERNAL:
             total += _bring(tensor, folder, files, detached, read)
             if total > MAX_WEIGHTS:
-                raise _damaged(tensor.name, f"the model's weights together are larger than {MAX_WEIGHTS >> 30} GiB")
+                raise _damaged_error(
+                    tensor.name, f"the model's weights together are larger than {MAX_WEIGHTS >> 30} GiB"
+                )
             if total > _MAX_TIMES * sum(map(len, files.values())):
-                raise _damaged(tensor.name, "the same bytes of a file are named again and again as weights")
+                raise _damaged_error(tensor.name, "the same bytes of a file are named again and again as weights")
     return sorted(files)
 
 
@@ -249,16 +251,18 @@ def _bring(
     if path not in files:
         left = MAX_WEIGHTS - sum(map(len, files.values()))
         if path.stat().st_size >= left:
-            raise _damaged(tensor.name, f"the files beside the model are {MAX_WEIGHTS >> 30} GiB or more together")
+            raise _damaged_error(
+                tensor.name, f"the files beside the model are {MAX_WEIGHTS >> 30} GiB or more together"
+            )
         files[path] = read(path, most=left)
     data = files[path]
     try:
         offset = int(entries.get("offset") or 0)
         length = int(entries.get("length") or len(data) - offset)
     except ValueError as error:
-        raise _damaged(tensor.name, f"it says to lie at {entries}") from error
+        raise _damaged_error(tensor.name, f"it says to lie at {entries}") from error
     if offset < 0 or length < 0 or offset + length > len(data):
-        raise _damaged(tensor.name, f"{path.name} has {len(data)} bytes, it wants {length} from {offset} on")
+        raise _damaged_error(tensor.name, f"{path.name} has {len(data)} bytes, it wants {length} from {offset} on")
     if detached is None or length < LARGE:
         tensor.raw_data = bytes(data[offset : offset + length])
     else:

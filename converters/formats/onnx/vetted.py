@@ -43,7 +43,7 @@ COMPUTING = frozenset(_COMPUTING.split())
 _LAYOUTS = frozenset(("com.microsoft.nchwc", "com.ms.internal.nhwc"))
 
 
-def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     """A copy in ``folder`` of the model in the file ``path``, with all its weights in it.
 
     Raises UnsupportedOpError where an op is not known to compute and do no more, DamagedFileError where weights lie

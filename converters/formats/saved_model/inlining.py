@@ -99,9 +99,9 @@ class _Flattening:
         for node in self.result.node:
             for i, reference in enumerate(node.input):
                 if not reference.startswith("^"):
-                    node.input[i] = self._resolved(reference)
+                    node.input[i] = self._resolve(reference)
         outer = {r: tensor(r) for r in [*self.aliases, *map(normal_ref, roots), *placed]}
-        return Flat(self.result, {r: self._resolved(t) for r, t in outer.items()})
+        return Flat(self.result, {r: self._resolve(t) for r, t in outer.items()})
 
     def _calls(self, node: Any) -> bool:
         return node.op in CALLING or node.op in self.functions
@@ -117,12 +117,12 @@ class _Flattening:
                 )
             raise unsupported_error(Node(n.name, n.op) for n in refused)
 
-    def _resolved(self, reference: str) -> str:
+    def _resolve(self, reference: str) -> str:
         """The tensor behind the results of calls, which is noted for all that were passed on the way."""
         passed: dict[str, None] = {}
         while reference in self.aliases:
             if reference in passed:
-                raise _damaged(f"the call's result {reference!r} is made of itself")
+                raise _damaged_error(f"the call's result {reference!r} is made of itself")
             passed[reference] = None
             reference = self.aliases[reference]
         self.aliases.update(dict.fromkeys(passed, reference))
@@ -180,10 +180,10 @@ class _Flattening:
         passed = len(function.arguments) + len(function.results)
         self._count(_PASSED * passed + len(prefix) * len(function.nodes) + function.letters)
         if depth >= _MAX_DEPTH:
-            raise _damaged(f"the function {called!r} is called {depth} functions deep, or calls itself")
+            raise _damaged_error(f"the function {called!r} is called {depth} functions deep, or calls itself")
         if len(arguments) != len(function.arguments):
             taken = len(function.arguments)
-            raise _damaged(f"the function {called!r} takes {taken} tensors and is given {len(arguments)}")
+            raise _damaged_error(f"the function {called!r} takes {taken} tensors and is given {len(arguments)}")
         given = dict(zip(function.arguments, arguments, strict=True))
         placed = {n.name: self.scope.fresh(f"{prefix}/{n.name}" if prefix else n.name) for n in function.nodes}
 
@@ -192,7 +192,7 @@ class _Flattening:
             if name in given:
                 return str(given[name])
             if name not in placed:
-                raise _damaged(f"a node of the function {called!r} reads {reference!r}, which is not there")
+                raise _damaged_error(f"a node of the function {called!r} reads {reference!r}, which is not there")
             result, _, position = rest.rpartition(":")
             return ref(placed[name], _index(function.own[name].op, result, position))
 
@@ -202,14 +202,14 @@ class _Flattening:
         results = []
         for result in function.results:
             if result not in function.made_of:
-                raise _damaged(f"the function {called!r} does not say what its result {result!r} is")
+                raise _damaged_error(f"the function {called!r} does not say what its result {result!r} is")
             results.append(tensor(function.made_of[result]))
         return results
 
     def _function(self, called: str) -> _Function:
         if called not in self.known:
             if called not in self.functions:
-                raise _damaged(f"the function {called!r} is called and is not there")
+                raise _damaged_error(f"the function {called!r} is called and is not there")
             function = _Function(self.functions[called])
             self._check(function.nodes)
             self.known[called] = function
@@ -220,7 +220,7 @@ class _Flattening:
         base = name.removeprefix("\0")
         types = list(node.attr["T"].list.type)
         if len(types) != len(inputs) or not inputs:
-            raise _damaged(f"the loop {node.name!r} says {len(types)} types for {len(inputs)} variables")
+            raise _damaged_error(f"the loop {node.name!r} says {len(types)} types for {len(inputs)} variables")
 
         merges = []
         for source, dtype in zip(inputs, types, strict=True):
@@ -242,7 +242,7 @@ class _Flattening:
             self._add(made)
         carried = self._body(node.attr["body"].func.name, f"{base}/body", [t.name for t in turns], turns[0].name, depth)
         if len(carried) != len(inputs):
-            raise _damaged(f"the body of the loop {node.name!r} gives {len(carried)} of {len(inputs)} variables")
+            raise _damaged_error(f"the body of the loop {node.name!r} gives {len(carried)} of {len(inputs)} variables")
         for index, (merge, switch, result, dtype) in enumerate(zip(merges, switches, carried, types, strict=True)):
             following = self._part(base, "NextIteration", result, T=dtype)
             merge.input.append(following.name)
@@ -256,7 +256,7 @@ class _Flattening:
         base = name.removeprefix("\0")
         types = [node.attr["Tcond"].type, *node.attr["Tin"].list.type]
         if len(types) != len(inputs) or types[0] != _BOOL:
-            raise _damaged(f"the branch {node.name!r} takes no bool, or other inputs than it says")
+            raise _damaged_error(f"the branch {node.name!r} takes no bool, or other inputs than it says")
         switches = [self._part(base, "Switch", s, inputs[0], T=t) for s, t in zip(inputs, types, strict=True)]
         for made in switches:
             self._add(made)
@@ -270,7 +270,7 @@ class _Flattening:
             sides.append(self._body(node.attr[key].func.name, f"{base}/{key}", given, pivot.name, depth))
         results = list(node.attr["Tout"].list.type)
         if not len(sides[0]) == len(sides[1]) == len(results):
-            raise _damaged(f"the two sides of the branch {node.name!r} give different numbers of results")
+            raise _damaged_error(f"the two sides of the branch {node.name!r} give different numbers of results")
         for index, (no, yes, dtype) in enumerate(zip(*sides, results, strict=True)):
             made = self._part(base, "Merge", no, yes, T=dtype)
             made.attr["N"].i = 2
@@ -284,7 +284,7 @@ class _Flattening:
     def _one(self, called: str, prefix: str, arguments: Sequence[str], pivot: str, depth: int) -> str:
         results = self._body(called, prefix, arguments, pivot, depth)
         if len(results) != 1:
-            raise _damaged(f"the function {called!r} has {len(results)} results where a loop wants one")
+            raise _damaged_error(f"the function {called!r} has {len(results)} results where a loop wants one")
         return results[0]
 
 
@@ -303,12 +303,12 @@ def _upstream(nodes: Mapping[str, Any], roots: Iterable[str], given: Collection[
         if name in given:
             return ()
         if name not in nodes:
-            raise _damaged(f"{name!r} is read and is not in the graph")
+            raise _damaged_error(f"{name!r} is read and is not in the graph")
         return (i.removeprefix("^").partition(":")[0] for i in nodes[name].input)
 
     seen = reachable((r.removeprefix("^").partition(":")[0] for r in roots), inputs)
     return [n for n in nodes.values() if n.name in seen and n.name not in given]
 
 
-def _damaged(what: str) -> DamagedFileError:
+def _damaged_error(what: str) -> DamagedFileError:
     return DamagedFileError(what, why="the SavedModel's functions do not fit together", fix="save the model again")

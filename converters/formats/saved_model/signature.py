@@ -189,7 +189,7 @@ def _several_actions(signature: ModelSignature, scope: NameScope) -> list[Node]:
     return nodes
 
 
-def declared(signature: ModelSignature) -> dict[str, Role | None]:
+def declared_outputs(signature: ModelSignature) -> dict[str, Role | None]:
     """The outputs that a signature declares, as they are called once exposed, with the roles that their names say."""
     names, joined = output_names(signature), _actions(signature)
     parts = {names[key] for keys in joined.values() if len(keys) > 1 for key in keys}
@@ -197,12 +197,14 @@ def declared(signature: ModelSignature) -> dict[str, Role | None]:
     return {name: OUTPUT_NAMES.get(name.rpartition("/")[2]) for name in exposed}
 
 
-def exposed(graph: Graph, signature: ModelSignature, notes: Sequence[str] = ()) -> tuple[Graph, SourceFacts]:
+def expose_signature(graph: Graph, signature: ModelSignature, notes: Sequence[str] = ()) -> tuple[Graph, SourceFacts]:
     """The graph with its outputs under telling names, and what its signature says of it. Raises DamagedFileError."""
     graph, roles = expose(graph, signature)
     memories = memories_of(signature, roles)
     said = (f"{action} is {', '.join(keys)}, in this order" for action, keys in _actions(signature).items())
-    return graph, SourceFacts(roles=roles, outputs=declared(signature), memories=memories, notes=(*notes, *said))
+    return graph, SourceFacts(
+        roles=roles, outputs=declared_outputs(signature), memories=memories, notes=(*notes, *said)
+    )
 
 
 def memories_of(signature: ModelSignature, roles: Mapping[str, Role]) -> tuple[SeparateMemory, ...]:

@@ -18,7 +18,7 @@ from converters.formats.frozen_graph.source import read as read_frozen
 from converters.formats.saved_model.inlining import flat
 from converters.formats.saved_model.lengths import without_counted
 from converters.formats.saved_model.reader import Saved, read_saved_model
-from converters.formats.saved_model.signature import ModelSignature, exposed, fed_by_signature
+from converters.formats.saved_model.signature import ModelSignature, expose_signature, fed_by_signature
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from converters.graph.nodes import Graph, node_of
 from signatures.errors import NotAPolicyError
@@ -43,12 +43,12 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     graph, contract = recalled(frozen.graph)
     facts = facts_of(graph, contract)
     if contract is None:
-        graph, facts = exposed(frozen.graph, frozen.signature, _notes(saved))
+        graph, facts = expose_signature(frozen.graph, frozen.signature, _notes(saved))
     original = OriginalRun("tensorflow", folder, definition=frozen.definition, detached=saved.detached)
     return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
 
 
-def held(folder: Path) -> str | None:
+def embedded_contract(folder: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     saved = read_saved_model(read_bytes(folder / FILE))
     return embedded(from_graph_def(saved.graph_def, saved.detached))
@@ -77,7 +77,7 @@ def frozen_model(saved: Saved, checkpoint: Checkpoint | None) -> FrozenModel:
     """What a signature computes, flat and frozen. Raises NotAPolicyError, DamagedFileError, GraphError."""
     detached = saved.detached
     training, signature = (
-        _inlined(saved) if saved.calls else (training_graph(saved.graph_def, detached), saved.signature)
+        _inline_signature(saved) if saved.calls else (training_graph(saved.graph_def, detached), saved.signature)
     )
     if checkpoint is not None and saved.calls:
         named = {name: Place(key) for name, key in checkpoint.by_variable().items()}
@@ -87,7 +87,7 @@ def frozen_model(saved: Saved, checkpoint: Checkpoint | None) -> FrozenModel:
     return FrozenModel(frozen.graph, definition, signature, () if checkpoint is None else checkpoint.files)
 
 
-def _inlined(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
+def _inline_signature(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
     """The graph that the signature's functions are, and the signature on it; its inputs are called as their keys.
 
     Which tensor of ``variables/`` is a variable's value is said by the function that restores them.

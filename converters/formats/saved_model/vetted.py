@@ -22,7 +22,7 @@ from converters.formats.saved_model.variables import files_of
 from converters.formats.saved_model.writer import METHOD
 
 
-def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     """A copy in ``folder`` of a SavedModel's folder with the signatures ``wanted``, as far as it has them.
 
     Raises UnsupportedOpError where an op does more than compute, NotAPolicyError, DamagedFileError, GraphError.
@@ -43,7 +43,7 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
         # The functions of two signatures may have nodes of the same names.
         prefix = f"{key}/" if any(placed.get(n.name, n) != n for n in part.node) else ""
         meta.graph_def.versions.CopyFrom(part.versions)
-        for node in _moved(part, prefix):
+        for node in _prefix_nodes(part, prefix):
             if node.name not in placed:
                 placed[node.name] = node
                 meta.graph_def.node.append(node)
@@ -60,7 +60,7 @@ def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     return copy
 
 
-def _moved(part: Any, prefix: str) -> list[Any]:
+def _prefix_nodes(part: Any, prefix: str) -> list[Any]:
     """The nodes of a graph under names with ``prefix`` before them."""
     nodes = []
     for node in part.node:

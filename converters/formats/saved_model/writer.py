@@ -18,7 +18,7 @@ from converters.files.external_data import Detached, is_readable
 from converters.formats.bundle.embed import with_contract
 from converters.formats.format import WriteOptions
 from converters.formats.frozen_graph.encode import encode
-from converters.formats.frozen_graph.writer import frozen
+from converters.formats.frozen_graph.writer import frozen_graph
 from converters.formats.saved_model.variables import files_of
 from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
@@ -63,7 +63,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The SavedModel artefact. Its graph is that of the ``.bytes``, put between the other fields as it was serialised;
     protobuf is given it again where the weights become variables.
     """
-    graph = frozen(policy, options.contract, options.weights)
+    graph = frozen_graph(policy, options.contract, options.weights)
     about, signed = schema.MetaGraphDef(), schema.MetaGraphDef()
     about.meta_info_def.tags.append("serve")
     for key, (inputs, outputs) in signatures_of(policy).items():

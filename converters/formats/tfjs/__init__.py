@@ -26,9 +26,9 @@ FORMATS = (
         main="tfjs",
         default=True,
         narrow=True,
-        held=_reader.held,
+        held=_reader.embedded_contract,
         ports=_artifact.ports,
-        vetted=_artifact.vetted,
+        vetted=_artifact.safe_copy,
         inner=_artifact.inner,
         runtimes=(
             *("tfjs-cpu", "tfjs-wasm", "tfjs-webgl"),

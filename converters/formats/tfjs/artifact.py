@@ -58,7 +58,7 @@ _GRAPH = ("node", "versions", "library")
 _FIX = "convert the model again with the official converter, the policy's outputs only"
 
 
-def vetted(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:
     """A copy in ``folder`` of the model in the folder ``path``.
 
     Raises UnsupportedOpError where an op does more than compute, SourceError where weights lie elsewhere,

@@ -66,9 +66,9 @@ def content_of(given: Fetched) -> dict[str, Any]:
     try:
         model = json_in(given.bytes_of(model_file(given.path)))
     except (ValueError, RecursionError) as error:
-        raise _damaged("model.json is not JSON", str(error)[:200]) from error
+        raise _damaged_error("model.json is not JSON", str(error)[:200]) from error
     if not isinstance(model, dict) or not isinstance(model.get("modelTopology"), dict):
-        raise _damaged("model.json has no modelTopology")
+        raise _damaged_error("model.json has no modelTopology")
     nodes = model["modelTopology"].get("node")
     schema.check_nodes(len(nodes) if isinstance(nodes, list) else 0)
     return model
@@ -93,17 +93,21 @@ def read_model(given: Fetched) -> WebModel:
         signature = _signature(model.get("signature") or extra.get("signature") or {})
         return WebModel(graph, signature, (path, *shards), extra.get("contract"))
     except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, binascii.Error) as error:
-        raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
+        raise _damaged_error(
+            "model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]
+        ) from error
 
 
-def held(path: Path) -> Any:
+def embedded_contract(path: Path) -> Any:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     try:
         return (json_in(read_bytes(path / MODEL if path.is_dir() else path)).get("userDefinedMetadata") or {}).get(
             "contract"
         )
     except (AttributeError, ArithmeticError, ValueError, RecursionError) as error:
-        raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
+        raise _damaged_error(
+            "model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]
+        ) from error
 
 
 def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
@@ -114,7 +118,9 @@ def read_signature(path: Path) -> tuple[ModelSignature, dict[str, str]]:
         nodes = {str(n["name"]): str(n["op"]) for n in model["modelTopology"]["node"]}
         return _signature(signature), nodes
     except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise _damaged("model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]) from error
+        raise _damaged_error(
+            "model.json is not in TensorFlow.js's form", f"{type(error).__name__}: {error}"[:200]
+        ) from error
 
 
 def _refuse_functions(topology: Mapping[str, Any]) -> None:
@@ -136,7 +142,9 @@ def weights_of(model: Mapping[str, Any], given: Fetched) -> tuple[dict[str, np.n
     try:
         return _weights(model.get("weightsManifest") or [], given, model_file(given.path).parent)
     except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError) as error:
-        raise _damaged(f"{MODEL}: its weightsManifest is none", f"{type(error).__name__}: {error}"[:200]) from error
+        raise _damaged_error(
+            f"{MODEL}: its weightsManifest is none", f"{type(error).__name__}: {error}"[:200]
+        ) from error
 
 
 def _weights(
@@ -151,21 +159,21 @@ def _weights(
             paths.append(shard(folder, name))
             place = paths[-1].resolve()
             if place in known:  # a file that is named again and again would be any amount of memory
-                raise _damaged(f"the weights {name[:120]!r} are named twice")
+                raise _damaged_error(f"the weights {name[:120]!r} are named twice")
             known.add(place)
         files.extend(paths)
         data = b"".join(_bytes(given, p) for p in paths)
         at = 0
         for entry in group["weights"]:
-            stored, shape = _stored(entry)
+            stored, shape = _stored_type(entry)
             size = math.prod(shape) * stored.itemsize
             if size > len(data) - at:
-                raise _damaged(f"the weight {entry['name']!r} lies beyond the end of its files")
+                raise _damaged_error(f"the weight {entry['name']!r} lies beyond the end of its files")
             raw = np.frombuffer(data, stored.newbyteorder("<"), math.prod(shape), at)
-            found[entry["name"]] = _restored(raw.astype(stored), entry).reshape(shape)
+            found[entry["name"]] = _dequantise(raw.astype(stored), entry).reshape(shape)
             at += size
         if at != len(data):
-            raise _damaged(
+            raise _damaged_error(
                 f"{len(data) - at} bytes are left over after the last weight", f"in {', '.join(p.name for p in paths)}"
             )
     return found, files
@@ -192,7 +200,7 @@ def _bytes(given: Fetched, path: Path) -> bytes:
         raise SourceError("cannot be read", where=path.name, why=error.why or error.what, fix=_FIX) from error
 
 
-def _stored(entry: Mapping[str, Any]) -> tuple[np.dtype, tuple[int, ...]]:
+def _stored_type(entry: Mapping[str, Any]) -> tuple[np.dtype, tuple[int, ...]]:
     """(dtype in the shard, shape) of a weight."""
     quantised = entry.get("quantization") or {}
     name = quantised.get("dtype", entry["dtype"])
@@ -202,11 +210,11 @@ def _stored(entry: Mapping[str, Any]) -> tuple[np.dtype, tuple[int, ...]]:
             f"the weight {entry['name']!r} has dtype {name}", where=MODEL, fix="convert the model again, in float32"
         )
     if len(shape) > _MAX_AXES or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise _damaged(f"the weight {entry['name']!r} has the shape {str(entry['shape'])[:80]}")
+        raise _damaged_error(f"the weight {entry['name']!r} has the shape {str(entry['shape'])[:80]}")
     return _DTYPES[name], shape
 
 
-def _restored(stored: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+def _dequantise(stored: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
     """A weight in its own dtype."""
     dtype = _DTYPES[entry["dtype"]]
     quantised = entry.get("quantization")
@@ -224,18 +232,18 @@ def _node(entry: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Node:
     attrs = {key: _attribute(value) for key, value in (entry.get("attr") or {}).items() if not key.startswith("_")}
     if op == "Const":
         if name not in weights:
-            raise _damaged(f"the constant {name!r} has no values", "weightsManifest does not name it")
-        return Node(name, op, value=_shaped(weights[name], entry), origin=f"{name}:0")
+            raise _damaged_error(f"the constant {name!r} has no values", "weightsManifest does not name it")
+        return Node(name, op, value=_reshape_constant(weights[name], entry), origin=f"{name}:0")
     inputs = tuple(normal_ref(i) for i in entry.get("input") or () if not i.startswith("^"))
     node = Node(name, op, inputs, attrs, origin=f"{name}:0")
     if is_fed(node):
         attrs.setdefault("shape", TensorShape(None))
         if not isinstance(attrs.get("dtype"), np.dtype) or not isinstance(attrs["shape"], TensorShape):
-            raise _damaged(f"the placeholder {name!r} does not say its dtype or shape")
+            raise _damaged_error(f"the placeholder {name!r} does not say its dtype or shape")
     return node
 
 
-def _shaped(value: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+def _reshape_constant(value: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
     """A constant in the shape that the graph says; the manifest may have a scalar as a vector of one."""
     tensor = ((entry.get("attr") or {}).get("value") or {}).get("tensor")
     dims = _shape(tensor.get("tensorShape") or {}).dims if tensor else None
@@ -261,7 +269,7 @@ def _attribute(value: Mapping[str, Any]) -> Any:
 def _dtype(value: Any) -> np.dtype:
     number = value if isinstance(value, int) else schema.BY_NAME.get(value)
     if number is None:
-        raise _damaged(f"the dtype {value!r} is not known")
+        raise _damaged_error(f"the dtype {value!r} is not known")
     return schema.dtype_of(number)
 
 
@@ -293,5 +301,5 @@ def _signature(value: Mapping[str, Any]) -> ModelSignature:
     return ModelSignature(inputs, outputs)
 
 
-def _damaged(what: str, why: str | None = None) -> DamagedFileError:
+def _damaged_error(what: str, why: str | None = None) -> DamagedFileError:
     return DamagedFileError(what, why=why, fix=_FIX)

@@ -11,7 +11,7 @@ import numpy as np
 from converters.compiler.passes.int8_products import join_products
 from converters.files.fetch import Fetched
 from converters.formats.bundle.embed import contract_of, facts_of, redrawn
-from converters.formats.saved_model.signature import exposed
+from converters.formats.saved_model.signature import expose_signature
 from converters.formats.source import ReadOptions, SourceModel
 from converters.formats.tfjs.reader import content_of, model_file, read_model, weights_of
 from converters.formats.tfjs.unfuse import unfuse
@@ -23,18 +23,18 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The model's signature as a policy; one that this tool wrote is what its contract says."""
     content = content_of(given)
     if "node" not in content["modelTopology"]:
-        return [_layered(content, given)]
+        return [_read_layers_model(content, given)]
     model = read_model(given)
     graph = unfuse(model.graph)
     if model.contract is None:
-        graph, facts = exposed(graph, model.signature)
+        graph, facts = expose_signature(graph, model.signature)
         return [SourceModel(graph, model.files, facts)]
     contract = contract_of(model.contract)
-    graph = _retyped(redrawn(join_products(graph), contract), contract)
+    graph = _cast_to_contract(redrawn(join_products(graph), contract), contract)
     return [SourceModel(graph, model.files, facts_of(graph, contract), contract.name)]
 
 
-def _layered(content: Mapping[str, Any], given: Fetched) -> SourceModel:
+def _read_layers_model(content: Mapping[str, Any], given: Fetched) -> SourceModel:
     """A layers model: Keras' layers, and weights under their names."""
     from converters.formats.keras.source import of_web_model
     from converters.formats.keras.weights import Listed
@@ -48,7 +48,7 @@ def _layered(content: Mapping[str, Any], given: Fetched) -> SourceModel:
 _NARROW = ("float32", "int32", "bool")
 
 
-def _retyped(graph: Graph, contract: Contract) -> Graph:
+def _cast_to_contract(graph: Graph, contract: Contract) -> Graph:
     """The graph with inputs and outputs in the dtypes of the contract, for a format that has not all of them.
 
     TensorFlow.js has no int64: what was narrowed to int32 is cast, behind an input and before an output.

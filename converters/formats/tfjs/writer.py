@@ -53,7 +53,7 @@ _NARROW = {
 _LOWEST = -128
 
 
-def _narrowed(node: Node) -> np.ndarray:
+def _narrow(node: Node) -> np.ndarray:
     value = node.value
     assert value is not None
     target = _NARROW.get(value.dtype, value.dtype)
@@ -140,7 +140,7 @@ def _weights(graph: Graph, storage: Storage) -> tuple[list[dict[str, Any]], list
     for node in graph.nodes:
         if node.op != "Const":
             continue
-        value = _narrowed(node)
+        value = _narrow(node)
         entry: dict[str, Any] = {"name": node.name, "shape": list(value.shape), "dtype": value.dtype.name}
         if storage == "float16" and (half := compact(value, storage)) is not None:
             value, entry["quantization"] = half[0], {"dtype": "float16"}
