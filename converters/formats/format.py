@@ -40,7 +40,7 @@ class _Deferred:
         return lambda *given: getattr(importlib.import_module(self._module), function)(*given)
 
 
-def deferred(room: str, *modules: str) -> list[Any]:
+def defer_imports(room: str, *modules: str) -> list[Any]:
     """Modules of a room, for what its ``Format`` is made of; the type checker is given them as they are."""
     return [_Deferred(f"{room}.{module}") for module in modules]
 

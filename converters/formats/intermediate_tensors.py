@@ -30,7 +30,7 @@ class View:
     name: str
     axes: tuple[int, ...] | None = None
 
-    def restored(self, array: np.ndarray) -> np.ndarray:
+    def restore(self, array: np.ndarray) -> np.ndarray:
         """The tensor as the graph has it."""
         if self.axes is None or array.ndim != len(self.axes):
             return array
@@ -50,7 +50,7 @@ class InnerTensors:
         """Tensors of the graph by name, its own axes; raises RunFailedError."""
         views = {tensor: view for tensor in tensors if (view := self.view(tensor)) is not None}
         values = self.run(feeds, list(dict.fromkeys(v.name for v in views.values()))) if views else {}
-        return {tensor: view.restored(values[view.name]) for tensor, view in views.items()}
+        return {tensor: view.restore(values[view.name]) for tensor, view in views.items()}
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Loaded:
     signature: str = ""
 
 
-def hidden(loaded: Loaded) -> contextlib.AbstractContextManager[InnerTensors]:
+def no_tensors(loaded: Loaded) -> contextlib.AbstractContextManager[InnerTensors]:
     """No tensor can be had."""
     return contextlib.nullcontext(InnerTensors(lambda tensor: None, loaded.run))
 

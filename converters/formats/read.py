@@ -11,7 +11,7 @@ from converters.files.fetch import Fetched
 from converters.formats.bundle import BUNDLE
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.format import Format, Member, Ports
-from converters.formats.recognise import not_readable, recognised
+from converters.formats.recognise import not_readable, recognise_path
 from converters.formats.registry import FORMATS
 from converters.formats.source import ReadOptions, SourceModel
 from signatures.contract import POLICY
@@ -28,10 +28,10 @@ _TAKEN = (
 )
 
 
-def fetched(path: Path) -> tuple[Fetched, Format]:
+def fetch(path: Path) -> tuple[Fetched, Format]:
     """What lies at ``path``, recognised and not read yet. Raises SourceError, NotAPolicyError, DamagedFileError."""
     given = Fetched(path)
-    found = recognised(given)
+    found = recognise_path(given)
     if not found.readable and found is not BUNDLE:
         raise not_readable(found, path, given.data)
     return given, found
@@ -112,17 +112,17 @@ def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[So
     """The models of one source inside of another; errors name it relative to the folder."""
     where = member.path.relative_to(folder.path)
     given = folder.inside(member.path)
-    found = recognised(given)
+    found = recognise_path(given)
     if found.read is None:
         raise not_readable(found, where, given.data)
     try:
         models = found.read(given, options)
     except ExportModelError as error:
         raise (error.at(str(where)) if member.path.is_file() else error) from error.__cause__
-    return [_named(model, member) for model in models]
+    return [_name_member(model, member) for model in models]
 
 
-def _named(model: SourceModel, member: Member) -> SourceModel:
+def _name_member(model: SourceModel, member: Member) -> SourceModel:
     facts = replace(model.facts, notes=(*model.facts.notes, *member.notes))
     name = model.name if member.name is None else member.name
     return replace(model, name=name, facts=facts, files=(*member.files, *model.files))
@@ -133,7 +133,7 @@ def ports_of(path: Path) -> list[tuple[Format, Ports]]:
 
     Raises SourceError where no runtime loads the format by itself, DamagedFileError, NotAPolicyError, BundleError.
     """
-    found = recognised(Fetched(path))
+    found = recognise_path(Fetched(path))
     if found is BUNDLE:
         bundle = Bundle.open(path)
         artefacts = [(f, _ports(f, bundle.path(f))) for f in FORMATS if f.ports is not None and bundle.has(f)]

@@ -19,7 +19,7 @@ _UNPACK = "unpack it and give the model inside"
 _NOT_A_MODEL = "give a model file"
 
 
-def _marked(at: int, marks: Sequence[bytes], file: Content) -> bool:
+def _has_mark(at: int, marks: Sequence[bytes], file: Content) -> bool:
     return any(file.head[at : at + len(mark)] == mark for mark in marks)
 
 
@@ -71,7 +71,7 @@ REFUSED = (
             key=key,
             label=label,
             advice=advice,
-            sniff=partial(_marked, at, marks),
+            sniff=partial(_has_mark, at, marks),
         )
         for key, label, advice, at, *marks in _OTHERS
     ),
@@ -117,7 +117,7 @@ def recognise(data: bytes, name: str = "") -> Format:
     return next((f for f in (*FORMATS, *REFUSED) if f.sniff is not None and f.sniff(content)), UNKNOWN)
 
 
-def recognised(given: Fetched) -> Format:
+def recognise_path(given: Fetched) -> Format:
     """The format of a file (by content) or a folder (by what lies in it). Raises SourceError, DamagedFileError.
 
     A checkpoint's prefix (``model-1000.cptk``) is no file; it is recognised by its index.

@@ -30,7 +30,7 @@ WRITTEN = {f.key: f for f in FORMATS if f.write is not None}
 DEFAULTS = tuple(f.key for f in WRITTEN.values() if f.default)
 
 
-def written(key: str) -> Format:
+def format_for_writing(key: str) -> Format:
     """The format of a word of ``--to``. Raises UsageError."""
     if key not in WRITTEN:
         raise UsageError(

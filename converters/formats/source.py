@@ -35,7 +35,7 @@ class OriginalRun:
     #: the tensors that are asked for, and those that are fed: no more of the definition is run (None: all of it)
     asked: tuple[Collection[str], Collection[str]] | None = None
 
-    def narrowed(self, source_map: SourceMap) -> OriginalRun:
+    def narrow(self, source_map: SourceMap) -> OriginalRun:
         """The same with no more of the definition than a policy asks for, which is held against what may be run.
 
         Raises UnsupportedOpError where an op that does more than compute hangs on it, GraphError where it is not whole.

@@ -247,7 +247,7 @@ def _original_of(found: Source, contract: Contract) -> OriginalRun | None:
     named = [m for m in found.models if m.name is not None and printable(m.name) == contract.origin.model]
     original = (named or list(found.models))[0].original
     with naming(found.path):
-        return None if original is None else original.narrowed(contract.source)
+        return None if original is None else original.narrow(contract.source)
 
 
 def _check_meaning(found: Source, contract: Contract, folder: Path) -> None:

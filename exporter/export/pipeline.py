@@ -13,7 +13,7 @@ from converters.files.fetch import path_text
 from converters.files.folders import scratch_folder
 from converters.formats.bundle import bundle
 from converters.formats.format import Artifact, Format
-from converters.formats.registry import DEFAULTS, WRITTEN, written
+from converters.formats.registry import DEFAULTS, WRITTEN, format_for_writing
 from converters.policy.policy import Policy
 from exporter.export.job import (
     Job,
@@ -202,7 +202,7 @@ class Exporter:
         whole_sizes = sizes_unrounded(job, [a.format for a in artifacts], options)
         with (
             landing(options.out) as (out, put),
-            bundle.staged(out / policy.name, contract, artifacts) as stage,
+            bundle.stage_bundle(out / policy.name, contract, artifacts) as stage,
             scratch_folder() if self.runtimes else nullcontext(Path()) as folder,
         ):
             report = None
@@ -319,9 +319,9 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     usual = DEFAULTS if wanted is None else wanted.formats[:1]
     targets = usual if options.targets is None else tuple(dict.fromkeys(options.targets))
     if wanted is None:
-        return [written(target) for target in targets]
+        return [format_for_writing(target) for target in targets]
     for target in targets:
-        if written(target).key not in wanted.formats:
+        if format_for_writing(target).key not in wanted.formats:
             raise UsageError(
                 f"--to {target} does not go with --for {wanted.name}",
                 why=f"{wanted.purpose}: it loads {', '.join(wanted.formats)}",
@@ -343,7 +343,7 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
                 why=f"the consumer decides the {decided}",
                 fix=f"leave {flag} out",
             )
-    return [written(target) for target in targets]
+    return [format_for_writing(target) for target in targets]
 
 
 def join_reports(

@@ -10,7 +10,7 @@ from pathlib import Path
 from converters.compiler.compile import compile_graph, explanations
 from converters.compiler.options import CompileOptions
 from converters.formats.format import Format
-from converters.formats.read import check_options, each_or_refused, fetched, read_models
+from converters.formats.read import check_options, each_or_refused, fetch, read_models
 from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.policy import Policy
 from converters.policy.rules import Decision
@@ -72,7 +72,7 @@ def narrow_original(model: SourceModel, policy: Policy) -> SourceModel:
     """The model with no more of its original than a policy asks for. Raises UnsupportedOpError, GraphError."""
     if model.original is None:
         return model
-    return replace(model, original=model.original.narrowed(policy.source))
+    return replace(model, original=model.original.narrow(policy.source))
 
 
 @contextmanager
@@ -101,7 +101,7 @@ def read_source(
     """
     path = Path(path)
     options = options or ReadOptions()
-    given, found = fetched(path)
+    given, found = fetch(path)
     check_options(found, path, options)
     with naming(path):
         errors: list[ExportModelError] = []

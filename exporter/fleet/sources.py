@@ -11,7 +11,7 @@ from pathlib import Path
 
 from converters.files.fetch import Fetched, path_text, unreadable
 from converters.formats.bundle import BUNDLE
-from converters.formats.recognise import recognised
+from converters.formats.recognise import recognise_path
 from converters.formats.source import ReadOptions
 from exporter.remote.filesystem import is_pattern, matching, remote
 from signatures.errors import SourceError, UsageError
@@ -63,7 +63,7 @@ def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None 
         others: list[Path] = []
         here = list(_expand(path, out.resolve(), others))
         if not here and path.is_dir():
-            recognised(Fetched(path))  # which says what lies there instead
+            recognise_path(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
                 f"{path_text(path)} stands for no source",
@@ -147,7 +147,7 @@ def _is_list(path: Path) -> bool:
     if path.suffix != ".txt" or not path.is_file():
         return False
     try:
-        if recognised(Fetched(path)).key != _TEXT:
+        if recognise_path(Fetched(path)).key != _TEXT:
             return False
     except SourceError:  # it cannot be read: its reader says why
         return False
@@ -203,7 +203,7 @@ def _walk(top: Path, out: Path) -> Iterator[Path]:
 
 def _parts(folder: Path) -> list[Path]:
     """The files of a folder that has a policy in each, under the file's name; else the folder, which is one source."""
-    found = recognised(Fetched(folder))
+    found = recognise_path(Fetched(folder))
     if found.members is None:
         return [folder]
     members = found.members(folder, ReadOptions())
@@ -217,7 +217,7 @@ def _is_called_a_model(path: Path) -> bool:
 
 def _is_source(path: Path) -> bool:
     try:
-        found = recognised(Fetched(path))
+        found = recognise_path(Fetched(path))
     except SourceError:
         return False
     return found.readable or found is BUNDLE or found.key in _TELLING

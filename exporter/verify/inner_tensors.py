@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from converters.formats.frozen_graph.reader import from_graph_def
-from converters.formats.intermediate_tensors import InnerTensors, Loaded, View, hidden
+from converters.formats.intermediate_tensors import InnerTensors, Loaded, View, no_tensors
 from converters.formats.registry import WRITTEN
 from converters.formats.saved_model.reader import read_saved_model
 from converters.formats.saved_model.source import FILE, frozen_model, values_beside
@@ -27,7 +27,7 @@ def inner_tensors(
     key, _, signature = participant.format.partition(":")
     loaded = Loaded(path, participant.runtime, participant.model.run, pool, signature)
     form = WRITTEN.get(key, WRITTEN["bytes"])  # the reference and the original are frozen graphs
-    with (form.inner or hidden)(loaded) as found:
+    with (form.inner or no_tensors)(loaded) as found:
         if participant.fed is None:
             yield found
             return

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from converters.files.fetch import Fetched
-from converters.formats.recognise import recognised
+from converters.formats.recognise import recognise_path
 from converters.formats.source import ReadOptions
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
@@ -144,11 +144,11 @@ def test_names_of_several_behaviors_are_the_bundles(tmp_path: Path) -> None:
 
 def test_folders_are_told_apart(tmp_path: Path) -> None:
     (result,) = export([fixture("continuous.bytes")], ExportOptions(tmp_path, verify="none"))
-    assert recognised(Fetched(result.folder)).key == "bundle"
-    assert recognised(Fetched(result.folder / "saved_model")).key == "saved_model"
-    assert recognised(Fetched(result.folder / "tfjs")).key == "tfjs"
+    assert recognise_path(Fetched(result.folder)).key == "bundle"
+    assert recognise_path(Fetched(result.folder / "saved_model")).key == "saved_model"
+    assert recognise_path(Fetched(result.folder / "tfjs")).key == "tfjs"
     run_of(tmp_path / "run")
-    assert recognised(Fetched(tmp_path / "run")).key == "run_folder"
+    assert recognise_path(Fetched(tmp_path / "run")).key == "run_folder"
 
 
 def test_a_folder_without_a_model_says_what_is_in_it(tmp_path: Path) -> None:

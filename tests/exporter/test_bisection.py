@@ -247,4 +247,4 @@ def test_an_entry_that_is_not_understood_is_a_tensor_that_is_not_there(entry: st
 @given(arrays.arrays(np.float32, arrays.array_shapes(min_dims=4, max_dims=4, max_side=3)), st.permutations(range(4)))
 @settings(max_examples=50, deadline=None)
 def test_a_turned_tensor_is_turned_back(array: np.ndarray, axes: list[int]) -> None:
-    np.testing.assert_array_equal(View("t", tuple(axes)).restored(array.transpose(axes)), array)
+    np.testing.assert_array_equal(View("t", tuple(axes)).restore(array.transpose(axes)), array)

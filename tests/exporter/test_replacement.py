@@ -188,19 +188,19 @@ def test_linux_exchanges_two_folders_in_one_step(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / name).touch()
-    assert exchange._exchanged(tmp_path / "a", tmp_path / "b")
+    assert exchange._exchange(tmp_path / "a", tmp_path / "b")
     assert files_in(tmp_path) == {"a", "a/b", "b", "b/a"}
-    assert not exchange._exchanged(tmp_path / "a", tmp_path / "nothing")
+    assert not exchange._exchange(tmp_path / "a", tmp_path / "nothing")
 
 
 def test_other_systems_do_not_try_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
-    assert not exchange._exchanged(tmp_path, tmp_path)
+    assert not exchange._exchange(tmp_path, tmp_path)
 
 
 def test_a_libc_without_the_call_is_no_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("converters.formats.bundle.exchange.ctypes.CDLL", lambda *a, **k: object())
-    assert not exchange._exchanged(tmp_path, tmp_path)
+    assert not exchange._exchange(tmp_path, tmp_path)
 
 
 def test_a_replaced_bundle_leaves_nothing_of_the_old_one(out: Path) -> None:
@@ -362,7 +362,7 @@ def test_exports_that_are_killed_at_random_tear_nothing_and_leave_nobody(tmp_pat
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc which file it is")
 def test_all_is_on_the_disk_before_the_exchange(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
-    sync, exchanged = os.fsync, exchange._exchanged
+    sync, exchanged = os.fsync, exchange._exchange
     monkeypatch.setattr(
         os, "fsync", lambda number: (seen.append(str(Path(f"/proc/self/fd/{number}").readlink())), sync(number))[1]
     )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.read import fetched, read_models
+from converters.formats.read import fetch, read_models
 from converters.formats.source import ReadOptions
 from converters.runtimes.javascript.node import js_home, node_executable
 from exporter.export.sources import read_source
@@ -38,7 +38,7 @@ def _array(kept: dict[str, Any]) -> np.ndarray:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_file_says_what_tensorflow_js_computes(models: Path, name: str) -> None:
-    (model,) = read_models(*fetched(models / f"{name}.json"), ReadOptions())
+    (model,) = read_models(*fetch(models / f"{name}.json"), ReadOptions())
     data = json.loads((models / f"{name}.data.json").read_text())
     assert_agrees(model, [_array(data["fed"])], [_array(a) for a in data["given"]])
 

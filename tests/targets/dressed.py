@@ -25,7 +25,7 @@ from converters.formats.barracuda.vocabulary import LayerType
 from converters.formats.format import WriteOptions
 from converters.formats.onnx import messages
 from converters.formats.onnx.edit import lift_draws
-from converters.formats.registry import written
+from converters.formats.registry import format_for_writing
 from converters.formats.source import ReadOptions
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
@@ -61,7 +61,7 @@ class Plain:
 
     @cached_property
     def run(self) -> Callable[[Mapping[str, Any]], Feeds]:
-        plain = written("onnx").artifact(self.policy, WriteOptions(CONTRACT))
+        plain = format_for_writing("onnx").artifact(self.policy, WriteOptions(CONTRACT))
         return runner_of(onnx.ModelProto.FromString(plain.files[plain.main].to_bytes()))
 
 
@@ -86,7 +86,7 @@ class Pair:
         """
         dressed = profile.dress(policy)
         form = form or profile.formats[0]
-        artifact = written(form).artifact(dressed, profile.write_options(CONTRACT))
+        artifact = format_for_writing(form).artifact(dressed, profile.write_options(CONTRACT))
         if profile.importers:
             importable(profile, artifact.files, policy.name)
             playable(profile, artifact.files, policy.name)

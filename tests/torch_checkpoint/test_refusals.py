@@ -11,7 +11,7 @@ import pytest
 
 from converters.files.fetch import Fetched
 from converters.formats.bundle.bundle import Bundle
-from converters.formats.recognise import recognised
+from converters.formats.recognise import recognise_path
 from converters.formats.source import ReadOptions
 from exporter import inspect_model
 from exporter.export.sources import read_source
@@ -98,7 +98,7 @@ def test_torchscript_is_refused_by_name(tmp_path: Path) -> None:
 def test_the_kind_is_told_by_content(tmp_path: Path) -> None:
     for name in ("ppo_1_1", "poca_0_26_discrete"):
         shutil.copy(FOLDER / f"{name}.pt", tmp_path / "a.bytes")
-        assert recognised(Fetched(tmp_path / "a.bytes")).key == "torch_checkpoint"
+        assert recognise_path(Fetched(tmp_path / "a.bytes")).key == "torch_checkpoint"
 
 
 def test_the_actors_own_state_dictionary_is_read_too(tmp_path: Path) -> None:

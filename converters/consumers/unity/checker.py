@@ -21,7 +21,7 @@ from converters.consumers.unity.scene import Scene
 from converters.consumers.unity.settings import Brain
 from converters.files.fetch import Fetched, read_bytes
 from converters.formats.barracuda import format as nn_format
-from converters.formats.recognise import recognised
+from converters.formats.recognise import recognise_path
 from signatures.errors import ExportModelError, SourceError
 from signatures.records import dataclass
 
@@ -148,7 +148,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
 
     Raises SourceError for a file that is neither ONNX nor ``.nn``, DamagedFileError for one that cannot be read.
     """
-    kind = recognised(Fetched(path)).key
+    kind = recognise_path(Fetched(path)).key
     if kind == "nn" or (path.suffix.lower() == ".nn" and kind != "onnx"):
         return _check_nn_file(path, consumer, brain)
     if kind != "onnx":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, deferred
+from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.files.file_probe import Content

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from converters.files.fetch import inside
-from converters.formats.bundle.embed import embedded, without_contract
+from converters.formats.bundle.embed import contract_text, without_contract
 from converters.formats.bundle.exchange import exchange, recover, stage
 from converters.formats.format import Artifact, Format
 from converters.formats.frozen_graph.reader import read_graph
@@ -161,7 +161,7 @@ class Bundle:
         like where it is damaged.
         """
         whole = read_graph(self.graph_file.read_bytes())
-        self.verify_contract(embedded(whole) or "")
+        self.verify_contract(contract_text(whole) or "")
         return without_contract(whole)
 
     def verify_contract(self, held: Any) -> None:
@@ -226,7 +226,7 @@ def writing(place: Path, what: str = "cannot be written") -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def staged(place: Path, contract: Contract, artifacts: Sequence[Artifact]) -> Iterator[Path]:
+def stage_bundle(place: Path, contract: Contract, artifacts: Sequence[Artifact]) -> Iterator[Path]:
     """A bundle in a new folder beside ``place``, gone afterwards unless it was put in its place. Raises BundleError."""
     with contextlib.ExitStack() as stack:
         with writing(place.parent, "the output folder cannot be written"):

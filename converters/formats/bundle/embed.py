@@ -37,7 +37,7 @@ def without_contract(graph: Graph) -> Graph:
     return Graph(tuple(n for n in graph.nodes if n.name != EMBEDDED))
 
 
-def embedded(graph: Graph) -> str | None:
+def contract_text(graph: Graph) -> str | None:
     """The contract's text in a graph, None where there is none."""
     node = graph.get(EMBEDDED)
     if node is None or node.value is None or node.value.ndim or not isinstance(node.value.item(), bytes):
@@ -77,9 +77,9 @@ def contract_of(content: Any) -> Contract:
         ) from error
 
 
-def recalled(graph: Graph) -> tuple[Graph, Contract | None]:
+def split_contract(graph: Graph) -> tuple[Graph, Contract | None]:
     """A GraphDef's graph without the constant that carries the contract, and the contract (None: it is not ours)."""
-    text = embedded(graph)
+    text = contract_text(graph)
     if text is None:
         return graph, None
     contract = contract_of(text)

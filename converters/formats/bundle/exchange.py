@@ -46,10 +46,10 @@ def stage(place: Path) -> Iterator[Path]:
 
 def exchange(new: Path, place: Path) -> None:
     """Put ``new``, the folder of a ``stage``, in its place; what was there goes with the stage. Raises OSError."""
-    _synced(new)
+    _sync_folder(new)
     if not place.exists():
         new.rename(place)
-    elif not _exchanged(new, place):
+    elif not _exchange(new, place):
         _two_renames(new, place)
     try:
         _sync(place.parent)
@@ -92,7 +92,7 @@ def _two_renames(new: Path, place: Path) -> None:
         raise
 
 
-def _exchanged(a: Path, b: Path) -> bool:
+def _exchange(a: Path, b: Path) -> bool:
     """renameat2(RENAME_EXCHANGE): both paths change places in one step. Linux only; False where it is not to be had."""
     platform: str = sys.platform
     if platform != "linux":
@@ -104,7 +104,7 @@ def _exchanged(a: Path, b: Path) -> bool:
     return result == 0
 
 
-def _synced(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
     """Wait until all of a folder is on the disk: after a power cut, what has a name has its content."""
     inside = [path for place, _, files in os.walk(folder) for path in (Path(place), *(Path(place, f) for f in files))]
     # A few at a time: the disk then waits for several of them at once; to start a thread for each takes longer.

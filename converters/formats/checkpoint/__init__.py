@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, deferred
+from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.files.file_probe import Content

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, deferred
+from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.formats.frozen_graph import artifact as _artifact

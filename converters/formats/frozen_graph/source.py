@@ -5,7 +5,7 @@ from __future__ import annotations
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched
-from converters.formats.bundle.embed import facts_of, recalled
+from converters.formats.bundle.embed import facts_of, split_contract
 from converters.formats.frozen_graph.reader import from_graph_def
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 
@@ -14,6 +14,6 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """The one graph in a file; one that this tool wrote is what its contract says."""
     detached = Detached()
     definition = schema.parse(schema.GraphDef, given.data, "TensorFlow graph", detached)
-    graph, contract = recalled(from_graph_def(definition, detached))
+    graph, contract = split_contract(from_graph_def(definition, detached))
     original = OriginalRun("tensorflow", given.path, definition=definition, detached=detached)
     return [SourceModel(graph, (given.path,), facts_of(graph, contract), original=original)]

@@ -8,7 +8,7 @@ from typing import Any
 
 from converters.files.fetch import Fetched, read_bytes
 from converters.files.file_probe import Content
-from converters.formats.bundle.embed import embedded, facts_of, recalled
+from converters.formats.bundle.embed import contract_text, facts_of, split_contract
 from converters.formats.checkpoint.freeze import freeze, with_values
 from converters.formats.checkpoint.tensor_bundle import Checkpoint
 from converters.formats.checkpoint.training_graph import Saved as Place
@@ -40,7 +40,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         return read_frozen(given.inside(file), options)
     saved = read_saved_model(given.bytes_of(file))
     frozen = frozen_model(saved, values_beside(folder))
-    graph, contract = recalled(frozen.graph)
+    graph, contract = split_contract(frozen.graph)
     facts = facts_of(graph, contract)
     if contract is None:
         graph, facts = expose_signature(frozen.graph, frozen.signature, _notes(saved))
@@ -51,7 +51,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
 def embedded_contract(folder: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     saved = read_saved_model(read_bytes(folder / FILE))
-    return embedded(from_graph_def(saved.graph_def, saved.detached))
+    return contract_text(from_graph_def(saved.graph_def, saved.detached))
 
 
 @dataclass(frozen=True)
