@@ -1,8 +1,8 @@
 """What a format is: one object, declared in the ``__init__`` of its room, that answers every question about it.
 
 How its files are recognised, read and written, what an artefact of it takes and gives, which runtimes run it, what it
-is called everywhere (``--to``, parity.json, tolerances, budgets). The modules of its functions are ``deferred``, so
-that the list of formats (converters/formats/registry.py) costs nothing.
+is called everywhere (``--to``, parity.json, tolerances, budgets). The modules of its functions come from
+``defer_imports``, so that the list of formats (converters/formats/registry.py) costs nothing.
 """
 
 from __future__ import annotations

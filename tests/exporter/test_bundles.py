@@ -406,7 +406,7 @@ def test_another_source_is_refused(ball: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "\udcff", "[" * 100_000])
 def test_a_graph_that_embeds_no_contract_is_refused(text: str, bundles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bundle, "embedded", lambda graph: text)
+    monkeypatch.setattr(bundle, "contract_text", lambda graph: text)
     with pytest.raises(BundleError, match="has been changed"):
         Bundle.open(bundles / "continuous").graph()
 

@@ -268,11 +268,11 @@ def test_every_name_that_is_resolved_later_is_there() -> None:
 
 
 def asked_later(room: Path) -> Iterator[tuple[str, str]]:
-    """(module, function) of all that a room's ``__init__`` asks of what ``deferred`` gives."""
+    """(module, function) of all that a room's ``__init__`` asks of what ``defer_imports`` gives."""
     tree, package = tree_of(room), ".".join(room.parent.relative_to(ROOT).parts)
     modules: dict[str, str] = {}
     for found in ast.walk(tree):
-        if isinstance(found, ast.Assign) and ast.unparse(found.value).startswith("deferred("):
+        if isinstance(found, ast.Assign) and ast.unparse(found.value).startswith("defer_imports("):
             assert isinstance(found.value, ast.Call) and isinstance(found.targets[0], ast.Tuple)
             words = [ast.literal_eval(word) for word in found.value.args[1:]]
             modules.update(zip(map(ast.unparse, found.targets[0].elts), words, strict=True))

@@ -157,7 +157,7 @@ def test_without_an_exchange_a_bundle_is_whole_at_the_other_points(point: str, o
 
 
 def test_without_an_exchange_the_old_bundle_goes_away_in_the_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exchange, "_exchanged", lambda a, b: False)
+    monkeypatch.setattr(exchange, "_exchange", lambda a, b: False)
     assert exported(out, "--deterministic").status == 0
     assert is_deterministic(out / "continuous")
     assert {p.name for p in out.iterdir()} == {"continuous"}
@@ -166,7 +166,7 @@ def test_without_an_exchange_the_old_bundle_goes_away_in_the_end(out: Path, monk
 def test_without_an_exchange_a_rename_that_fails_puts_the_old_bundle_back(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exchange, "_exchanged", lambda a, b: False)
+    monkeypatch.setattr(exchange, "_exchange", lambda a, b: False)
     rename = Path.rename
 
     def failing(path: Path, target: Path) -> Path:
@@ -366,7 +366,7 @@ def test_all_is_on_the_disk_before_the_exchange(out: Path, monkeypatch: pytest.M
     monkeypatch.setattr(
         os, "fsync", lambda number: (seen.append(str(Path(f"/proc/self/fd/{number}").readlink())), sync(number))[1]
     )
-    monkeypatch.setattr(exchange, "_exchanged", lambda a, b: (seen.append("exchange"), exchanged(a, b))[1])
+    monkeypatch.setattr(exchange, "_exchange", lambda a, b: (seen.append("exchange"), exchanged(a, b))[1])
     assert exported(out).status == 0
     before = {Path(p).name for p in seen[: seen.index("exchange")]}
     assert before >= {"policy.json", "continuous.bytes", "continuous.onnx", "saved_model.pb", "tfjs", "new"}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from converters.formats.barracuda import source as _source
     from converters.formats.barracuda import writer as _writer
 else:
-    _answers, _source, _writer = deferred(__name__, "answers", "source", "writer")
+    _answers, _source, _writer = defer_imports(__name__, "answers", "source", "writer")
 
 
 #: Versions of the format, an int64 at its beginning.

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from converters.formats.c import contract as _contract
     from converters.formats.c import writer as _writer
 else:
-    _artifact, _contract, _writer = deferred(__name__, "artifact", "contract", "writer")
+    _artifact, _contract, _writer = defer_imports(__name__, "artifact", "contract", "writer")
 
 FORMATS = (
     Format(

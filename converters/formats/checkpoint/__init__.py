@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from converters.formats.checkpoint import listing as _listing
     from converters.formats.checkpoint import source as _source
 else:
-    _listing, _source = deferred(__name__, "listing", "source")
+    _listing, _source = defer_imports(__name__, "listing", "source")
 
 
 #: The last bytes of a table (tensorflow/core/lib/io/format.h), which a checkpoint's index is.

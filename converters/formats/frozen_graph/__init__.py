@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from converters.formats.frozen_graph import source as _source
     from converters.formats.frozen_graph import writer as _writer
 else:
-    _artifact, _source, _writer = deferred(__name__, "artifact", "source", "writer")
+    _artifact, _source, _writer = defer_imports(__name__, "artifact", "source", "writer")
 
 FORMATS = (
     Format(

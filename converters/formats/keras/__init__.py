@@ -9,7 +9,7 @@ from converters.formats.format import Format, defer_imports
 if TYPE_CHECKING:
     from converters.formats.keras import source as _source
 else:
-    (_source,) = deferred(__name__, "source")
+    (_source,) = defer_imports(__name__, "source")
 
 FORMATS = (
     Format(

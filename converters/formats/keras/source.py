@@ -124,7 +124,7 @@ def of_web_model(
 ) -> SourceModel:
     """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``, ``training`` its ``trainingConfig``.
 
-    Raises what ``layered`` raises.
+    Raises what ``build_layered`` raises.
     """
     config = topology.get("model_config") or topology
     loss = loss_of(training) or loss_of(topology.get("training_config"))

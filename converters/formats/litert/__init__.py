@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from converters.formats.litert import artifact as _artifact
     from converters.formats.litert import writer as _writer
 else:
-    _artifact, _writer = deferred(__name__, "artifact", "writer")
+    _artifact, _writer = defer_imports(__name__, "artifact", "writer")
 
 FORMATS = (
     Format(

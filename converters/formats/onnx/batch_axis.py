@@ -56,8 +56,8 @@ def read_rows(
 ) -> Reading:
     """Return the reading that is right of a model with ``nodes``; ``axes`` and ``ends`` are the batch axes of memories,
     by input and by output. Inputs that are handed on as they came say nothing of rows: godot_rl's exporter may fix
-    ``state_ins`` alone to one number. Raises what ``imported`` raises, SignatureError where the model gives one row
-    only and no reading gives more.
+    ``state_ins`` alone to one number. Raises what ``_import_nodes`` raises, SignatureError where the model
+    gives one row only and no reading gives more.
     """
     asked, judged = _without_echoes(declared, outputs, nodes)
     batch = _fixed_batch(asked, axes)

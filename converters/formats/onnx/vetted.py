@@ -57,7 +57,7 @@ def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:
 
 
 def self_contained_model(path: Path, detached: Detached | None = None) -> Any:
-    """The ModelProto with the data of all its files, or ``detached`` with it. Raises what ``vetted`` raises."""
+    """The ModelProto with the data of all its files, or ``detached`` with it. Raises what ``safe_copy`` raises."""
     model = decode_model(read_bytes(path), detached)
     own = {(f.domain, f.name) for f in model.functions}
     parts = (model.graph, *model.functions)

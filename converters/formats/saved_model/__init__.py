@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from converters.formats.saved_model import vetted as _vetted
     from converters.formats.saved_model import writer as _writer
 else:
-    _artifact, _source, _vetted, _writer = deferred(__name__, "artifact", "source", "vetted", "writer")
+    _artifact, _source, _vetted, _writer = defer_imports(__name__, "artifact", "source", "vetted", "writer")
 
 
 def _sniff(file: Content) -> bool:

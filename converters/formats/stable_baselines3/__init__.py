@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from converters.formats.stable_baselines3 import run_folder as _run_folder
     from converters.formats.stable_baselines3 import source as _source
 else:
-    _run_folder, _source = deferred(__name__, "run_folder", "source")
+    _run_folder, _source = defer_imports(__name__, "run_folder", "source")
 
 FORMATS = (
     Format(

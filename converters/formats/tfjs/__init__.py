@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from converters.formats.tfjs import source as _source
     from converters.formats.tfjs import writer as _writer
 else:
-    _artifact, _reader, _source, _writer = deferred(__name__, "artifact", "reader", "source", "writer")
+    _artifact, _reader, _source, _writer = defer_imports(__name__, "artifact", "reader", "source", "writer")
 
 FORMATS = (
     Format(

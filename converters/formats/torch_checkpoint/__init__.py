@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from converters.files.file_probe import Content
     from converters.formats.torch_checkpoint import source as _source
 else:
-    (_source,) = deferred(__name__, "source")
+    (_source,) = defer_imports(__name__, "source")
 
 
 def _sniff(file: Content) -> bool:

@@ -31,7 +31,7 @@ def _back(op: Op, net: Importer, value: str) -> str:
 
 
 def _window(op: Op, net: Importer, size: Sequence[int]) -> Window:
-    """The window over the first input; what auto_pad and ceil_mode ask for stands in ``_resolved``."""
+    """The window over the first input; what auto_pad and ceil_mode ask for stands in ``_resolve_padding``."""
     spatial = net.rank(op.need(0)) - 2
     if spatial not in (1, 2):
         raise op.op_error(f"it works on {spatial} spatial axes", "policies see images and rows of pixels")
