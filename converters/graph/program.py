@@ -256,7 +256,15 @@ def _leave_out(program: Program) -> None:
 
 
 def _join(program: Program) -> None:
-    """A stage that one other alone reads, element by element and in the same loops, becomes a part of that."""
+    """A stage that one other alone reads, element by element and in the same loops, becomes a part of that.
+
+    Not two that reduce: a printer computes eight elements of one reduction side by side.
+    """
+    while _join_once(program):
+        pass
+
+
+def _join_once(program: Program) -> bool:
     made: dict[Any, Stage] = {s.result.place: s for s in program.stages}
     readers = Count(p for s in program.stages for p in {e.tensor.place for e in elements(s.body)})
     kept_places = {t.place for t in program.outputs.values()}
@@ -267,6 +275,7 @@ def _join(program: Program) -> None:
         for e in elements(stage.body):
             reads.setdefault(e.tensor.place, []).append(e)
         swap: dict[int, Expression] = {}
+        reducing = False
         for place, found in reads.items():
             before = made.get(place)
             if before is None or readers[place] > 1 or place in kept_places:
@@ -274,6 +283,9 @@ def _join(program: Program) -> None:
             alike = all(id(e) not in within and _same_place(e, before, stage) for e in found)
             if not alike or split_loop(before, before.body) or any(isinstance(x, Drawn) for x in every(before.body)):
                 continue
+            if _reduces(before.body) and (reducing or _reduces(stage.body)):
+                continue
+            reducing = reducing or _reduces(before.body)
             turned = {id(a): b for a, b in zip(before.counters, stage.counters, strict=True)}
             body = inline_scalars(before.body, turned)
             swap |= {id(e): body for e in found}
@@ -281,6 +293,11 @@ def _join(program: Program) -> None:
         if swap:
             stage.body = inline_scalars(stage.body, swap)
     program.stages = [s for s in program.stages if s.result.place not in gone]
+    return bool(gone)
+
+
+def _reduces(x: Expression) -> bool:
+    return any(isinstance(one, Reduced) for one in every(x))
 
 
 def _same_place(e: Element, before: Stage, stage: Stage) -> bool:

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from converters.files.children.process import RunFailedError
-from converters.formats.c.contract import answers
-from converters.formats.c.text import comment
+from converters.formats.c.contract import answers, header_of
 from converters.formats.format import WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.printer import comment
 from converters.graph.types import FLOAT32, INT32
 from converters.runtimes.c import COMPILERS, compiler
 from converters.runtimes.c.child import FLAGS, run_bounded
@@ -66,6 +66,43 @@ def test_every_policy_acts_alike(source: Path, tmp_path: Path, here: RuntimePool
     for result in export([source], ExportOptions(tmp_path, ("c",), verify=("c",)), pool=here):
         assert result.report is not None
         assert result.report.passed is True, "\n".join(failure_lines(result.report))
+
+
+#: Without those of a library.
+PLAIN = tuple(f for f in FLAGS if f not in ("-shared", "-fPIC"))
+SANITIZED = ("-std=c99", "-O1", "-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("source", known.params(known.sources()))
+def test_compilers_and_sanitizers_find_nothing(source: Path, tmp_path: Path, here: RuntimePool, is_new: Chosen) -> None:
+    """No warning in any compiler that is here; and AddressSanitizer and UndefinedBehaviorSanitizer, with odd inputs."""
+    policies = known.policies_or_skip(source)
+    if not is_new("c-sanitizers", policies):  # type: ignore[call-arg, arg-type]
+        return
+    for policy in policies:
+        artifact = WRITTEN["c"].artifact(policy, WriteOptions("{}"))
+        artifact.write(tmp_path)
+        header = header_of(policy.name, policy.signature)
+        p, floats = header.prefix, [f for f in header.inputs if f.spec.dtype == "float32"]
+        fill = "".join(f"for (int i = 0; i < {f.size}; i++) input.{f.name}[i] = odd[(i + row) % 5];" for f in floats)
+        program = tmp_path / "main.c"
+        program.write_text(
+            f'#define {p.upper()}_IMPLEMENTATION\n#define {p.upper()}_SELFTEST\n#include "{artifact.main}"\n'
+            f"#include <stdlib.h>\nint main(void)\n{{\n    {p}_memory *memory = malloc(sizeof *memory);\n"
+            f"    {p}_input input = {{0}};\n    {p}_output output;\n"
+            "    const float odd[5] = {NAN, INFINITY, -3e9f, 1e20f, 0.5f};\n"
+            f"    int wrong = {p}_selftest(memory);\n    {p}_reset(memory, 1);\n"
+            f"    for (int row = 0; row < 5; row++) {{ {fill} (void)odd; {p}_act(&input, memory, &output); }}\n"
+            "    free(memory);\n    return wrong;\n}\n"
+        )
+        for each in filter(None, map(shutil.which, COMPILERS)):
+            subprocess.run([each, *PLAIN, "-fsyntax-only", str(program)], check=True, cwd=tmp_path)
+        command = [str(compiler()), *SANITIZED, "-o", str(tmp_path / "main"), str(program), "-lm"]
+        subprocess.run(command, check=True, cwd=tmp_path)
+        done = subprocess.run([str(tmp_path / "main")], check=False, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("name", FIXTURES)
@@ -133,8 +170,7 @@ def printed(name: str, main: str, folder: Path) -> list[str]:
     compilers = [found for found in map(shutil.which, ("gcc", "clang")) if found]
     said = set()
     for each in compilers:
-        flags = [f for f in FLAGS if f not in ("-shared", "-fPIC")]
-        command = [each, *flags, "-I", str(result.folder), "-o", str(folder / "main"), str(source), "-lm"]
+        command = [each, *PLAIN, "-I", str(result.folder), "-o", str(folder / "main"), str(source), "-lm"]
         subprocess.run(command, check=True)
         said.add(subprocess.run([str(folder / "main")], check=True, capture_output=True, text=True).stdout)
     (only,) = said

@@ -10,10 +10,12 @@ import numpy as np
 from converters.compiler.targets import C, prepare
 from converters.files.chunks import Pieces
 from converters.formats.c.contract import Field, Header, header_of
-from converters.formats.c.text import C_TYPES, Printer, literal
+from converters.formats.c.text import C_TYPES
+from converters.formats.c.text import C as Words
 from converters.formats.format import WriteOptions
 from converters.graph.ops.table import traits
-from converters.graph.program import Program, program_of
+from converters.graph.printer import Printer
+from converters.graph.program import Program, arena_of, program_of
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from signatures.contract import EMBEDDED
@@ -60,12 +62,19 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 def _text(policy: Policy, header: Header, program: Program, options: WriteOptions) -> str:
     p = header.prefix
-    printer = Printer(p)
+    words = Words(p)
+    printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
     by_name |= {f.spec.name: f"memory->{f.name}" for f in (*header.noise, *([header.state] if header.state else []))}
     for name, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[name])
-    body = printer.body(program)
+    statements = printer.body(program)
+    places = [stage.result.place for stage in program.stages]
+    body = [
+        f"    {C_TYPES[at.dtype.name]} *const {printer.name(at)} = memory->{arena_of(at.dtype)} + {at.offset};"
+        for at in places
+    ]
+    body += statements
     answered = (*header.outputs, *([header.next_state] if header.next_state else []))
     for f in answered:
         target = f"memory->{header.state.name}" if f is header.next_state and header.state else f"output->{f.name}"
@@ -118,8 +127,8 @@ def _text(policy: Policy, header: Header, program: Program, options: WriteOption
         *([f"/* Draw a class for each of {len(sizes)} branches. */\n{choose.splitlines()[0]};"] if choose else []),
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
         f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <math.h>\n#include <string.h>",
-        *(printer.constant(place) for place in program.constants),
-        *sorted(printer.helpers.values()),
+        *(words.constant(place, printer.name(place)) for place in program.constants),
+        *sorted(words.helpers.values()),
         *([_DRAWS.replace("$P", p).strip()] if draws else []),
         *([_NORMAL.replace("$P", p).strip()] if header.noise else []),
         f"void {p}_reset({p}_memory *memory, uint64_t seed)\n{{\n    memset(memory, 0, sizeof *memory);\n"
@@ -134,7 +143,7 @@ def _text(policy: Policy, header: Header, program: Program, options: WriteOption
         f"    for (int i = 0; i < agents; i++) without += {p}_act(&input[i], &memory[i], &output[i]);\n"
         f"    return without;\n}}",
         *([choose] if choose else []),
-        _selftest(policy, header),
+        _selftest(policy, header, words),
         "#endif",
     ]
     return "\n\n".join(parts) + "\n"
@@ -174,7 +183,7 @@ def _fed(field: Field, row: int) -> np.ndarray:
     return ((i * 7 + row * 5) % 17 - 8) / 8 if field.spec.dtype == "float32" else np.zeros(field.size)
 
 
-def _selftest(policy: Policy, header: Header) -> str:
+def _selftest(policy: Policy, header: Header, words: Words) -> str:
     """Golden rows: inputs by a formula, what the kernels make of them, as far as nothing is drawn."""
     p, graph = header.prefix, policy.graph
     drawn = graph.descendants(n.name for n in graph.nodes if traits(n).sampler)
@@ -211,7 +220,7 @@ def _selftest(policy: Policy, header: Header) -> str:
         empty = f"int {p}_selftest({p}_memory *memory)\n{{\n    (void)memory;\n    return 0;\n}}"
         return f"#ifdef {p.upper()}_SELFTEST\n{empty}\n#endif"
     rounded = [float(f"{x:.6g}") if np.isfinite(x) else np.nan for x in golden]  # NaN: not compared
-    numbers = ", ".join(literal(x, np.dtype(np.float32)) for x in rounded)
+    numbers = ", ".join(words.literal(x, np.dtype(np.float32)) for x in rounded)
     return (
         f"#ifdef {p.upper()}_SELFTEST\nint {p}_selftest({p}_memory *memory)\n{{\n"
         f"    static const float golden[{len(golden)}] = {{{numbers}}};\n    {p}_input input;\n    {p}_output output;\n"

@@ -146,7 +146,10 @@ def pool(kind: Kind) -> Loops:
             result = builder.reduce(kind, window, part, image.dtype)
             if kind == "max":
                 return result
-            return apply("div", result, builder.reduce("sum", window, lambda k: part(k, True), image.dtype))
+            count: Expression = Number(window[0] * window[1], image.dtype)
+            if place(at, [number(0), number(0)])[1] is not None:  # a part of some windows lies outside
+                count = builder.reduce("sum", window, lambda k: part(k, True), image.dtype)
+            return apply("div", result, count)
 
         return builder.compute(shape_of(node, builder), one, image.dtype)
 
