@@ -46,6 +46,9 @@ def collapse_views(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dic
             editor.redirect(node.name, editor.resolve(source))
         elif shape is not None and sum(1 for d in shape if isinstance(d, str)) <= 1:
             target = np.array([-1 if isinstance(d, str) else d for d in shape], INT32)
+            if node.inputs == (source, f"{node.name}/to") and _is_equal(editor.constant_of(node.inputs[1]), target):
+                editor.keep(node)  # made here, and read back
+                continue
             made = editor.add(
                 "Reshape", [source, editor.const(target, f"{node.name}/to")], f"{node.name}/view", node.origin
             )
@@ -55,6 +58,10 @@ def collapse_views(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dic
             editor.keep(node)
     moved = {name: editor.resolve(reference) for name, reference in fetches.items()}
     return editor.graph().prune(moved.values()), moved
+
+
+def _is_equal(known: np.ndarray | None, target: np.ndarray) -> bool:
+    return known is not None and np.array_equal(known, target)
 
 
 def _is_view(node: Node, types: Types) -> bool:

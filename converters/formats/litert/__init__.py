@@ -1,4 +1,4 @@
-"""LiteRT (TensorFlow Lite): written with its signatures, for phones, boards and pages."""
+"""LiteRT (TensorFlow Lite): read, and written with its signatures, for phones, boards and pages."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.formats.litert import artifact as _artifact
+    from converters.formats.litert import source as _source
     from converters.formats.litert import writer as _writer
 else:
-    _artifact, _writer = defer_imports(__name__, "artifact", "writer")
+    _artifact, _source, _writer = defer_imports(__name__, "artifact", "source", "writer")
 
 FORMATS = (
     Format(
         key="litert",
         label="a LiteRT (TensorFlow Lite) model",
-        advice="give the graph it was converted from",
         sniff=lambda file: file.head[4:8] == b"TFL3",
+        read=_source.read,
         write=_writer.write,
         main="{name}.tflite",
         narrow=True,

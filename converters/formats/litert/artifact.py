@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,13 +13,11 @@ from converters.files.folders import scratch_folder
 from converters.formats.format import Port, Ports
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
 from converters.formats.litert.flatbuffer import Table, decoded, encoded
-from converters.formats.litert.schema import BUILTINS, TYPES
+from converters.formats.litert.schema import BUILTINS, OPERATOR_NAMES
+from converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
 from signatures.contract import EMBEDDED
-from signatures.errors import DamagedFileError, UnsupportedOpError
-
-_OPERATORS = {builtin.code: name for name, builtin in BUILTINS.items()}
-_DTYPES = {number: dtype for dtype, (number, _) in TYPES.items()}
+from signatures.errors import UnsupportedOpError
 
 
 def ports(path: Path) -> Ports:
@@ -31,7 +29,7 @@ def ports(path: Path) -> Ports:
     signatures = {str(s.get("signature_key", "")): s for s in model.get("signature_defs", ())}
     key = next((k for k in ("serving_default", *signatures) if k in signatures), "")
     signature = signatures.get(key, {})
-    subgraph = _entry(model, "subgraphs", signature.get("subgraph_index", 0))
+    subgraph = entry_of(model, "subgraphs", signature.get("subgraph_index", 0))
 
     def side(name: str) -> tuple[Port, ...]:
         named = [(e.get("name", ""), e.get("tensor_index", 0)) for e in signature.get(name, ())]
@@ -41,30 +39,17 @@ def ports(path: Path) -> Ports:
 
 
 def _port(name: str, subgraph: Table, number: int) -> Port:
-    tensor = _entry(subgraph, "tensors", number)
-    dtype = _DTYPES.get(tensor.get("type", 0))
-    shape: list[int] = list(tensor["shape_signature"] if "shape_signature" in tensor else tensor.get("shape", ()))
-    dims = tuple(None if n < 0 else int(n) for n in shape)
-    return Port(name or str(tensor.get("name", "")), None if dtype is None else dtype.name, dims)
-
-
-def _entry(table: Table, vector: str, number: int) -> Table:
-    """An entry of a vector of a file that anyone may have made."""
-    entries = table.get(vector, ())
-    if not 0 <= number < len(entries):
-        raise DamagedFileError(
-            "the .tflite file is damaged", why=f"it has no {vector}[{number}]", fix="export it again"
-        )
-    found: Table = entries[number]
-    return found
+    tensor = entry_of(subgraph, "tensors", number)
+    dtype = dtype_of(tensor)
+    return Port(name or str(tensor.get("name", "")), None if dtype is None else dtype.name, dims_of(tensor))
 
 
 def held(path: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
-    return _note(decoded(read_bytes(path)), EMBEDDED)
+    return note(decoded(read_bytes(path)), EMBEDDED)
 
 
-def _note(model: Table, name: str) -> str | None:
+def note(model: Table, name: str) -> str | None:
     """A text of the metadata."""
     for entry in model.get("metadata", ()):
         if entry.get("name") == name:
@@ -73,13 +58,13 @@ def _note(model: Table, name: str) -> str | None:
 
 
 def _buffer(model: Table, number: int) -> bytes:
-    return bytes(_entry(model, "buffers", number).get("data", b""))
+    return bytes(entry_of(model, "buffers", number).get("data", b""))
 
 
 def operator_of(code: Table) -> str:
     """The name of an operator of the list; of one that is not written here its number, or what it calls itself."""
     number = max(code.get("deprecated_builtin_code", 0), code.get("builtin_code", 0))
-    return str(code.get("custom_code") or _OPERATORS.get(number) or f"operator {number}")
+    return str(code.get("custom_code") or OPERATOR_NAMES.get(number) or f"operator {number}")
 
 
 def vetted(path: Path, signatures: Sequence[str], folder: Path) -> Path:
@@ -101,6 +86,16 @@ def vetted(path: Path, signatures: Sequence[str], folder: Path) -> Path:
     return copy
 
 
+def function_alone(path: Path, function: int, ports: Collection[int]) -> bytes:
+    """A copy with one function, that makes nothing but some tensors. Raises SourceError, DamagedFileError."""
+    model = decoded(read_bytes(path))
+    subgraph = entry_of(model, "subgraphs", function)
+    operators = needed(subgraph, ports, (int(i) for i in subgraph.get("inputs", ())))
+    kept = {"version", "operator_codes", "buffers"}
+    alone = {**subgraph, "operators": operators, "outputs": [*ports]}
+    return encoded({**{k: v for k, v in model.items() if k in kept}, "subgraphs": [alone]}).joined()
+
+
 @contextmanager
 def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     """Those of a signature, in the same runtime: a copy gives them as further outputs."""
@@ -114,7 +109,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     made = {int(i) for operator in subgraph["operators"] for i in operator["outputs"]} - kept.keys()
     fed = {entry["name"]: entry.get("tensor_index", 0) for entry in signature["inputs"]}
 
-    names = loads(_note(model, TENSORS_KEY) or "")
+    names = loads(note(model, TENSORS_KEY) or "")
 
     def view(tensor: str) -> View | None:
         found = names.view(tensor)
@@ -161,7 +156,7 @@ def _kept(model: Table, subgraph: Table) -> dict[int, int]:
 def _constant(model: Table, tensor: Table) -> np.ndarray:
     """The numbers of a constant, widened where they are kept in fewer bytes."""
     shape = [int(n) for n in tensor.get("shape", ())]
-    array = np.frombuffer(_buffer(model, tensor.get("buffer", 0)), _DTYPES[tensor.get("type", 0)]).reshape(shape)
+    array = np.frombuffer(_buffer(model, tensor.get("buffer", 0)), dtype_of(tensor)).reshape(shape)
     kept = tensor.get("quantization")
     if kept is not None:
         sizes = [-1 if axis == kept.get("quantized_dimension", 0) else 1 for axis in range(array.ndim)]

@@ -178,6 +178,7 @@ class _Reader:
     def __init__(self, data: bytes | memoryview) -> None:
         self.data = memoryview(data)
         self.read: dict[tuple[str, int], Table] = {}
+        self.texts: dict[int, str] = {}
         #: entries of vectors that may still be read: a file has no more than a fourth of its bytes, each named once
         self.left = len(self.data)
 
@@ -228,7 +229,10 @@ class _Reader:
             else:
                 made[field.name] = self._table(table, target)
         elif kind == "str":
-            made[field.name] = bytes(self._span(target + 4, self._number("I", target))).decode("utf-8", "replace")
+            if target not in self.texts:
+                text = bytes(self._span(target + 4, self._number("I", target)))
+                self.texts[target] = text.decode("utf-8", "replace")
+            made[field.name] = self.texts[target]
         elif kind == "data":
             made[field.name] = np.frombuffer(self._span(target + 4, self._number("I", target)), np.uint8)
         elif not kind.startswith("["):

@@ -24,7 +24,8 @@ _TABLES = {
     "OperatorCode": "deprecated_builtin_code:i8 custom_code:str version:i32=1 builtin_code:i32",
     "SubGraph": "tensors:[Tensor] inputs:[i32] outputs:[i32] operators:[Operator] name:str",
     "Tensor": "shape:[i32] type:i8 buffer:u32 name:str quantization:QuantizationParameters is_variable:bool "
-    ":Any shape_signature:[i32] has_rank:bool",
+    "sparsity:SparsityParameters shape_signature:[i32] has_rank:bool",
+    "SparsityParameters": "",
     "QuantizationParameters": "min:[f32] max:[f32] scale:[f32] zero_point:[i64] details_type:u8 :Any "
     "quantized_dimension:i32",
     "Operator": "opcode_index:u32 inputs:[i32] outputs:[i32] builtin_options_type:u8 builtin_options:union "
@@ -60,6 +61,9 @@ _TABLES = {
     "LeakyReluOptions": "alpha:f32",
     "BatchMatMulOptions": "adj_x:bool adj_y:bool asymmetric_quantize_inputs:bool",
     "RandomOptions": "seed:i64 seed2:i64",
+    "L2NormOptions": "activation:i8",
+    "CumsumOptions": "exclusive:bool reverse:bool",
+    "GeluOptions": "approximate:bool",
 }
 
 #: What an ``Operator.builtin_options_type`` stands for; an operator that is told nothing may have an empty table.
@@ -70,6 +74,7 @@ OPTIONS: Mapping[str, int] = {
     "FullyConnectedOptions": 8,
     "SoftmaxOptions": 9,
     "ConcatenationOptions": 10,
+    "L2NormOptions": 12,
     "AddOptions": 11,
     "ReshapeOptions": 17,
     "MulOptions": 21,
@@ -90,7 +95,9 @@ OPTIONS: Mapping[str, int] = {
     "LeakyReluOptions": 75,
     "SplitVOptions": 79,
     "BatchMatMulOptions": 101,
+    "CumsumOptions": 102,
     "RandomOptions": 114,
+    "GeluOptions": 116,
 }
 
 #: ``Tensor.type`` by dtype, and the letter by which ``BUILTINS`` calls it.
@@ -118,6 +125,7 @@ ACTIVATIONS = {"": 0, "RELU": 1, "RELU_N1_TO_1": 2, "RELU6": 3, "TANH": 4}
 #: all), then ``@`` the operand whose dtype counts where that is not the first, and versions above 1: by dtype, and
 #: behind ``>4=`` where operands of more than four axes are broadcast (0: that is not done).
 #: Versions are those that TensorFlow 2.21's converter gives the same operator, and dtypes those that it writes it for.
+#: No dtype (``-``): an operator of other tools' files, which is read and not written.
 _BUILTINS = """
 ABS 101 - fi i=5
 ADD 0 AddOptions fil l=4
@@ -126,11 +134,13 @@ ARG_MAX 56 ArgMaxOptions fib b=3
 ARG_MIN 79 ArgMinOptions fib b=3
 AVERAGE_POOL_2D 1 Pool2DOptions f
 BATCH_MATMUL 126 BatchMatMulOptions f
+BROADCAST_TO 130 - -
 CAST 53 CastOptions *
 CEIL 104 - f
 CONCATENATION 2 ConcatenationOptions filub
 CONV_2D 3 Conv2DOptions f
 COS 108 - f
+CUMSUM 128 CumsumOptions -
 DEPTHWISE_CONV_2D 4 DepthwiseConv2DOptions f
 DEQUANTIZE 6 - hc h=3 c=5
 DIV 42 DivOptions fi >4=2
@@ -144,8 +154,12 @@ FLOOR_DIV 90 - fi f=2 >4=0
 FLOOR_MOD 95 - fil >4=0
 FULLY_CONNECTED 9 FullyConnectedOptions f
 GATHER 36 GatherOptions filub b=3
+GATHER_ND 107 - -
+GELU 150 GeluOptions -
 GREATER 61 - fil >4=0
 GREATER_EQUAL 62 - fil >4=0
+HARD_SWISH 117 - -
+L2_NORMALIZATION 11 L2NormOptions -
 LEAKY_RELU 98 LeakyReluOptions f
 LESS 58 - fil >4=0
 LESS_EQUAL 63 - fil >4=0
@@ -168,9 +182,11 @@ PACK 83 PackOptions filu
 PAD 34 - fil
 PADV2 60 - fil
 POW 78 - fi >4=0
+PRELU 54 - -
 RANDOM_STANDARD_NORMAL 146 RandomOptions *
 RANDOM_UNIFORM 148 RandomOptions *
 RANGE 96 - fil l=2
+RANK 110 - -
 REDUCE_ALL 140 ReducerOptions b
 REDUCE_ANY 91 ReducerOptions b
 REDUCE_MAX 82 ReducerOptions fil
@@ -178,6 +194,8 @@ REDUCE_MIN 89 ReducerOptions fil
 REDUCE_PROD 81 ReducerOptions fil
 RELU 19 - f
 RELU6 21 - f
+RELU_0_TO_1 152 - -
+RELU_N1_TO_1 20 - -
 RESHAPE 22 ReshapeOptions *
 ROUND 116 - f
 RSQRT 76 - f
@@ -200,6 +218,7 @@ SUB 41 SubOptions fil l=4 >4=3
 SUM 74 ReducerOptions fil
 TANH 28 - f
 TILE 69 - filub
+TOPK_V2 48 - -
 TRANSPOSE 39 - filub b=3 >4=4
 UNPACK 88 UnpackOptions fib b=3
 WHERE 109 - bfil
@@ -225,6 +244,37 @@ class Builtin:
         return max(wide, self.versions.get(letter, 1)) if wide else None
 
 
+#: Operators that are neither written nor read, by the names that people know, for messages.
+_OTHERS = """
+ASSIGN_VARIABLE 144
+BATCH_TO_SPACE_ND 37
+BIDIRECTIONAL_SEQUENCE_LSTM 52
+CALL_ONCE 129
+CONV_3D 132
+DEPTH_TO_SPACE 5
+EMBEDDING_LOOKUP 7
+FAKE_QUANT 80
+IF 118
+LSTM 16
+MIRROR_PAD 100
+QUANTIZE 114
+READ_VARIABLE 143
+RESIZE_BILINEAR 23
+RESIZE_NEAREST_NEIGHBOR 97
+REVERSE_V2 105
+SCATTER_ND 122
+SPACE_TO_BATCH_ND 38
+SPACE_TO_DEPTH 26
+STABLEHLO_COMPOSITE 206
+SVDF 27
+TRANSPOSE_CONV 67
+UNIDIRECTIONAL_SEQUENCE_LSTM 44
+UNIDIRECTIONAL_SEQUENCE_RNN 35
+VAR_HANDLE 142
+WHILE 119
+"""
+
+
 def _builtin(code: str, options: str, takes: str, *more: str) -> Builtin:
     operand = next((int(m[1:]) for m in more if m.startswith("@")), 0)
     versions = {key: int(version) for key, _, version in (m.partition("=") for m in more) if version}
@@ -233,6 +283,13 @@ def _builtin(code: str, options: str, takes: str, *more: str) -> Builtin:
 
 BUILTINS: Mapping[str, Builtin] = {
     name: _builtin(*rest) for name, *rest in (line.split() for line in _BUILTINS.split("\n") if line)
+}
+
+
+#: Number → name of every operator that has one here.
+OPERATOR_NAMES: Mapping[int, str] = {
+    **{int(code): name for name, code in (line.split() for line in _OTHERS.split("\n") if line)},
+    **{builtin.code: name for name, builtin in BUILTINS.items()},
 }
 
 

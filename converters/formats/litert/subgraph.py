@@ -16,6 +16,7 @@ from converters.formats.format import WriteOptions
 from converters.formats.intermediate_tensors import View
 from converters.formats.litert.flatbuffer import Table
 from converters.formats.litert.schema import ACTIVATIONS, BUILTINS, OPTIONS, PADDINGS, TABLES, TYPES
+from converters.formats.litert.tensors import UNNAMED
 from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.litert.base import NONE, Value, refused, reshaped
 from converters.graph.ops.table import op_of
@@ -126,11 +127,13 @@ class Subgraph:
             version = 2
         return self.shared.operator(op, version)
 
-    def const(self, array: np.ndarray, holds: str = "", axes: Sequence[int] = ()) -> Value:
-        """A constant; equal ones are one tensor."""
+    def const(self, array: np.ndarray, holds: str = "", axes: Sequence[int] = (), *, own: bool = False) -> Value:
+        """A constant; equal ones are one tensor, unless it is to be its ``own``."""
+        if own:
+            return self._tensor(of_array(array), self.shared.buffer(array))
         found = None if self.storage == "float32" else compact(array, self.storage)
         value = self._stored(array) if found is None else self._widened(array, *found)
-        if holds:
+        if holds and not UNNAMED.fullmatch(holds):
             if "name" not in self.tensors[value]:
                 self.tensors[value]["name"] = self._names.fresh(holds)
             self.turned[holds] = View(self.tensors[value]["name"], tuple(axes))
@@ -208,7 +211,7 @@ class Subgraph:
 
     def _bound(self, reference: str, value: Value) -> Value:
         self._values[reference] = value
-        if "name" not in self.tensors[value] and reference not in self._names:
+        if "name" not in self.tensors[value] and reference not in self._names and not UNNAMED.fullmatch(reference):
             self.tensors[value]["name"] = self._names.fresh(reference)
         return value
 

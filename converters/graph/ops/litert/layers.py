@@ -64,7 +64,7 @@ def _convolved(
     if len(node.inputs) > 2:
         bias = builder.value(node.inputs[2])
     else:
-        bias = builder.const(np.zeros(weights.shape[0] if op == "CONV_2D" else weights.shape[-1], weights.dtype))
+        bias = builder.const(np.zeros(weights.shape[0 if op == "CONV_2D" else -1], weights.dtype), own=True)
     kernel = builder.const(weights, node.inputs[1] if axes else "", axes)
     values = [builder.value(node.inputs[0]), kernel, bias]
     return _activated(node, builder, op, values, **_windows(node), **options)

@@ -1,0 +1,112 @@
+"""Products, convolutions, pooling, padding."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from converters.formats.litert.importer.elementwise import activated
+from converters.formats.litert.importer.importer import KERNELS, Importer
+from converters.formats.litert.importer.operator import Op, Translate
+from converters.formats.litert.schema import PADDINGS
+
+_PADDING = {number: name for name, number in PADDINGS.items()}
+
+
+def _fully_connected(op: Op, net: Importer) -> str:
+    """Rows of the last axis (or of as many numbers as a result has weights), times a matrix with a row per result."""
+    x, weights = op.need(0), op.need(1)
+    if op.integer("weights_format"):
+        raise op.refused("its weights are shuffled, for a model that is quantised")
+    turned = weights in net.kernels
+    results, size = (net.length(weights, i) for i in ((1, 0) if turned else (0, 1)))
+    shape = net.type_of(x).shape
+    if shape is None or len(shape) != 2:
+        x = net.reshape(x, [-1, size])
+    value = _with_bias(op, net, net.add("MatMul", [x, weights], transpose_b=not turned))
+    if op.flag("keep_num_dims") and shape is not None and len(shape) != 2:
+        value = net.reshape(value, [*shape[:-1], results])
+    return value
+
+
+def _with_bias(op: Op, net: Importer, value: str) -> str:
+    """The bias, unless it is one of zeros without a name, which a layer without one is given; then the activation."""
+    bias = op.get(2)
+    if bias is not None:
+        number = net.constant(bias)
+        added = number is None or number.any() or not net.is_unnamed(bias)
+        value = net.add("BiasAdd", [value, bias]) if added else value
+    return activated(op, net, value)
+
+
+def _batch_matmul(op: Op, net: Importer) -> str:
+    a, b = op.need(0), op.need(1)
+    x_turned, y_turned = op.flag("adj_x"), op.flag("adj_y")
+    if net.rank(a) == net.rank(b) == 2:
+        return net.add("MatMul", [a, b], transpose_a=x_turned, transpose_b=y_turned)
+    return net.add("BatchMatMul", [a, b], adj_x=x_turned, adj_y=y_turned)
+
+
+def _windows(op: Op, **more: Any) -> dict[str, Any]:
+    padding = _PADDING.get(op.integer("padding"))
+    if padding is None:
+        raise op.refused(f"its padding is {op.integer('padding')}, which is neither SAME nor VALID")
+    return {"padding": padding, "strides": (1, op.integer("stride_h"), op.integer("stride_w"), 1), **more}
+
+
+def _dilated(op: Op) -> dict[str, Any]:
+    down, across = (op.integer(f"dilation_{side}_factor", 1) for side in ("h", "w"))
+    return _windows(op, dilations=(1, down, across, 1))
+
+
+def _conv2d(op: Op, net: Importer) -> str:
+    image, kernel = op.need(0), op.need(1)
+    if kernel not in net.kernels:
+        kernel = net.transpose(kernel, KERNELS[op.kind])
+    channels, taken = net.length(image, 3), net.length(kernel, 2)
+    if channels != taken:
+        raise op.refused(
+            f"its image has {channels} channels, and a filter takes {taken}", "filters in groups are not read"
+        )
+    return _with_bias(op, net, net.add("Conv2D", [image, kernel], **_dilated(op)))
+
+
+def _depthwise(op: Op, net: Importer) -> str:
+    """A filter is [1, height, width, channels · multiplier] here."""
+    image, kernel = op.need(0), net.needed_constant(op.need(1), "its kernel")
+    _, height, width, results = kernel.shape
+    channels = net.length(image, 3)
+    if kernel.shape[0] != 1 or not channels or results % channels:
+        raise op.refused(f"its kernel {list(kernel.shape)} does not fit an image of {channels} channels")
+    own = net.const(kernel.reshape(height, width, channels, results // channels), "kernel")
+    return _with_bias(op, net, net.add("DepthwiseConv2dNative", [image, own], **_dilated(op)))
+
+
+def _pool(kind: str) -> Translate:
+    def translate(op: Op, net: Importer) -> str:
+        size = (1, op.integer("filter_height"), op.integer("filter_width"), 1)
+        return activated(op, net, net.add(kind, [op.need(0)], **_windows(op, ksize=size)))
+
+    return translate
+
+
+def _pad(op: Op, net: Importer) -> str:
+    operands = op.operands()
+    paddings = net.needed_constant(operands[1], "the paddings").astype(np.int64)
+    if (paddings < 0).any():
+        raise op.refused("it pads by less than nothing")
+    return net.add("Pad" if len(operands) == 2 else "PadV2", operands)
+
+
+OPS: Mapping[str, Translate] = {
+    "AVERAGE_POOL_2D": _pool("AvgPool"),
+    "BATCH_MATMUL": _batch_matmul,
+    "CONV_2D": _conv2d,
+    "DEPTHWISE_CONV_2D": _depthwise,
+    "FULLY_CONNECTED": _fully_connected,
+    "MAX_POOL_2D": _pool("MaxPool"),
+    "PAD": _pad,
+    "PADV2": _pad,
+}

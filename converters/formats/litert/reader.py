@@ -1,0 +1,124 @@
+"""A .tflite file to a graph: the function that its first signature calls, or (before there were signatures) its first.
+
+Tensors that are made for nothing are left out with the operators that make them; every operator that is left must be
+one of the table, and read only what stands before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from converters.compiler.options import MAX_PORTS
+from converters.formats.litert.artifact import note, operator_of
+from converters.formats.litert.flatbuffer import Table, decoded
+from converters.formats.litert.importer.importer import Importer
+from converters.formats.litert.importer.table import TABLE
+from converters.formats.litert.schema import VERSION
+from converters.formats.litert.tensors import Tensors, damaged, entry_of, needed
+from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
+from converters.formats.saved_model.signature import ModelSignature, Tensor
+from converters.graph.builder import MAX_NODES
+from converters.graph.nodes import Graph, TensorShape
+from signatures.contract import EMBEDDED
+from signatures.errors import NotAPolicyError
+from signatures.records import dataclass
+
+#: The signature that is read where a file has several, as TensorFlow calls the one of a model that is served.
+SERVING = "serving_default"
+#: What TensorFlow puts in front of the name of an input.
+_SERVED = f"{SERVING}_"
+
+
+@dataclass(frozen=True)
+class LitertModel:
+    """A file as it was read.
+
+    ``tensors`` and ``ports`` are the numbers of tensors by name, and by what a caller calls them, for who runs the file
+    itself; ``function`` is the number of the one that was read.
+    """
+
+    graph: Graph
+    signature: ModelSignature
+    key: str
+    tensors: Mapping[str, int]
+    ports: Mapping[str, int]
+    function: int
+    others: tuple[str, ...]
+    description: str = ""
+    contract: str | None = None
+    widened: bool = False
+    narrowed: bool = False
+
+
+def read_litert(data: bytes) -> LitertModel:
+    """Read a file. Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError."""
+    model = decoded(data)
+    if model.get("version", 0) != VERSION:
+        raise NotAPolicyError(
+            f"the .tflite file is of version {model.get('version', 0)} of its format",
+            why=f"version {VERSION} is read, which TensorFlow Lite has written since its first release",
+            fix="convert the model again",
+        )
+    named = {str(s.get("signature_key", "")): s for s in reversed(model.get("signature_defs", ()))}
+    key = next((k for k in (SERVING, *reversed(named)) if k in named), "")
+    called = named.get(key, {})
+    subgraph = entry_of(model, "subgraphs", called.get("subgraph_index", 0))
+    tensors = Tensors(model, subgraph, len(data))
+    inputs, outputs = (_ports(subgraph, called, side, tensors) for side in ("inputs", "outputs"))
+    if not outputs:
+        raise NotAPolicyError("the model gives nothing", fix="give the model that training exported")
+    operators = needed(subgraph, outputs.values(), inputs.values())
+    if len(operators) > MAX_NODES:
+        raise NotAPolicyError(
+            f"the model has {len(operators)} operators",
+            why="a policy has some hundreds",
+            fix="convert the policy alone",
+        )
+    views = loads(note(model, TENSORS_KEY) or "").values.values()
+    contract = note(model, EMBEDDED)
+    stored = None if contract is None else {v.name for v in views if v is not None and v.axes}
+    importer = Importer(tensors, {number: name for name, number in inputs.items()}, stored)
+    for operator in operators:
+        code = entry_of(model, "operator_codes", operator.get("opcode_index", 0))
+        importer.translate(operator, operator_of(code), TABLE)
+    for number in outputs.values():
+        importer.operand(number)
+    graph = importer.graph()
+
+    def side(ports: Mapping[str, int]) -> dict[str, Tensor]:
+        dims = {n: TensorShape(tensors.dims(n)) for n in ports.values()}
+        return {name: Tensor(importer.values[n], tensors.dtype(n), dims[n]) for name, n in ports.items()}
+
+    return LitertModel(
+        graph,
+        ModelSignature(side(inputs), side(outputs), key or None),
+        key,
+        {name: number for number, name in enumerate(tensors.names)},
+        {**outputs, **inputs},
+        int(called.get("subgraph_index", 0)),
+        tuple(k for k in named if k != key),
+        str(model.get("description", "")),
+        contract,
+        importer.widened,
+        importer.narrowed,
+    )
+
+
+def _ports(subgraph: Table, called: Table, side: str, tensors: Tensors) -> dict[str, int]:
+    """Name → number of the tensors that are fed or given. Raises DamagedFileError, NotAPolicyError."""
+    named = [(str(e.get("name", "")), int(e.get("tensor_index", 0))) for e in called.get(side, ())]
+    listed = [int(i) for i in subgraph.get(side, ())]
+    if len(listed) > MAX_PORTS or len(named) > MAX_PORTS:
+        raise NotAPolicyError(
+            f"the model has {max(len(listed), len(named))} {side}",
+            why=f"no more than {MAX_PORTS} are converted; a policy has a few",
+            fix="convert the policy alone",
+        )
+    found: dict[str, int] = {}
+    for name, number in named or [("", n) for n in listed]:
+        own = tensors.name(number).removeprefix(_SERVED)
+        name = name or own.removesuffix(":0")
+        if name in found:
+            raise damaged(f"two {side} are called {name!r}")
+        found[name] = number
+    return found

@@ -1,0 +1,500 @@
+"""A .tflite as a source: ours gives the same bytes again, and others act as they do in LiteRT."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from converters.formats.format import WriteOptions
+from converters.formats.litert.flatbuffer import Table, decoded, encoded
+from converters.formats.litert.importer.table import TABLE as OPERATORS
+from converters.formats.litert.reader import read_litert
+from converters.formats.litert.schema import BUILTINS, OPTIONS, TYPES
+from converters.formats.registry import WRITTEN
+from converters.formats.source import ReadOptions
+from converters.graph.ops.table import TABLE
+from converters.graph.run import run_graph
+from converters.runtimes.pool import RuntimePool
+from exporter.export.job import contract_of
+from exporter.export.pipeline import ExportOptions, export
+from exporter.export.sources import read_source
+from exporter.inspect.inspection import inspect_source
+from exporter.reports.summary import failure_lines
+from fixtures import FIXTURES, path
+from signatures.contract import safe_name
+from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
+from tests import known
+from tests.commands import ROOT
+from tests.conftest import Chosen
+from tests.graph.harness import policy_of
+from tests.graph.samples import SAMPLES
+from tests.litert import make_models
+
+interpreter = pytest.importorskip("ai_edge_litert.interpreter", reason="pip install 'export-model[litert]'")
+pytestmark = pytest.mark.xdist_group("litert-reader")
+
+#: Policies of ../shared that the first reading still simplifies (4 of 449, measured 2026-11-24).
+SIMPLER = {
+    "AliBharwani+ml-agents__CustomResidualAttentionWithLayerNorm.onnx",
+    "keras_attention.keras",
+    "keras_conv.keras",
+    "sb3_recurrent_disc_own_forward__legacy_fixed.onnx",
+}
+
+
+def again(file: Path, text: str) -> bytes:
+    """What is written of a file of ours, with a contract."""
+    (policy,) = read_source(file).policies()
+    return written(policy, text)
+
+
+def written(policy: Any, text: str) -> bytes:
+    (pieces,) = WRITTEN["litert"].artifact(policy, WriteOptions(text)).files.values()
+    return pieces.joined()
+
+
+def _trip(source: Path, folder: Path) -> list[tuple[bytes, bytes]]:
+    """Of each policy: its file, and what is written of that file under the same contract."""
+    found, place = read_source(source), folder / "policy.tflite"
+    trips = []
+    for model, policy in found.compiled(None):
+        named = replace(policy, name=safe_name(policy.name))
+        text = contract_of(named, found, model, ReadOptions()).compact()
+        place.write_bytes(written(named, text))
+        trips.append((place.read_bytes(), again(place, text)))
+    return trips
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_a_round_trip_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
+    for first, second in _trip(path(name), tmp_path):
+        assert first == second
+
+
+@pytest.mark.corpus
+@pytest.mark.slow
+@pytest.mark.parametrize("source", known.params(known.sources()))
+def test_every_policy_gives_the_same_bytes(source: Path, tmp_path: Path, is_new: Chosen) -> None:
+    if not is_new("litert", known.policies_or_skip(source)):  # type: ignore[call-arg, arg-type]
+        return
+    for first, second in _trip(source, tmp_path):
+        assert (first == second) is (source.name not in SIMPLER)
+
+
+def test_a_file_of_ours_is_what_its_contract_says(tmp_path: Path) -> None:
+    (made,) = export([path("recurrent")], ExportOptions(tmp_path, ("litert",), verify="none"))
+    (policy,) = read_source(made.folder / "recurrent.tflite").policies()
+    wanted, found = made.policy.signature, policy.signature
+    assert [(s.name, s.role, s.shape) for s in found.inputs] == [(s.name, s.role, s.shape) for s in wanted.inputs]
+    assert [(s.name, s.role) for s in found.outputs] == [(s.name, s.role) for s in wanted.outputs]
+    assert (found.family, found.algorithm, found.memory) == (wanted.family, wanted.algorithm, wanted.memory)
+
+
+@pytest.mark.parametrize("storage", ["float16", "int8"])
+def test_weights_in_fewer_bytes_are_widened(storage: Any, tmp_path: Path, processes: RuntimePool) -> None:
+    """To what the file's own runtime makes of them; XNNPACK and the plain kernels widen alike."""
+    options = ExportOptions(tmp_path, ("litert",), verify="none", weights=storage)
+    (made,) = export([path("continuous")], options)
+    check = ExportOptions(tmp_path / "again", ("onnx",), verify=("litert-plain", "onnxruntime"))
+    (result,) = export([made.folder / "continuous.tflite"], check, pool=processes)
+    assert result.report is not None
+    assert result.report.passed is True, "\n".join(failure_lines(result.report))
+    assert result.report.original == "litert-plain"
+
+
+# ------------------------------------------------------------------ files of TensorFlow's converter
+
+
+@pytest.fixture(scope="module")
+def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("tensorflow")
+    folder = tmp_path_factory.mktemp("theirs")
+    subprocess.run([sys.executable, "-m", "tests.litert.make_models", str(folder)], cwd=ROOT, check=True)
+    return folder
+
+
+READ = (
+    *make_models.ACTIVATIONS,
+    *("softmax", "image", "cell", "gru", "attention", "conv1d", "halves"),
+    *(f"saved-{name}" for name in make_models.SAVED),
+    *(f"frozen-{name}" for name in make_models.FROZEN),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READ)
+def test_files_of_tensorflow_s_converter_act_as_in_litert(
+    name: str, theirs: Path, tmp_path: Path, processes: RuntimePool
+) -> None:
+    options = ExportOptions(tmp_path, ("onnx", "litert"), verify=("litert", "litert-plain", "onnxruntime"))
+    (result,) = export([theirs / f"{name}.tflite"], options, pool=processes)
+    assert result.report is not None
+    assert result.report.passed is True, "\n".join(failure_lines(result.report))
+    assert result.report.original == "litert-plain"
+    signature = result.policy.signature
+    if name.startswith(("saved-", "frozen-")):  # names and roles as in the graph that it was converted from
+        (wanted,) = (p.signature for p in read_source(path(name.partition("-")[2])).policies())
+        assert {(s.name, s.role) for s in signature.inputs} == {(s.name, s.role) for s in wanted.inputs}
+        assert signature.heads[0].spec.role == wanted.heads[0].spec.role
+    assert (signature.memory is not None) is (name in ("cell", "saved-recurrent"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", make_models.REFUSED)
+def test_quantised_and_stateful_models_are_refused_by_name(name: str, theirs: Path) -> None:
+    with pytest.raises(UnsupportedOpError) as caught:
+        read_source(theirs / f"{name}.tflite")
+    assert make_models.REFUSED[name] in caught.value.what
+    assert caught.value.why and caught.value.fix
+
+
+# ------------------------------------------------------------------ operators
+
+
+#: The first versions that LiteRT has of operators that had none before.
+VERSIONS = {"BROADCAST_TO": 2}
+
+
+def model_of(
+    kind: str,
+    inputs: Sequence[np.ndarray],
+    results: Sequence[str] = ("float32",),
+    fed: int = 1,
+    **options: Any,
+) -> Table:
+    """A model of one operator; the first ``fed`` operands are inputs of the model, the others constants."""
+    buffers: list[Table] = [{}]
+    tensors: list[Table] = []
+    for number, array in enumerate(inputs):
+        tensor: Table = {"type": TYPES[array.dtype][0], "name": f"in{number}", "shape": list(array.shape)}
+        if number >= fed:
+            tensor["buffer"] = len(buffers)
+            buffers.append({"data": array})
+        tensors.append(tensor)
+    tensors += [{"type": TYPES[np.dtype(r)][0], "name": f"out{i}"} for i, r in enumerate(results)]
+    outputs = [len(inputs) + i for i in range(len(results))]
+    operator: Table = {"inputs": [*range(len(inputs))], "outputs": outputs}
+    builtin = BUILTINS[kind]
+    if builtin.options:
+        operator |= {"builtin_options_type": OPTIONS[builtin.options], "builtin_options": options}
+    code = {
+        "deprecated_builtin_code": min(builtin.code, 127),
+        "builtin_code": builtin.code,
+        "version": VERSIONS.get(kind, 1),
+    }
+    return {
+        "version": 3,
+        "operator_codes": [code],
+        "subgraphs": [{"tensors": tensors, "inputs": [*range(fed)], "outputs": outputs, "operators": [operator]}],
+        "buffers": buffers,
+    }
+
+
+def graph_of(model: Table) -> Any:
+    return read_litert(encoded(model).joined()).graph
+
+
+def answers(model: Table, feeds: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """(what the numpy kernels make of the graph that is read, what LiteRT's own make of the file)."""
+    data = encoded(model).joined()
+    runner = interpreter.Interpreter(
+        model_content=data,
+        experimental_op_resolver_type=interpreter.OpResolverType.BUILTIN_WITHOUT_DEFAULT_DELEGATES,
+    )
+    runner.allocate_tensors()
+    for details, array in zip(runner.get_input_details(), feeds, strict=True):
+        runner.set_tensor(details["index"], array)
+    runner.invoke()
+    theirs = [runner.get_tensor(d["index"]) for d in runner.get_output_details()]
+    found = read_litert(data)
+    from converters.compiler.passes.normalise import normalise
+
+    names = [t.name for t in found.signature.outputs.values()]
+    graph = normalise(found.graph, [n.split(":")[0] for n in names])
+    given = {f"in{i}": array for i, array in enumerate(feeds)}
+    ours = run_graph(graph, given, names)
+    return [ours[n] for n in names], theirs
+
+
+def floats(*shape: int) -> np.ndarray:
+    draw = np.random.default_rng(sum(shape))
+    return np.asarray(draw.standard_normal(shape) * 3, np.float32)
+
+
+def ints(*numbers: int) -> np.ndarray:
+    return np.array(numbers, np.int32)
+
+
+X, IMAGE = floats(3, 4), floats(2, 6, 6, 3)
+WINDOW = {"padding": 1, "stride_h": 1, "stride_w": 1}
+DILATED = {"dilation_h_factor": 1, "dilation_w_factor": 1}
+#: What the writer makes none of: operators of other tools, options, forms of operands.
+CASES: Mapping[str, tuple[Any, ...]] = {
+    "BROADCAST_TO": ("BROADCAST_TO", [floats(1, 4), ints(3, 4)]),
+    "CUMSUM": ("CUMSUM", [X, ints(1)], {"exclusive": True}),
+    "CUMSUM, in reverse": ("CUMSUM", [X, ints(0)], {"reverse": True}),
+    "GATHER_ND": ("GATHER_ND", [X, ints(2, 0, 1).reshape(3, 1)]),
+    "GELU": ("GELU", [X]),
+    "GELU by tanh": ("GELU", [X], {"approximate": True}),
+    "HARD_SWISH": ("HARD_SWISH", [X * 3]),
+    "L2_NORMALIZATION": ("L2_NORMALIZATION", [X]),
+    "LEAKY_RELU": ("LEAKY_RELU", [X], {"alpha": 0.3}),
+    "PRELU": ("PRELU", [X, floats(4)]),
+    "RANK": ("RANK", [X], {}, ("int32",)),
+    "RELU_0_TO_1": ("RELU_0_TO_1", [X]),
+    "RELU_N1_TO_1": ("RELU_N1_TO_1", [X]),
+    "TOPK_V2": ("TOPK_V2", [X, np.array(2, np.int32)], {}, ("float32", "int32")),
+    "SOFTMAX, beta": ("SOFTMAX", [X], {"beta": 0.5}),
+    "RESHAPE by its option": ("RESHAPE", [X], {"new_shape": [2, 6]}),
+    "RESHAPE to a scalar": ("RESHAPE", [floats(1)], {"new_shape": [0]}),
+    "ADD and RELU": ("ADD", [X, floats(4)], {"activation": 1}),
+    "SUB and RELU_N1_TO_1": ("SUB", [X, floats(4)], {"activation": 2}),
+    "MUL and RELU6": ("MUL", [X, floats(4)], {"activation": 3}),
+    "FULLY_CONNECTED of three axes": ("FULLY_CONNECTED", [floats(2, 3, 4), floats(5, 4), floats(5)]),
+    "FULLY_CONNECTED that keeps its axes": (
+        "FULLY_CONNECTED",
+        [floats(2, 3, 4), floats(5, 4), floats(5)],
+        {"keep_num_dims": True, "activation": 1},
+    ),
+    "STRIDED_SLICE, ends by lengths": (
+        "STRIDED_SLICE",
+        [X, ints(1, 1), ints(2, 2), ints(1, 1)],
+        {"offset": True},
+    ),
+    "STRIDED_SLICE, masks": (
+        "STRIDED_SLICE",
+        [X, ints(0, 1), ints(0, 2), ints(1, 1)],
+        {"begin_mask": 1, "end_mask": 1, "shrink_axis_mask": 2},
+    ),
+    "CONV_2D, SAME, strides": (
+        "CONV_2D",
+        [IMAGE, floats(4, 3, 2, 3), floats(4)],
+        {**DILATED, "padding": 0, "stride_h": 2, "stride_w": 1, "activation": 1},
+    ),
+    "CONV_2D, dilated": (
+        "CONV_2D",
+        [IMAGE, floats(4, 2, 2, 3), floats(4)],
+        {**WINDOW, "dilation_h_factor": 2, "dilation_w_factor": 3},
+    ),
+    "DEPTHWISE_CONV_2D": (
+        "DEPTHWISE_CONV_2D",
+        [IMAGE, floats(1, 3, 3, 6), floats(6)],
+        {**WINDOW, **DILATED, "depth_multiplier": 2},
+    ),
+    "AVERAGE_POOL_2D, SAME": (
+        "AVERAGE_POOL_2D",
+        [IMAGE],
+        {"padding": 0, "stride_h": 2, "stride_w": 2, "filter_height": 3, "filter_width": 3},
+    ),
+    "BATCH_MATMUL, turned": ("BATCH_MATMUL", [floats(2, 4, 3), floats(2, 5, 4)], {"adj_x": True, "adj_y": True}),
+}
+
+
+@pytest.mark.parametrize("title", CASES)
+def test_operators_of_others_compute_what_litert_computes(title: str) -> None:
+    kind, inputs, *rest = CASES[title]
+    options = rest[0] if rest else {}
+    results = rest[1] if len(rest) > 1 else ("float32",)
+    ours, theirs = answers(model_of(kind, inputs, results, **options), inputs[:1])
+    for a, b in zip(ours, theirs, strict=True):
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-6)
+
+
+def test_every_operator_of_the_table_has_a_case_or_is_written() -> None:
+    written_ones = {name for name, builtin in BUILTINS.items() if builtin.takes}
+    cases = {case[0] for case in CASES.values()}
+    assert OPERATORS.keys() | {"DEQUANTIZE"} == BUILTINS.keys()
+    assert {name for name in OPERATORS if name not in written_ones} <= cases
+
+
+SIZES = st.integers(1, 4)
+
+
+@given(rows=SIZES, size=SIZES, results=SIZES, activation=st.integers(0, 3), biased=st.booleans())
+def test_products_of_any_size(rows: int, size: int, results: int, activation: int, biased: bool) -> None:
+    operands = [floats(rows, size), floats(results, size), *([floats(results)] if biased else [])]
+    ours, theirs = answers(model_of("FULLY_CONNECTED", operands, activation=activation), operands[:1])
+    np.testing.assert_allclose(ours[0], theirs[0], rtol=2e-5, atol=2e-6)
+
+
+@given(
+    size=st.integers(3, 7),
+    kernel=st.tuples(st.integers(1, 3), st.integers(1, 3)),
+    strides=st.tuples(st.integers(1, 3), st.integers(1, 3)),
+    padding=st.integers(0, 1),
+)
+def test_convolutions_of_any_size(size: int, kernel: tuple[int, int], strides: tuple[int, int], padding: int) -> None:
+    operands = [floats(1, size, size + 1, 2), floats(3, *kernel, 2), floats(3)]
+    options = {**DILATED, "padding": padding, "stride_h": strides[0], "stride_w": strides[1]}
+    ours, theirs = answers(model_of("CONV_2D", operands, **options), operands[:1])
+    np.testing.assert_allclose(ours[0], theirs[0], rtol=2e-5, atol=1e-5)
+
+
+@given(
+    begin=st.tuples(st.integers(-5, 5), st.integers(-5, 5)),
+    end=st.tuples(st.integers(-5, 5), st.integers(-5, 5)),
+    steps=st.tuples(st.integers(1, 3), st.integers(-2, -1) | st.integers(1, 2)),
+    masks=st.tuples(st.integers(0, 3), st.integers(0, 3)),
+)
+def test_slices_of_any_bounds(begin: Any, end: Any, steps: Any, masks: tuple[int, int]) -> None:
+    operands = [X, ints(*begin), ints(*end), ints(*steps)]
+    model = model_of("STRIDED_SLICE", operands, begin_mask=masks[0], end_mask=masks[1])
+    ours, theirs = answers(model, operands[:1])
+    assert ours[0].shape == theirs[0].shape
+    np.testing.assert_array_equal(ours[0], theirs[0])
+
+
+@pytest.mark.parametrize("op", [op for op in TABLE if TABLE[op].litert is not None and not TABLE[op].sampler])
+def test_what_is_written_of_an_op_is_read_as_the_same(op: str) -> None:
+    """By the numpy kernels: the graph that is read gives what the sample's own gives."""
+    for sample in (s for s in SAMPLES if s.op == op):
+        try:
+            data = written(policy_of(sample.graph, sample.fetches), "")
+        except UnsupportedOpError:
+            continue  # a dtype that LiteRT lacks: tests/graph/test_ops.py
+        found = read_litert(data)
+        keys = [f"y{i}" for i in range(len(sample.fetches))]
+        names = [found.signature.outputs[k].name for k in keys]
+        ours = run_graph(found.graph, sample.feeds, names)
+        wanted = run_graph(sample.graph, sample.feeds, sample.fetches)
+        for name, fetch in zip(names, sample.fetches, strict=True):
+            np.testing.assert_allclose(ours[name], wanted[fetch], rtol=2e-6, atol=2e-6, err_msg=sample.title)
+
+
+# ------------------------------------------------------------------ refused
+
+
+def changed(change: Any, kind: str = "FULLY_CONNECTED") -> Table:
+    """A model of one layer, changed."""
+    model = model_of(kind, [X, floats(5, 4), floats(5)])
+    change(model, model["subgraphs"][0])
+    return model
+
+
+QUANTISED = {"scale": [0.5], "zero_point": [0]}
+
+
+def _as_integers(model: Table, subgraph: Table) -> None:
+    subgraph["tensors"][1] |= {"type": TYPES[np.dtype(np.int8)][0], "quantization": QUANTISED}
+
+
+UNREAD: Mapping[str, tuple[Any, str]] = {
+    "quantised weights": (_as_integers, "quantised to int8"),
+    "sparse weights": (lambda m, s: s["tensors"][1].update(sparsity={}), "sparse"),
+    "a variable": (lambda m, s: s["tensors"][1].update(is_variable=1), "keeps its value"),
+    "a custom operator": (lambda m, s: m["operator_codes"][0].update(builtin_code=32, custom_code="Mine"), "Mine"),
+    "an LSTM": (lambda m, s: m["operator_codes"][0].update(builtin_code=44), "UNIDIRECTIONAL_SEQUENCE_LSTM"),
+    "an operator of the future": (lambda m, s: m["operator_codes"][0].update(builtin_code=999), "operator 999"),
+    "an activation of the future": (
+        lambda m, s: s["operators"][0]["builtin_options"].update(activation=5),
+        "activation 5",
+    ),
+    "shuffled weights": (lambda m, s: s["operators"][0]["builtin_options"].update(weights_format=1), "shuffled"),
+    "no weights": (lambda m, s: s["operators"][0].update(inputs=[0, -1]), "operand 1 is missing"),
+}
+
+
+@pytest.mark.parametrize("title", UNREAD)
+def test_what_is_not_read_is_refused_by_name(title: str) -> None:
+    change, says = UNREAD[title]
+    with pytest.raises(UnsupportedOpError) as caught:
+        graph_of(changed(change))
+    assert says in caught.value.message
+
+
+def _repeat(model: Table, subgraph: Table) -> None:
+    """A tensor that is made of what was made of itself."""
+    subgraph["tensors"].append({"name": "between"})
+    model["operator_codes"][0].update(builtin_code=BUILTINS["TANH"].code, deprecated_builtin_code=28)
+    subgraph["operators"] = [{"inputs": [a], "outputs": [b]} for a, b in ((0, 3), (3, 4), (4, 3))]
+
+
+def _shared(model: Table, subgraph: Table) -> None:
+    """A megabyte of weights under a thousand shapes, each of them read."""
+    model["buffers"][1] = {"data": np.zeros(1 << 20, np.uint8)}
+    subgraph["tensors"] += [{"type": 0, "buffer": 1, "name": f"w{i}", "shape": [1 << 18] + [1] * i} for i in range(30)]
+    count = len(subgraph["tensors"])
+    subgraph["operators"] = [
+        {"inputs": [0, *range(count - 30, count)], "outputs": [3]},
+    ]
+    model["operator_codes"][0].update(builtin_code=BUILTINS["ADD_N"].code, deprecated_builtin_code=106)
+
+
+DAMAGED: Mapping[str, tuple[Any, str]] = {
+    "an operand that is not there": (lambda m, s: s["operators"][0].update(inputs=[0, 9]), "tensors[9]"),
+    "an operand below all": (lambda m, s: s["operators"][0].update(inputs=[0, -2]), "tensors[-2]"),
+    "an operand that nothing makes": (
+        lambda m, s: s["operators"][0].update(inputs=[0, 3, 2], outputs=[3]),
+        "nothing makes",
+    ),
+    "an operator twice": (_repeat, "made before"),
+    "an operator of no code": (lambda m, s: s["operators"][0].update(opcode_index=7), "operator_codes[7]"),
+    "a buffer that is not there": (lambda m, s: s["tensors"][1].update(buffer=9), "buffers[9]"),
+    "fewer bytes than its shape": (lambda m, s: s["tensors"][1].update(shape=[5, 5]), "not of the shape"),
+    "a shape that no memory holds": (lambda m, s: s["tensors"][1].update(shape=[2**31 - 1] * 9), "not of the shape"),
+    "lengths below 0": (lambda m, s: s["tensors"][1].update(shape=[-5, -4]), "below 0"),
+    "an input twice": (lambda m, s: s.update(inputs=[0, 0]), "two inputs"),
+    "a result that is no tensor": (lambda m, s: s.update(outputs=[77]), "tensors[77]"),
+    "no function": (lambda m, s: m.update(subgraphs=[]), "subgraphs[0]"),
+    "the same bytes again and again": (_shared, "name the same bytes"),
+    "more results than it has": (
+        lambda m, s: (s["tensors"].append({"name": "y"}), s["operators"][0].update(outputs=[3, 4])),
+        "results",
+    ),
+}
+
+
+@pytest.mark.parametrize("title", DAMAGED)
+def test_a_damaged_file_is_refused(title: str) -> None:
+    change, says = DAMAGED[title]
+    with pytest.raises(DamagedFileError) as caught:
+        graph_of(changed(change))
+    assert says in caught.value.message
+
+
+def test_what_nothing_needs_is_not_looked_at() -> None:
+    """An operator that no output depends on may be any."""
+
+    def change(model: Table, subgraph: Table) -> None:
+        model["operator_codes"].append({"builtin_code": 999})
+        subgraph["tensors"].append({"name": "unused"})
+        subgraph["operators"].append({"opcode_index": 1, "inputs": [0], "outputs": [4]})
+
+    assert "out0" in graph_of(changed(change))
+
+
+def test_a_file_of_another_version_is_refused() -> None:
+    with pytest.raises(NotAPolicyError, match="version 2"):
+        graph_of(changed(lambda model, subgraph: model.update(version=2)))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_changed_tables_give_a_graph_or_an_error_of_ours(seed: int, tmp_path: Path) -> None:
+    """Numbers of the tables of a whole policy, changed; ``make fuzz`` tries thousands."""
+    draw = np.random.default_rng(seed)
+    (policy,) = read_source(path("discrete")).policies()
+    model = decoded(written(policy, ""))
+    for _ in range(3):
+        subgraph = model["subgraphs"][0]
+        table = draw.choice([*subgraph["tensors"], *subgraph["operators"]])
+        vectors = [k for k in ("shape", "inputs", "outputs") if k in table and len(table[k])]
+        if vectors:
+            numbers = [int(n) for n in table[vectors[0]]]
+            numbers[int(draw.integers(len(numbers)))] = int(draw.choice([-1, 0, 1, 5, 77, 2**31 - 1]))
+            table[vectors[0]] = numbers
+    file = tmp_path / "policy.tflite"
+    file.write_bytes(encoded(model).joined())
+    try:
+        inspect_source(file)
+    except ExportModelError as error:
+        assert error.exit_status == 2
