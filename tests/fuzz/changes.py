@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import io
 import json
 import pickletools
@@ -11,9 +13,12 @@ from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
 
+import numpy as np
+
 from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda.format import _Parser
 from converters.formats.checkpoint.table import read_table
+from converters.formats.litert.flatbuffer import decoded, encoded
 from signatures.digest import sha256_hex
 from tests.checkpoint.writing import table
 from tests.fuzz import mutation
@@ -132,6 +137,60 @@ def _index(data: bytes, random: Random) -> bytes:
     made = [(bytes(k), bytes(v)) for k, v in pairs]
     size = {"per_block": random.choice((1, 2, 8)), "interval": random.choice((1, 4))}
     return table(made, **size)
+
+
+def _tables(table: dict[str, Any]) -> list[dict[str, Any]]:
+    """A table of a flatbuffer and all in it."""
+    found = [table]
+    for value in table.values():
+        for each in value if isinstance(value, list) else [value]:
+            if isinstance(each, dict):
+                found += _tables(each)
+    return found
+
+
+def _field(table: dict[str, Any], random: Random, known: list[dict[str, Any]]) -> None:
+    if not table:
+        return
+    name = random.choice(sorted(table))
+    value = table[name]
+    if random.random() < 0.1:
+        del table[name]
+    elif isinstance(value, int):
+        table[name] = random.choice((mutation.number(random, value), random.randrange(8)))
+    elif isinstance(value, str):
+        table[name] = mutation.text(random, [str(t.get("name", "")).encode() for t in known]).decode("utf-8", "replace")
+    elif isinstance(value, dict):
+        table[name] = random.choice(known)
+    elif isinstance(value, bytes) or getattr(value, "dtype", None) == np.uint8:
+        table[name] = mutation.damaged(bytes(value), random)
+    elif isinstance(value, np.ndarray) or (value and not isinstance(value[0], dict)):
+        numbers = [*map(int, value)]
+        at = random.randrange(len(numbers) + 1)
+        new = random.choice((mutation.number(random), random.randrange(40), -1))
+        numbers[at : at + random.choice((0, 1, 1))] = [new] * random.choice((0, 1, 1, 4))
+        table[name] = numbers
+    elif value:
+        at = random.randrange(len(value))
+        table[name] = value[:at] + random.choice(([], value[:at], [random.choice(value)])) + value[at + 1 :]
+
+
+def flatbuffer(files: Files, random: Random) -> Files:
+    """Fields of the tables changed, and written anew with right offsets; or its bytes."""
+    ((name, data),) = files.items()
+    for _ in range(8):
+        model = copy.deepcopy(decoded(data))
+        for _ in range(random.choice((1, 1, 1, 2, 3, 6))):
+            known = _tables(model)
+            _field(random.choice(known), random, known)
+        with contextlib.suppress(struct.error, KeyError, OverflowError, TypeError, ValueError, RecursionError):
+            data = encoded(model).joined()
+            break
+    for _ in range(random.choice((0, 0, 0, 0, 1, 2))):
+        at = 4 * random.randrange(len(data) // 4)
+        number = mutation.number(random) & 0xFFFFFFFF
+        data = data[:at] + number.to_bytes(4, "little") + data[at + 4 :]
+    return {name: data if random.random() < 0.9 else mutation.damaged(data, random)}
 
 
 def checkpoint(files: Files, random: Random) -> Files:

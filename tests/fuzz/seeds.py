@@ -243,6 +243,10 @@ def _single_nn() -> list[Files]:
     return [{"policy.nn": data} for files in _artefacts("", ".nn") for data in files.values()]
 
 
+def _litert() -> list[Files]:
+    return [{"policy.tflite": data} for files in _artefacts("", ".tflite") for data in files.values()]
+
+
 def _recordings() -> list[Files]:
     """Three rows of each policy, under the names that its contract has."""
     return [
@@ -267,6 +271,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "SavedModel", Reader(_saved_models, changes.saved_model)
     yield "ONNX", Reader(_onnx, changes.one(changes.message(changes.onnx_message)), "policy.onnx")
     yield "Barracuda .nn", Reader(lambda: _single_nn(), changes.nn, "policy.nn")
+    yield "LiteRT", Reader(_litert, changes.flatbuffer, "policy.tflite")
     yield "checkpoint", Reader(_checkpoints, changes.checkpoint)
     yield "PyTorch", Reader(_torch, changes.pickled, "policy.pt")
     yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), changes.tfjs)

@@ -22,6 +22,7 @@ import numpy as np
 
 from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda.format import Layer, NnInput, NnModel
+from converters.formats.litert.flatbuffer import encoded
 from tests.barracuda.nn_files import write_nn
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
@@ -294,6 +295,44 @@ def _(folder: Path, count: int) -> Path:
         np.zeros(0, np.float32),
     )
     return _written(folder / "policy.nn", write_nn(model))
+
+
+def _lite(folder: Path, tensors: list[Any], operators: list[Any], **more: Any) -> Path:
+    tensors = [
+        {"name": "obs", "shape": [1, 3], "shape_signature": [-1, 3]},
+        {"name": "action", "shape": [1, 3]},
+        *tensors,
+    ]
+    subgraph = {"tensors": tensors, "inputs": [0], "outputs": [1], "operators": operators}
+    tanh = {"deprecated_builtin_code": 28, "builtin_code": 28, "version": 1}
+    model = {"version": 3, "operator_codes": [tanh], "subgraphs": [subgraph], "buffers": [{}], **more}
+    return _written(folder / "policy.tflite", encoded(model).joined())
+
+
+@maker(".tflite, a chain")
+def _(folder: Path, count: int) -> Path:
+    ends = [0, *range(2, count + 1), 1]
+    operators = [{"inputs": [a], "outputs": [b]} for a, b in itertools.pairwise(ends)]
+    return _lite(folder, [{"name": f"t{i}", "shape": [1, 3]} for i in range(count - 1)], operators)
+
+
+@maker(".tflite, one operator again and again")
+def _(folder: Path, count: int) -> Path:
+    return _lite(folder, [{"name": "t"}], [{"inputs": [0], "outputs": [1]}] * count)
+
+
+@maker(".tflite, tensors of one long name")
+def _(folder: Path, count: int) -> Path:
+    return _lite(
+        folder, [{"name": "t" * 10_000, "buffer": i % 3} for i in range(count)], [{"inputs": [0], "outputs": [1]}]
+    )
+
+
+@maker(".tflite, outputs")
+def _(folder: Path, count: int) -> Path:
+    ports = [{"name": f"y{i}", "tensor_index": 1} for i in range(count)]
+    called = {"inputs": [{"name": "obs"}], "outputs": ports, "signature_key": "serving_default"}
+    return _lite(folder, [], [{"inputs": [0], "outputs": [1]}], signature_defs=[called])
 
 
 def _onnx(folder: Path, nodes: list[Any], **more: Any) -> Path:
