@@ -24,8 +24,8 @@ from signatures.spec import PolicySignature
 from tests.chains.starts import Start
 
 #: What a hop gives to the next one: one format's artefact, or the bundle's folder.
-FORMS = ("bytes", "saved_model", "tfjs", "onnx", "bundle")
-_MAIN = {"bytes": "{name}.bytes", "saved_model": "saved_model", "tfjs": "tfjs", "onnx": "{name}.onnx", "bundle": ""}
+FORMS = ("bytes", "saved_model", "tfjs", "onnx", "litert", "bundle")
+_MAIN = {form: "" if form == "bundle" else WRITTEN[form].main for form in FORMS}
 #: Nothing is computed anew on the way, so the kernels may only differ by how a constant was folded.
 CLOSE = Tolerance(2e-6, 2e-6)
 
@@ -97,7 +97,7 @@ def assert_runs_alike(wanted: ExportResult, got: ExportResult, form: str, pool: 
     names = [s.name for s in signature.outputs if s.name not in random]
     kind = "tfjs" if form == "bundle" else form
     runtime = next(r for r in WRITTEN[kind].runtimes if r != "numpy")
-    loading = {"kind": "saved_model"} if kind == "saved_model" else {"kind": "graph"}
+    loading = {"kind": kind if kind in ("saved_model", "litert") else "graph"}
     models = [
         pool.process(runtime).load(str(r.folder / _MAIN[kind].format(name=r.policy.name)), **loading)
         for r in (wanted, got)
