@@ -18,7 +18,7 @@ import numpy as np
 from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda.format import _Parser
 from converters.formats.checkpoint.table import read_table
-from converters.formats.litert.flatbuffer import decoded, encoded
+from converters.formats.litert.flatbuffer import decode, encode
 from signatures.digest import sha256_hex
 from tests.checkpoint.writing import table
 from tests.fuzz import mutation
@@ -179,12 +179,12 @@ def flatbuffer(files: Files, random: Random) -> Files:
     """Fields of the tables changed, and written anew with right offsets; or its bytes."""
     ((name, data),) = files.items()
     for _ in range(8):
-        model = copy.deepcopy(decoded(data))
+        model = copy.deepcopy(decode(data))
         for _ in range(random.choice((1, 1, 1, 2, 3, 6))):
             known = _tables(model)
             _field(random.choice(known), random, known)
         with contextlib.suppress(struct.error, KeyError, OverflowError, TypeError, ValueError, RecursionError):
-            data = encoded(model).joined()
+            data = encode(model).to_bytes()
             break
     for _ in range(random.choice((0, 0, 0, 0, 1, 2))):
         at = 4 * random.randrange(len(data) // 4)

@@ -22,7 +22,7 @@ import numpy as np
 
 from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda.format import Layer, NnInput, NnModel
-from converters.formats.litert.flatbuffer import encoded
+from converters.formats.litert.flatbuffer import encode
 from tests.barracuda.nn_files import write_nn
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
@@ -306,7 +306,7 @@ def _lite(folder: Path, tensors: list[Any], operators: list[Any], **more: Any) -
     subgraph = {"tensors": tensors, "inputs": [0], "outputs": [1], "operators": operators}
     tanh = {"deprecated_builtin_code": 28, "builtin_code": 28, "version": 1}
     model = {"version": 3, "operator_codes": [tanh], "subgraphs": [subgraph], "buffers": [{}], **more}
-    return _written(folder / "policy.tflite", encoded(model).joined())
+    return _written(folder / "policy.tflite", encode(model).to_bytes())
 
 
 @maker(".tflite, a chain")

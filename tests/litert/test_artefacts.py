@@ -12,7 +12,7 @@ from converters.compiler.passes.weights import Storage
 from converters.files.children.process import RunFailedError
 from converters.formats.format import WriteOptions
 from converters.formats.litert.artifact import vetted
-from converters.formats.litert.flatbuffer import decoded, encoded
+from converters.formats.litert.flatbuffer import decode, encode
 from converters.formats.litert.schema import BUILTINS
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Node
@@ -113,7 +113,7 @@ def test_a_file_tells_its_contract_and_both_signatures(tmp_path: Path) -> None:
     held = WRITTEN["litert"].held
     assert held is not None
     assert parse(json.loads(held(file) or "")).signature == result.policy.signature
-    model = decoded(file.read_bytes())
+    model = decode(file.read_bytes())
     names = {s["signature_key"]: [e["name"] for e in s["inputs"]] for s in model["signature_defs"]}
     assert names == {"serving_default": ["state", "epsilon"], "deterministic": ["state"]}
     ports = WRITTEN["litert"].ports
@@ -135,7 +135,7 @@ def test_there_is_one_buffer_for_a_constant_and_no_operator_that_a_fused_one_doe
         layers.append(node(f"r{i}", "Relu", f"a{i}"))
         last = f"r{i}"
     (data,) = WRITTEN["litert"].artifact(policy_of(graph(*layers), [last]), WriteOptions("{}")).files.values()
-    model = decoded(data.to_bytes())
+    model = decode(data.to_bytes())
     (subgraph,) = model["subgraphs"]
     # the last is the copy that gives the output its name
     names = [model["operator_codes"][o.get("opcode_index", 0)]["builtin_code"] for o in subgraph["operators"]]
@@ -147,7 +147,7 @@ def test_there_is_one_buffer_for_a_constant_and_no_operator_that_a_fused_one_doe
 def test_signatures_of_the_same_tensors_share_a_function() -> None:
     (policy,) = read_source(path("recurrent")).policies()
     (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
-    model = decoded(data.to_bytes())
+    model = decode(data.to_bytes())
     assert len(model["signature_defs"]) == 2
     assert len(model["subgraphs"]) == 1
 
@@ -193,12 +193,12 @@ def test_a_bundle_is_verified_again_and_a_changed_weight_is_found(here: RuntimeP
     (result,) = exported(path("continuous"), tmp_path, here, "bytes")
     assert verify_bundle(result.folder, runtimes=list(LITERT)).passed
     file = result.folder / "continuous.tflite"
-    model = decoded(file.read_bytes())
+    model = decode(file.read_bytes())
     weights = max(model["buffers"], key=lambda b: len(b.get("data", b"")))
     array = np.frombuffer(bytes(weights["data"]), np.float32).copy()
     array[7] += 0.5
     weights["data"] = array
-    data = encoded(model).to_bytes()
+    data = encode(model).to_bytes()
     report = compare_artefacts(path("continuous"), _file(tmp_path / "theirs.tflite", data), runtimes=list(LITERT))
     assert not report.passed
     assert any("kernel" in str(f.bisection) for f in report.failures if f.bisection is not None)
@@ -212,11 +212,11 @@ def _file(place: Path, data: bytes) -> Path:
 def test_a_stranger_s_operator_is_not_handed_to_the_runtime(tmp_path: Path) -> None:
     (policy,) = read_source(path("continuous")).policies()
     (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()
-    model = decoded(data.to_bytes())
+    model = decode(data.to_bytes())
     custom = {"builtin_code": 32, "deprecated_builtin_code": 32, "custom_code": "FlexReadFile"}
     for code, name in ((custom, "FlexReadFile"), ({"builtin_code": 999}, "operator 999")):
         changed = {**model, "operator_codes": [*model["operator_codes"], code]}
-        file = _file(tmp_path / "theirs.tflite", encoded(changed).to_bytes())
+        file = _file(tmp_path / "theirs.tflite", encode(changed).to_bytes())
         with pytest.raises(UnsupportedOpError, match=name):
             vetted(file, [], tmp_path)
 
@@ -225,9 +225,9 @@ def test_a_file_without_signatures_is_called_by_its_tensors(here: RuntimePool, t
     """As ``tf.lite`` of 2019 wrote them."""
     made = graph(placeholder("x", (None, 3)), node("y", "Tanh", "x"))
     (data,) = WRITTEN["litert"].artifact(policy_of(made, ["y"]), WriteOptions("{}")).files.values()
-    model = decoded(data.to_bytes())
+    model = decode(data.to_bytes())
     del model["signature_defs"]
-    file = _file(tmp_path / "old.tflite", encoded(model).to_bytes())
+    file = _file(tmp_path / "old.tflite", encode(model).to_bytes())
     ports = WRITTEN["litert"].ports
     assert ports is not None
     found = ports(file)

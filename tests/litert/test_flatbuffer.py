@@ -12,7 +12,7 @@ import pytest
 
 from converters.formats.format import WriteOptions
 from converters.formats.litert import schema
-from converters.formats.litert.flatbuffer import decoded, encoded
+from converters.formats.litert.flatbuffer import decode, encode
 from converters.formats.registry import WRITTEN
 from exporter.export.sources import read_source
 from fixtures import FIXTURES, path
@@ -66,10 +66,10 @@ def same(ours: Any, other: Any, table: str) -> None:
 def test_litert_reads_the_tables_that_were_written(name: str) -> None:
     data = written(name)
     assert data[4:8] == b"TFL3"
-    model = decoded(data)
+    model = decode(data)
     same(model, generated.ModelT.InitFromPackedBuf(data, 0), "Model")
     assert written(name) == data
-    assert encoded(model).to_bytes() == data
+    assert encode(model).to_bytes() == data
 
 
 def test_weights_begin_where_vector_instructions_ask_for() -> None:
@@ -77,7 +77,7 @@ def test_weights_begin_where_vector_instructions_ask_for() -> None:
     for name in FIXTURES:
         data = written(name)
         start = np.frombuffer(data, np.uint8).ctypes.data
-        places = [b["data"].ctypes.data - start for b in decoded(data)["buffers"][1:]]
+        places = [b["data"].ctypes.data - start for b in decode(data)["buffers"][1:]]
         assert places
         assert [at % 16 for at in places] == [0] * len(places)
 
@@ -123,8 +123,8 @@ def test_large_numbers_and_all_kinds_of_fields_come_back() -> None:
     quantised = {"scale": [0.5, 0.25], "zero_point": [-(2**40), 3], "quantized_dimension": 1}
     tensor = {"name": "größe", "shape": [3, 2], "buffer": 1, "quantization": quantised, "is_variable": 1}
     model = {"version": 3, "buffers": buffers, "subgraphs": [{"tensors": [tensor, tensor]}]}
-    data = encoded(model).to_bytes()
-    found = decoded(data)
+    data = encode(model).to_bytes()
+    found = decode(data)
     same(found, generated.ModelT.InitFromPackedBuf(data, 0), "Model")
     assert found["buffers"][2] == {"size": 2**40, "offset": 7}
     assert np.frombuffer(found["buffers"][1]["data"], np.float32).tolist() == [0, 3, 1, 4, 2, 5]
@@ -145,7 +145,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_every_beginning_of_a_file_is_refused_or_read(small: bytes) -> None:
     for length in range(len(small)):
         with pytest.raises(DamagedFileError, match=r"the \.tflite file is damaged"):
-            decoded(small[:length])
+            decode(small[:length])
             raise DamagedFileError("the .tflite file is damaged", why="only its last bytes, of weights, are gone")
 
 
@@ -159,7 +159,7 @@ def test_changed_bytes_raise_nothing_but_that_it_is_damaged(small: bytes) -> Non
             value = random.choice((0, 1, 4, 8, random.getrandbits(31), 2**32 - 1, 2**31, len(data), len(data) - at))
             data[at : at + 4] = value.to_bytes(4, "little")
         try:
-            decoded(bytes(data))
+            decode(bytes(data))
         except DamagedFileError:
             refused += 1
     assert refused > 400
@@ -182,7 +182,7 @@ def test_what_many_lead_to_is_not_read_for_each_of_them() -> None:
     """Five hundred functions whose operators are one vector of five thousand: a few kilobytes, 2.5 million to read."""
     many = [{"name": str(i), "operators": [{"opcode_index": i + 1}]} for i in range(500)]
     last = {"operators": [{"opcode_index": 7}] * 5000}
-    data = bytearray(encoded({"version": 3, "subgraphs": [*many, last]}).to_bytes())
+    data = bytearray(encode({"version": 3, "subgraphs": [*many, last]}).to_bytes())
     _, *subgraphs = entries(data, number(data, "I", 0), 2)
     shared = entries(data, subgraphs[-1], 3)[0]
     vector = shared + number(data, "I", shared)
@@ -190,11 +190,11 @@ def test_what_many_lead_to_is_not_read_for_each_of_them() -> None:
         at = entries(data, subgraph, 3)[0]
         struct.pack_into("<I", data, at, vector - at)
     with pytest.raises(DamagedFileError, match="more often than a file of its length can"):
-        decoded(bytes(data))
+        decode(bytes(data))
 
 
 def test_equal_operators_stand_once_in_a_file() -> None:
     model = {"version": 3, "subgraphs": [{"operators": [{"opcode_index": 7}] * 9}] * 9}
-    data = encoded(model).to_bytes()
-    assert decoded(data)["subgraphs"][8]["operators"][8] == {"opcode_index": 7}
+    data = encode(model).to_bytes()
+    assert decode(data)["subgraphs"][8]["operators"][8] == {"opcode_index": 7}
     assert len(data) < 9 * 9 * 4 + 9 * 40 + 100

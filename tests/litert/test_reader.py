@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.formats.format import WriteOptions
-from converters.formats.litert.flatbuffer import Table, decoded, encoded
+from converters.formats.litert.flatbuffer import Table, decode, encode
 from converters.formats.litert.importer.table import TABLE as OPERATORS
 from converters.formats.litert.reader import read_litert
 from converters.formats.litert.schema import BUILTINS, OPTIONS, TYPES
@@ -59,7 +59,7 @@ def again(file: Path, text: str) -> bytes:
 
 def written(policy: Any, text: str) -> bytes:
     (pieces,) = WRITTEN["litert"].artifact(policy, WriteOptions(text)).files.values()
-    return pieces.joined()
+    return pieces.to_bytes()
 
 
 def _trip(source: Path, folder: Path) -> list[tuple[bytes, bytes]]:
@@ -200,12 +200,12 @@ def model_of(
 
 
 def graph_of(model: Table) -> Any:
-    return read_litert(encoded(model).joined()).graph
+    return read_litert(encode(model).to_bytes()).graph
 
 
 def answers(model: Table, feeds: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """(what the numpy kernels make of the graph that is read, what LiteRT's own make of the file)."""
-    data = encoded(model).joined()
+    data = encode(model).to_bytes()
     runner = interpreter.Interpreter(
         model_content=data,
         experimental_op_resolver_type=interpreter.OpResolverType.BUILTIN_WITHOUT_DEFAULT_DELEGATES,
@@ -483,7 +483,7 @@ def test_changed_tables_give_a_graph_or_an_error_of_ours(seed: int, tmp_path: Pa
     """Numbers of the tables of a whole policy, changed; ``make fuzz`` tries thousands."""
     draw = np.random.default_rng(seed)
     (policy,) = read_source(path("discrete")).policies()
-    model = decoded(written(policy, ""))
+    model = decode(written(policy, ""))
     for _ in range(3):
         subgraph = model["subgraphs"][0]
         table = draw.choice([*subgraph["tensors"], *subgraph["operators"]])
@@ -493,7 +493,7 @@ def test_changed_tables_give_a_graph_or_an_error_of_ours(seed: int, tmp_path: Pa
             numbers[int(draw.integers(len(numbers)))] = int(draw.choice([-1, 0, 1, 5, 77, 2**31 - 1]))
             table[vectors[0]] = numbers
     file = tmp_path / "policy.tflite"
-    file.write_bytes(encoded(model).joined())
+    file.write_bytes(encode(model).to_bytes())
     try:
         inspect_source(file)
     except ExportModelError as error:

@@ -12,7 +12,7 @@ from converters.files.fetch import read_bytes
 from converters.files.folders import scratch_folder
 from converters.formats.format import Port, Ports
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
-from converters.formats.litert.flatbuffer import Table, decoded, encoded
+from converters.formats.litert.flatbuffer import Table, decode, encode
 from converters.formats.litert.schema import BUILTINS, OPERATOR_NAMES
 from converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
@@ -25,7 +25,7 @@ def ports(path: Path) -> Ports:
 
     Raises SourceError, DamagedFileError.
     """
-    model = decoded(read_bytes(path))
+    model = decode(read_bytes(path))
     signatures = {str(s.get("signature_key", "")): s for s in model.get("signature_defs", ())}
     key = next((k for k in ("serving_default", *signatures) if k in signatures), "")
     signature = signatures.get(key, {})
@@ -46,7 +46,7 @@ def _port(name: str, subgraph: Table, number: int) -> Port:
 
 def held(path: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
-    return note(decoded(read_bytes(path)), EMBEDDED)
+    return note(decode(read_bytes(path)), EMBEDDED)
 
 
 def note(model: Table, name: str) -> str | None:
@@ -72,7 +72,7 @@ def vetted(path: Path, signatures: Sequence[str], folder: Path) -> Path:
 
     Raises UnsupportedOpError, DamagedFileError.
     """
-    model = decoded(read_bytes(path))
+    model = decode(read_bytes(path))
     others = [name for name in map(operator_of, model.get("operator_codes", ())) if name not in BUILTINS]
     if others:
         raise UnsupportedOpError(
@@ -82,25 +82,25 @@ def vetted(path: Path, signatures: Sequence[str], folder: Path) -> Path:
             fix="convert the policy with builtin operators alone",
         )
     copy = folder / path.name
-    encoded(model).write(copy)
+    encode(model).write(copy)
     return copy
 
 
 def function_alone(path: Path, function: int, ports: Collection[int]) -> bytes:
     """A copy with one function, that makes nothing but some tensors. Raises SourceError, DamagedFileError."""
-    model = decoded(read_bytes(path))
+    model = decode(read_bytes(path))
     subgraph = entry_of(model, "subgraphs", function)
     operators = needed(subgraph, ports, (int(i) for i in subgraph.get("inputs", ())))
     kept = {"version", "operator_codes", "buffers"}
     alone = {**subgraph, "operators": operators, "outputs": [*ports]}
-    return encoded({**{k: v for k, v in model.items() if k in kept}, "subgraphs": [alone]}).joined()
+    return encode({**{k: v for k, v in model.items() if k in kept}, "subgraphs": [alone]}).to_bytes()
 
 
 @contextmanager
 def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     """Those of a signature, in the same runtime: a copy gives them as further outputs."""
     key = loaded.signature or "serving_default"
-    model = decoded(loaded.path.read_bytes())
+    model = decode(loaded.path.read_bytes())
     signature = next(s for s in model["signature_defs"] if s["signature_key"] == key)
     subgraph = model["subgraphs"][signature.get("subgraph_index", 0)]
     tensors = subgraph["tensors"]
@@ -130,7 +130,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
                 "subgraphs": [wider if s is subgraph else s for s in model["subgraphs"]],
                 "signature_defs": [opened if s is signature else s for s in model["signature_defs"]],
             }
-            encoded(copy).write(file)
+            encode(copy).write(file)
             with loaded.pool.process(loaded.runtime).load(str(file), kind="litert", signature=key) as one:
                 values.update(one.run(given, wanted))
         return values

@@ -31,7 +31,7 @@ LARGEST = 2**31 - 1
 # ------------------------------------------------------------------ writing
 
 
-def encoded(model: Table) -> Pieces:
+def encode(model: Table) -> Pieces:
     """The file of a ``Model``; ``data`` is bytes or an array. Raises TooLargeError."""
     return _Writer().file(model)
 
@@ -169,7 +169,7 @@ def _joined(parts: Sequence[bytes | np.ndarray]) -> list[bytes | np.ndarray]:
 # ------------------------------------------------------------------ reading
 
 
-def decoded(data: bytes | memoryview) -> Table:
+def decode(data: bytes | memoryview) -> Table:
     """The ``Model`` of a file. Raises DamagedFileError."""
     return _Reader(data).model()
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from converters.compiler.options import MAX_PORTS
 from converters.formats.litert.artifact import note, operator_of
-from converters.formats.litert.flatbuffer import Table, decoded
+from converters.formats.litert.flatbuffer import Table, decode
 from converters.formats.litert.importer.importer import Importer
 from converters.formats.litert.importer.table import TABLE
 from converters.formats.litert.schema import VERSION
@@ -52,7 +52,7 @@ class LitertModel:
 
 def read_litert(data: bytes) -> LitertModel:
     """Read a file. Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError."""
-    model = decoded(data)
+    model = decode(data)
     if model.get("version", 0) != VERSION:
         raise NotAPolicyError(
             f"the .tflite file is of version {model.get('version', 0)} of its format",

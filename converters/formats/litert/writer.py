@@ -12,7 +12,7 @@ from converters.compiler.targets import LITERT, prepare
 from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
 from converters.formats.intermediate_tensors import View
-from converters.formats.litert.flatbuffer import Table, encoded
+from converters.formats.litert.flatbuffer import Table, encode
 from converters.formats.litert.schema import VERSION
 from converters.formats.litert.subgraph import Shared, Subgraph
 from converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
@@ -48,7 +48,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         "metadata": metadata,
         "signature_defs": signatures,
     }
-    return {f"{policy.name}.tflite": encoded(model)}
+    return {f"{policy.name}.tflite": encode(model)}
 
 
 def _function(

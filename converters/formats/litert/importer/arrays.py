@@ -162,7 +162,7 @@ def _top_k(op: Op, net: Importer) -> list[str]:
 def _cumulated(op: Op, net: Importer) -> str:
     axis = net.axis(op.need(0), _axis(op, net, 1))
     x = nn.last(net, op.need(0), axis)
-    return nn.moved_back(net, nn.cumulated(net, x, exclusive=op.flag("exclusive"), reverse=op.flag("reverse")), axis)
+    return nn.moved_back(net, nn.cumulate(net, x, exclusive=op.flag("exclusive"), reverse=op.flag("reverse")), axis)
 
 
 def _drawn(kind: str) -> Translate:

@@ -69,7 +69,7 @@ def _cast(op: Op, net: Importer) -> str:
 
 def _softmax(op: Op, net: Importer) -> str:
     """Over the last axis; ``beta`` is a factor in front, 1 in every model that TensorFlow's converter makes."""
-    return net.add("Softmax", [nn.scaled(net, op.need(0), op.number("beta"))])
+    return net.add("Softmax", [nn.scale_and_shift(net, op.need(0), op.number("beta"))])
 
 
 def _leaky_relu(op: Op, net: Importer) -> str:
