@@ -66,7 +66,7 @@ def _trip(source: Path, folder: Path) -> list[tuple[bytes, bytes]]:
     """Of each policy: its file, and what is written of that file under the same contract."""
     found, place = read_source(source), folder / "policy.tflite"
     trips = []
-    for model, policy in found.compiled(None):
+    for model, policy in found.compile_models(None):
         named = replace(policy, name=safe_name(policy.name))
         text = contract_of(named, found, model, ReadOptions()).compact()
         place.write_bytes(written(named, text))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from converters.files.fetch import Fetched
 from converters.formats.bundle.embed import contract_of, facts_of, redrawn
 from converters.formats.litert.reader import LitertModel, read_litert
-from converters.formats.saved_model.signature import exposed
+from converters.formats.saved_model.signature import expose_signature
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from converters.graph.ops.table import traits
 from converters.policy.facts import DOUBLES_NARROWED
@@ -26,7 +26,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         contract = contract_of(model.contract)
         graph = redrawn(model.graph, contract)
         return [SourceModel(graph, (given.path,), facts_of(graph, contract), contract.name, original)]
-    graph, facts = exposed(model.graph, model.signature, _notes(model))
+    graph, facts = expose_signature(model.graph, model.signature, _notes(model))
     return [SourceModel(graph, (given.path,), facts, original=original, producer=model.description)]
 
 
