@@ -27,12 +27,12 @@ def importable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None
         found = list(misreadings(model, profile.importers))
         unknown = [c for c in model if c.op not in MEASURED]
         if found:
-            first = found[0]
+            first, tried = found[0], path.rpartition(".")[2]
             raise ProfileError(
                 f"{name!r} cannot be made for {profile.name}: {first.importer} does not read its {first.construct.op}",
                 where=f"node {first.construct.name}",
                 why=f"{first.rule.reading.value}: {first.rule.says} (measured: {first.rule.evidence})",
-                fix=f"{other_format(profile, 'onnx')}export for a later consumer (--for help lists them)",
+                fix=f"{other_format(profile, tried)}export for a later consumer (--for help lists them)",
             )
         if unknown:
             raise ProfileError(

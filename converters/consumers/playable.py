@@ -12,6 +12,7 @@ from converters.consumers.unity.consumers import consumer
 from converters.consumers.unity.onnx_file import parsed_onnx
 from converters.files.chunks import Pieces
 from converters.formats.barracuda.format import parse
+from converters.formats.registry import BARRACUDA, ONNX
 from signatures.errors import ProfileError
 
 
@@ -32,10 +33,10 @@ def _verdicts(profile: Profile, files: Mapping[str, Pieces]) -> Iterator[UnityVe
     for path, data in files.items():
         if path.endswith(".onnx"):
             file = parsed_onnx(data.to_bytes())
-            yield from (check_onnx(file, Path(path), r) for r in releases if "onnx" in r.formats)
+            yield from (check_onnx(file, Path(path), r) for r in releases if ONNX.key in r.formats)
         elif path.endswith(".nn"):
             model = parse(data.to_bytes())
-            yield from (check_nn(model, Path(path), r) for r in releases if "nn" in r.formats)
+            yield from (check_nn(model, Path(path), r) for r in releases if BARRACUDA.key in r.formats)
 
 
 def _refuse(

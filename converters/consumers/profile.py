@@ -21,6 +21,7 @@ class Profile:
     releases of ``converters/consumers/unity/consumers.py`` whose checks must accept it, ``players`` those whose player
     must play it. ``opset`` is the ONNX opset.
     ``own_names`` are formats whose writer gives a policy the consumer's names by itself (``.nn`` of API version 2).
+    ``code`` is the snippet that says how to use its files.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Profile:
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()
     players: tuple[str, ...] = ()
+    code: str = "agent"
 
     def write_options(self, contract: str) -> WriteOptions:
         """Return how a writer makes the files of this consumer."""

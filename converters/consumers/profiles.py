@@ -8,6 +8,7 @@ from converters.consumers.mlagents import version2, version3
 from converters.consumers.mlagents.tensorflowsharp import Generation, dress
 from converters.consumers.profile import Profile
 from converters.consumers.unity.consumers import releases_for
+from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX
 from signatures.errors import UsageError, suggestion
 
 #: What CoreBrainInternal.cs gave as pictures until 0.4.0b.
@@ -25,7 +26,13 @@ _GENERATIONS = (
 )
 #: ML-Agents 0.1 to 0.6 on the TensorFlowSharp plugin: a ``.bytes`` for each generation.
 TFSHARP = tuple(
-    Profile(name=g.name, purpose=purpose, formats=("bytes",), dress=partial(dress, generation=g))
+    Profile(
+        name=g.name,
+        purpose=purpose,
+        formats=(FROZEN_GRAPH.key,),
+        dress=partial(dress, generation=g),
+        code="internal-brain",
+    )
     for g, purpose in _GENERATIONS
 )
 _UNITY6 = releases_for("unity6")
@@ -35,7 +42,7 @@ PROFILES: tuple[Profile, ...] = (
         name="unity6",
         aliases=("sentis", "inference-engine"),
         purpose="ML-Agents 3.0 and 4.0 in Unity 2023 and Unity 6 (Sentis 2.1, Inference Engine 2.2 to 2.4)",
-        formats=("onnx",),
+        formats=(ONNX.key,),
         # PreviousActionInputGenerator of 3.0.0 throws at the first decision (../shared/unity/r3/player.json)
         dress=partial(version3.dress, profile="unity6", feeds_previous=False),
         importers=tuple(c.runtime for c in _UNITY6),
@@ -46,7 +53,7 @@ PROFILES: tuple[Profile, ...] = (
         name="barracuda-3",
         aliases=("barracuda",),
         purpose="ML-Agents 2.3 (release 20) in Unity 2020 to 2022 (Barracuda 3.0)",
-        formats=("onnx", "nn"),
+        formats=(ONNX.key, BARRACUDA.key),
         # measured in releases 20 and 2.0.1: ../shared/unity/r3/minimal/rank2.jsonl
         dress=partial(version3.dress, profile="barracuda-3", transposes_buffers=True),
         opset=12,
@@ -57,7 +64,7 @@ PROFILES: tuple[Profile, ...] = (
     Profile(
         name="barracuda-1.4",
         purpose="ML-Agents 2.0 to 2.2 (releases 17 to 19) in Unity 2019 to 2021 (Barracuda 1.4 to 2.3)",
-        formats=("onnx", "nn"),
+        formats=(ONNX.key, BARRACUDA.key),
         dress=partial(version3.dress, profile="barracuda-1.4", transposes_buffers=True),
         opset=12,
         importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),
@@ -68,8 +75,8 @@ PROFILES: tuple[Profile, ...] = (
         name="barracuda-1.0",
         purpose="ML-Agents 1.0 to 1.9 (releases 1 to 16) in Unity 2018 to 2020 (Barracuda 1.0 to 1.3); "
         "memory in .nn alone",
-        formats=("onnx", "nn"),
-        own_names=frozenset({"nn"}),
+        formats=(ONNX.key, BARRACUDA.key),
+        own_names=frozenset({BARRACUDA.key}),
         dress=partial(version2.dress, profile="barracuda-1.0"),
         opset=11,
         importers=("Barracuda 1.1.2", "Barracuda 1.4.0"),

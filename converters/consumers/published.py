@@ -36,7 +36,7 @@ def published() -> dict[str, Any]:
                 "name": p.name,
                 "purpose": p.purpose,
                 "formats": list(p.formats),
-                "opset": p.opset if "onnx" in p.formats else None,
+                "opset": p.opset if p.importers else None,
                 "importers": list(p.importers),
                 "releases": list(dict.fromkeys((*p.checkers, *p.players))),
             }

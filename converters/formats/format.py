@@ -17,17 +17,23 @@ from typing import TYPE_CHECKING, Any
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from converters.compiler.passes.weights import Storage
     from converters.files.chunks import Pieces
     from converters.files.fetch import Fetched
     from converters.files.file_probe import Content
     from converters.formats.intermediate_tensors import InnerTensors, Loaded
     from converters.formats.source import ReadOptions, SourceModel
+    from converters.graph.jitter import Jitter
+    from converters.graph.nodes import Graph
     from converters.policy.policy import Policy
     from signatures.contract import FileEntry
     from signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
+#: Takes inputs by name, what to fetch, and how rounding is disturbed (None: not at all).
+Kernels = Callable[["dict[str, np.ndarray]", Sequence[str], "Jitter | None"], "dict[str, np.ndarray]"]
 
 
 class _Deferred:
@@ -159,7 +165,10 @@ class Format:
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
       once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
       source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
-      ``answers`` are the outputs of a policy that an artefact answers (None: all). ``narrow``: it can hold weights in
+      ``answers`` are the outputs of a policy that an artefact answers (None: all). ``graph`` reads the graph of an
+      artefact of ours, ``kernels`` runs one by the numpy kernels (None: what its reader makes of it is run).
+      ``elsewhere`` is what alone runs it besides, where that cannot be asked; ``unity``: Unity loads it, if its names
+      are those that a profile (``--for``) gives. ``narrow``: it can hold weights in
       float16 or int8. ``fixed``: it can be written for a fixed number of agents.
       ``library`` is a Python package that runs such a file by itself; verification does not ask it.
       ``program``: it is source code, which is run right after it was written and never again, since anyone may have
@@ -190,6 +199,10 @@ class Format:
     snippets: tuple[Code, ...] = ()
     dtypes: frozenset[str] = frozenset()
     answers: Callable[[PolicySignature], list[str]] | None = None
+    graph: Callable[[Path], Graph] | None = None
+    kernels: Callable[[Path], Kernels] | None = None
+    elsewhere: str = ""
+    unity: bool = False
     narrow: bool = False
     fixed: bool = False
     library: str = ""

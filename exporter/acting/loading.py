@@ -18,12 +18,12 @@ from signatures.fields import printable
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
     from converters.formats.bundle.bundle import Declared
+    from converters.formats.format import Format
     from converters.formats.source import ReadOptions
 
 Array = np.ndarray
-#: Runtime → the format that it runs.
-_TAKES = {"onnxruntime": "onnx", "numpy": "bytes"}
-RUNTIMES = tuple(_TAKES)
+#: What runs a policy in this process, the preferred first.
+RUNTIMES = ("onnxruntime", "numpy")
 
 
 def load_policy(
@@ -59,17 +59,23 @@ def load_as(
     return _of_source(path, runtime, seed, compiling, read)
 
 
-def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
-    from converters.formats.bundle.bundle import Bundle
+def _taken_by(runtime: str) -> Format:
+    """The format that a runtime runs before all others."""
     from converters.formats.registry import WRITTEN
 
+    return next(f for f in WRITTEN.values() if f.runtimes[:1] == (runtime,))
+
+
+def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
+    from converters.formats.bundle.bundle import Bundle
+
     found = Bundle.open(folder)
-    named = {r: found.path(WRITTEN[key]) for r, key in _TAKES.items() if found.has(WRITTEN[key])}
+    named = {r: found.path(_taken_by(r)) for r in RUNTIMES if found.has(_taken_by(r))}
     files = {r: path for r, path in named.items() if path.is_file()}
     here = [r for r in RUNTIMES if r in files and (r == "numpy" or importlib.util.find_spec(r) is not None)]
     if runtime is not None and runtime not in here:
         if runtime not in files:
-            wanted = found.path(WRITTEN[_TAKES[runtime]]).name
+            wanted = found.path(_taken_by(runtime)).name
             raise BundleError(f"has no {wanted}", where=str(folder), fix="export the policy with it again")
         raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
     if not here:
@@ -80,7 +86,7 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
             fix="export the policy with --to bytes,onnx",
         )
     chosen = runtime or here[0]
-    found.verify_hashes(WRITTEN[_TAKES[chosen]])
+    found.verify_hashes(_taken_by(chosen))
     kept = found.contract.source.noise_kept and bool(found.contract.source.noise)
     signature = found.signature
     with naming(files[chosen]):
@@ -96,7 +102,6 @@ def _of_source(
 ) -> LoadedPolicy:
     """A source's only policy, compiled and written in memory."""
     from converters.formats.format import WriteOptions
-    from converters.formats.registry import WRITTEN
     from exporter.export.sources import read_source
 
     policies = read_source(path, read).policies(compiling)
@@ -110,7 +115,7 @@ def _of_source(
     if importlib.util.find_spec(chosen) is None:
         raise RuntimeUnavailableError("onnxruntime is not installed", fix="pip install 'export-model[onnxruntime]'")
     with naming(path):
-        artifact = WRITTEN[_TAKES[chosen]].artifact(policy, WriteOptions("{}"))
+        artifact = _taken_by(chosen).artifact(policy, WriteOptions("{}"))
         run, _ = _RUNS[chosen](artifact.files[artifact.main].to_bytes())
     kept = policy.source.noise_kept and bool(policy.source.noise)
     return LoadedPolicy(policy.name, policy.signature, run, chosen, seed, draws_itself=kept)
@@ -160,9 +165,8 @@ def _for_onnxruntime(path: Path, names: Sequence[str]) -> bytes:
 
 def _for_numpy(path: Path, names: Sequence[str]) -> bytes:
     from converters.files.folders import scratch_folder
-    from converters.formats.registry import WRITTEN
 
-    vetted = WRITTEN["bytes"].vetted
+    vetted = _taken_by("numpy").vetted
     assert vetted is not None
     with scratch_folder() as folder:
         return vetted(path, names, folder).read_bytes()

@@ -205,7 +205,7 @@ class Console:
             say(f"next: {command_text('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         ours = results[-1].policy.signature.family.startswith("ML-Agents")
-        if ours and names == "canonical" and not {"bytes", "onnx"}.isdisjoint(results[-1].sizes):
+        if ours and names == "canonical" and _can_be_dressed(results[-1].sizes):
             say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
         say(f"next: {_next(results)}")
 
@@ -213,6 +213,13 @@ class Console:
         """The answer for a program, where it was asked for."""
         if self.as_json:
             say_json(content)
+
+
+def _can_be_dressed(sizes: Mapping[str, int]) -> bool:
+    """Whether a format was written that Unity loads, under other names."""
+    from converters.formats.registry import WRITTEN
+
+    return any(WRITTEN[key].unity for key in sizes)
 
 
 def _next(results: Sequence[ExportResult]) -> str:
@@ -232,7 +239,9 @@ def _next(results: Sequence[ExportResult]) -> str:
         install = to_verify(last.report)
         if install is not None:
             return hint(install, f"then: {command_text('verify', last.folder)}")
-    if {"tfjs", "bytes"} <= {*last.sizes}:
+    from exporter.serve.site import NEEDED
+
+    if NEEDED.keys() <= last.sizes.keys():
         return hint(command_text("serve", last.folder), "see it act, in a browser")
     return hint(command_text("snippets", last.folder), "code for Python, JavaScript, C#, Unity, TF Serving")
 

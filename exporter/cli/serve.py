@@ -77,10 +77,11 @@ def _bundle_of(place: Path) -> Iterator[Path]:
     from converters.files.folders import scratch_folder
     from exporter.export.options import ExportOptions
     from exporter.export.pipeline import export
+    from exporter.serve.site import NEEDED
     from exporter.tables import command_text
 
     with scratch_folder() as folder:
-        results = list(export([place], ExportOptions(folder, ("bytes", "tfjs"), verify="none")))
+        results = list(export([place], ExportOptions(folder, tuple(NEEDED), verify="none")))
         if len(results) > 1:
             raise UsageError(
                 f"{place} holds {len(results)} policies",

@@ -22,7 +22,6 @@ from converters.files.children.process import LoadedModel, RunFailedError
 from converters.files.folders import scratch_folder, size_of
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.format import Format, Port, Ports
-from converters.formats.frozen_graph.writer import frozen_graph
 from converters.formats.read import ports_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
@@ -35,7 +34,17 @@ from exporter.remote.fetching import nearby
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Failure, Feeds, Participant, PolicyUnderTest, Run, loading
+from exporter.verify.participants import (
+    Failure,
+    Feeds,
+    Participant,
+    PolicyUnderTest,
+    Run,
+    loaded,
+    loading,
+    policy_under_test,
+    write_reference,
+)
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance, check_rules
@@ -150,24 +159,15 @@ def compare_artefacts(
             check_rules(options.rules, outputs, {m.format.key: m.format.runtimes for m in matched}, used)
         folder = Path(opened.enter_context(scratch_folder()))
         pool = opened.enter_context(RuntimePool()) if pool is None else pool
-        reference_file = folder / "reference.bytes"
-        frozen_graph(policy).write(reference_file)
+        reference_file = write_reference(policy, folder)
         copies = [_safe_copy(m, folder / str(number)) for number, m in enumerate(matched)]
         own = rounded_to(reference)
         kept = [None if (storage := rounded_to(path)) == own else storage for path, *_ in artefacts]
         reports = []
         for storage in dict.fromkeys(kept):
             chosen = [(m, copy) for m, copy, of in zip(matched, copies, kept, strict=True) if of == storage]
-            tested = PolicyUnderTest(
-                policy.name,
-                policy.signature,
-                policy.graph,
-                {},
-                {m.label: size_of(m.ports.path) for m, _ in chosen},
-                reference_file,
-                source,
-                policy.source,
-            )
+            sizes = {m.label: size_of(m.ports.path) for m, _ in chosen}
+            tested = policy_under_test(policy, {}, folder, sizes=sizes, reference=reference_file, source=source)
             compared = partial(_compare, policy, chosen, used, known, pool, options, progress, judge)
             if storage is None:
                 reports.append(compared(tested))
@@ -391,31 +391,33 @@ def _participants(
     chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
         again = loading(runtime, path, candidate.ports.options, partial(_run_renamed, candidate))
-        try:
-            model, run = again(pool, False)
-        except RunFailedError as error:
-            failure(candidate.label, runtime, error, "*")
-            for problem in candidate.problems:
-                failure(candidate.label, runtime, RunFailedError(problem.text), problem.name)
-            continue
-        blocked = any(p.blocking for p in candidate.problems)
-        hints = {} if blocked else _same_numbers(candidate, policy, numpy_model, model)
-        for problem in candidate.problems:
-            failure(candidate.label, runtime, RunFailedError(problem.text + hints.get(problem.name, "")), problem.name)
-        if candidate.outputs and not blocked:
-            yield Participant(
-                ":".join((candidate.format.key, *filter(None, [candidate.ports.options.get("signature")]))),
-                runtime,
-                run,
-                list(candidate.outputs),
-                model,
-                candidate.label,
-                candidate.drawn,
-                path,
-                candidate.own_feeds,
-                again,
-            )
-        model.unload()
+        for model, run in loaded(again, pool, partial(_not_loaded, candidate, failure, runtime)):
+            blocked = any(p.blocking for p in candidate.problems)
+            hints = {} if blocked else _same_numbers(candidate, policy, numpy_model, model)
+            _misfits(candidate, failure, runtime, hints)
+            if candidate.outputs and not blocked:
+                yield Participant(
+                    format=":".join((candidate.format.key, *filter(None, [candidate.ports.options.get("signature")]))),
+                    runtime=runtime,
+                    run=run,
+                    outputs=list(candidate.outputs),
+                    model=model,
+                    label=candidate.label,
+                    drawn=candidate.drawn,
+                    path=path,
+                    fed=candidate.own_feeds,
+                    again=again,
+                )
+
+
+def _not_loaded(candidate: _Candidate, failure: Failure, runtime: str, error: RunFailedError, output: str) -> None:
+    failure(candidate.label, runtime, error, output)
+    _misfits(candidate, failure, runtime, {})
+
+
+def _misfits(candidate: _Candidate, failure: Failure, runtime: str, hints: Mapping[str, str]) -> None:
+    for problem in candidate.problems:
+        failure(candidate.label, runtime, RunFailedError(problem.text + hints.get(problem.name, "")), problem.name)
 
 
 def _same_numbers(

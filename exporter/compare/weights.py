@@ -10,13 +10,12 @@ from pathlib import Path
 
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.bundle import Bundle
-from converters.formats.frozen_graph.writer import frozen_graph
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.export.options import storage_of
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import PolicyUnderTest
+from exporter.verify.participants import PolicyUnderTest, write_reference
 from exporter.verify.report import ParityReport
 from signatures.contract import POLICY
 
@@ -44,10 +43,9 @@ def compare_rounded(
 
     ``folder`` is where the rounded policy is written to.
     """
-    graph = round_weights(tested.graph, storage)
-    reference = folder / f"reference-{storage}.bytes"
-    small = replace(tested, graph=graph, reference=reference, source=None)
-    frozen_graph(replace(policy, graph=graph)).write(reference)
+    small_policy = replace(policy, graph=round_weights(tested.graph, storage))
+    reference = write_reference(small_policy, folder, f"reference-{storage}")
+    small = replace(tested, graph=small_policy.graph, reference=reference, source=None)
     report = run(small)
     found = decisions(tested, small, storage, runtimes, pool, options or VerifyOptions())
     ran = tested.source.runtime if found and tested.source and tested.source.runtime in runtimes else None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import writing
+from converters.formats.registry import BARRACUDA, ONNX
 from exporter.demo import BALL, HALLWAY
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import export
@@ -43,6 +44,7 @@ def write_files(out: Path) -> None:
 def _contents() -> list[bytes]:
     ball, hallway = BALL.read_bytes(), HALLWAY.read_bytes()
     with scratch_folder() as folder:
-        (result,) = export([BALL], ExportOptions(Path(folder), ("onnx", "nn"), verify="none"))
-        onnx, barracuda = ((result.folder / f"3DBall.{suffix}").read_bytes() for suffix in ("onnx", "nn"))
+        forms = (ONNX, BARRACUDA)
+        (result,) = export([BALL], ExportOptions(Path(folder), [f.key for f in forms], verify="none"))
+        onnx, barracuda = ((result.folder / f.main_of(BALL.stem)).read_bytes() for f in forms)
     return [ball, onnx, barracuda, hallway, ball, hallway]

@@ -12,8 +12,7 @@ import numpy as np
 from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import Bundle, unfit
 from converters.formats.bundle.embed import runnable
-from converters.formats.frozen_graph.writer import frozen_graph
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.saved_model.writer import signatures_of
 from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
@@ -24,9 +23,8 @@ from exporter.export.options import storage_of
 from exporter.export.pipeline import Progress, consumer, join_reports
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
-from exporter.verify.inner_tensors import saved_graph
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import PolicyUnderTest
+from exporter.verify.participants import policy_under_test, write_reference
 from exporter.verify.report import ParityReport
 from exporter.verify.verification import verify
 from signatures.contract import POLICY, Contract, safe_name
@@ -34,6 +32,9 @@ from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, 
 from signatures.fields import printable
 from signatures.roles import Role
 from signatures.spec import PolicySignature
+
+#: The runtime that is our own kernels in numpy.
+KERNELS = "numpy"
 
 if TYPE_CHECKING:
     from converters.consumers.profile import Profile
@@ -73,10 +74,11 @@ def verify_folder(
     if read is not None and made_for is None:
         _check_meaning(read, contract, folder)
     # Without the source, it is the consumer alone that is asked.
-    asked = again is None and made_for is not None and not {"bytes", "nn"} & artefacts.keys()
+    judge = next((f for f in formats if KERNELS in f.runtimes), None)
+    asked = again is None and made_for is not None and judge is None
     if asked:
-        _check_asked(folder, artefacts, str(made_for), runtimes, options)
-    reference = artefacts.get("bytes", artefacts.get("nn")) or (artefacts["onnx"] if made_for else found.graph_file)
+        _check_asked(found, str(made_for), runtimes, options)
+    reference = found.graph_file if judge is None and made_for is None else found.path(judge or formats[0])
     for each in formats:
         if each.held is not None:
             with naming(artefacts[each.key]):
@@ -85,7 +87,7 @@ def verify_folder(
     formats = [f for f in formats if not f.program] or formats
     artefacts = {f.key: artefacts[f.key] for f in formats}
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
-    if "bytes" in artefacts:
+    if FROZEN_GRAPH.key in artefacts:
         with naming(reference):
             embedding = found.graph()
         graph = _whole_graph(embedding, names, artefacts)
@@ -103,17 +105,21 @@ def verify_folder(
         contract.source,
     )
     used, known = chosen_runtimes(runtimes, formats)
-    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
     sizes = {f.key: found.size(f) for f in formats}
     with scratch_folder() as scratch, RuntimePool() as pool:
-        copies = _safe_copies(artefacts, names, list(keys), scratch)
-        if again is not None:
-            reference = scratch / "reference.bytes"
-            frozen_graph(again.policy).write(reference)
-        tested = PolicyUnderTest(
-            found.name, signature, graph, copies, sizes, reference, original, contract.source, keys,
-            made_for, artefacts, contract.tool.get("batch"), read is not None and runs_elsewhere(read),
-        )  # fmt: skip
+        copies = _safe_copies(artefacts, names, list(signatures_of(policy)), scratch)
+        tested = policy_under_test(
+            policy,
+            copies,
+            scratch,
+            sizes=sizes,
+            reference=reference if again is None else write_reference(again.policy, scratch),
+            source=original,
+            files=artefacts,
+            profile=made_for,
+            batch=contract.tool.get("batch"),
+            runs_elsewhere=read is not None and runs_elsewhere(read),
+        )
         weights = contract.tool.get("weights")
         # What was rounded is held against itself; the source is asked what it decides.
         held = replace(tested, source=None) if weights else tested
@@ -136,12 +142,16 @@ def verify_folder(
         )
         return replace(report, notes=(*report.notes, note))
     if source is None:
-        own = "bytes" if "bytes" in artefacts else "nn"
+        own = (judge or FROZEN_GRAPH).key
         note = f"the source was not given: the reference is the bundle's own .{own}"
-        report = replace(report, reference=f"{own}/numpy", notes=(*report.notes, note), self_consistent=False)
-    if report.passed is None and set(artefacts) == {"nn"}:
-        # No runtime outside Unity has it, so none can be asked for: the files are whole and one contract says so.
-        note = "only Unity runs a .nn: its bytes, its contract and that it answers by our own reader were verified"
+        report = replace(report, reference=f"{own}/{KERNELS}", notes=(*report.notes, note), self_consistent=False)
+    (first, *others) = formats
+    if report.passed is None and first.elsewhere and not others:
+        # No runtime that is here has it, so none can be asked for: the files are whole and one contract says so.
+        note = (
+            f"only {first.elsewhere} runs a .{first.key}: its bytes, its contract and that it answers by our own "
+            "reader were verified"
+        )
         report = replace(report, notes=(*report.notes, note))
     elif report.passed is None and not report.undecided and not (allow_unverified or runtimes == "none"):
         raise RuntimeUnavailableError(
@@ -171,15 +181,10 @@ def _safe_copies(
     return copies
 
 
-def _check_asked(
-    folder: Path,
-    artefacts: Mapping[str, Path],
-    made_for: str,
-    runtimes: str | Sequence[str],
-    options: VerifyOptions | None,
-) -> None:
+def _check_asked(found: Bundle, made_for: str, runtimes: str | Sequence[str], options: VerifyOptions | None) -> None:
     """Raise where a bundle in a consumer's names lacks the file, or is to be compared without its source."""
-    if "onnx" not in artefacts:
+    folder = found.folder
+    if not any(found.has(WRITTEN[key]) for key in consumer(made_for).formats):
         raise unfit(folder, "has no file that its consumer loads", f"it was made for {made_for}")
     if runtimes != "auto" or (options is not None and (options.golden or options.rules)):
         raise UsageError(
@@ -191,17 +196,19 @@ def _check_asked(
 
 
 def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Path]) -> Graph:
-    """A graph that has all inputs and outputs: the .bytes', else the SavedModel's.
+    """A graph that has all inputs and outputs: the .bytes', else another file's.
 
-    A .bytes that lacks one is what the comparison is to find; raises BundleError where there is no SavedModel either.
+    A .bytes that lacks one is what the comparison is to find; raises BundleError where all lack one.
     """
     missing = [name for name in names if name not in graph]
-    if missing and "saved_model" in artefacts:
-        with naming(artefacts["saved_model"]):
-            graph = saved_graph(artefacts["saved_model"])
-        missing = [name for name in names if name not in graph]
+    for key, path in artefacts.items():
+        read = WRITTEN[key].graph
+        if missing and read is not None:
+            with naming(path):
+                graph = read(path)
+            missing = [name for name in names if name not in graph]
     if missing:
-        raise unfit(artefacts["bytes"], f"has no tensor {missing[0]!r}", f"{POLICY} names it")
+        raise unfit(artefacts[FROZEN_GRAPH.key], f"has no tensor {missing[0]!r}", f"{POLICY} names it")
     return graph
 
 

@@ -126,33 +126,18 @@ def contract_of(
 
 def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     """A policy whose artefacts lie in ``stage``; what else verification needs is put into ``scratch``."""
-    from converters.formats.frozen_graph.writer import frozen_graph
-    from converters.formats.saved_model.writer import signatures_of
-    from exporter.verify.participants import PolicyUnderTest
+    from exporter.verify.participants import policy_under_test
 
-    policy = job.policy
     paths = {a.format.key: stage / a.main for a in artifacts}
-    reference = paths.get("bytes")
-    if reference is None:
-        # The numpy reference reads a .bytes; one is made for it where none was asked for.
-        scratch.mkdir(exist_ok=True)
-        reference = scratch / "reference.bytes"
-        frozen_graph(policy).write(reference)
-    keys = {k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()}
-    return PolicyUnderTest(
-        policy.name,
-        policy.signature,
-        policy.graph,
+    return policy_under_test(
+        job.policy,
         paths,
-        {a.format.key: a.size for a in artifacts},
-        reference,
-        job.model.original if job.own is None and job.whole is None else None,
-        policy.source,
-        keys,
-        None if job.profile is None else job.profile.name,
-        paths,
-        job.batch,
-        runs_elsewhere(job.source),
+        scratch,
+        sizes={a.format.key: a.size for a in artifacts},
+        source=job.model.original if job.own is None and job.whole is None else None,
+        profile=None if job.profile is None else job.profile.name,
+        batch=job.batch,
+        runs_elsewhere=runs_elsewhere(job.source),
     )
 
 

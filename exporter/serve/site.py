@@ -12,7 +12,7 @@ from converters.files.fetch import Fetched
 from converters.formats.bundle.bundle import Bundle, dumps, writing
 from converters.formats.bundle.embed import runnable
 from converters.formats.bundle.exchange import exchange, stage
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import FROZEN_GRAPH, ONNX, TFJS, WRITTEN
 from converters.formats.tfjs.reader import content_of
 from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from converters.runtimes.js import KERNELS
@@ -36,6 +36,11 @@ MARK = f'<meta name="generator" content="{MADE_BY}">'.encode()
 #: Bytes at the beginning of a page of one file, among which the mark is.
 _HEAD = 2000
 
+#: The formats that a page is made of, and why.
+NEEDED = {
+    TFJS.key: "the page runs TensorFlow.js",
+    FROZEN_GRAPH.key: "what the page's answers are held against is computed from it",
+}
 _TFJS = "@tensorflow/tfjs"
 _ORT = "onnxruntime-web"
 
@@ -83,7 +88,7 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     those of policy.json, it holds no TensorFlow.js or no .bytes), UsageError (the scene does not fit).
     """
     site, said = _content(folder, scene)
-    vendor, backends, absent = _vendor("onnx" in said["models"]["model"])
+    vendor, backends, absent = _vendor(ONNX.key in said["models"]["model"])
     site.update(vendor)
     site[SITE] = dumps({**said, "backends": [_JS, *backends], "absent": absent})
     site[INDEX] = _asking_at_once(site)
@@ -98,9 +103,9 @@ def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
 
     site, said = _content(folder, scene)
     with naming(folder):  # it stands in the page as JSON, so it has to be some
-        content_of(Fetched(folder / "tfjs"))
+        content_of(Fetched(Bundle.open(folder).path(TFJS)))
     for place in said["models"].values():
-        site.pop(place.pop("onnx", ""), None)
+        site.pop(place.pop(ONNX.key, ""), None)
     absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
     site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
     with naming(folder):
@@ -121,9 +126,9 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
     site.update(_model(policy, "model"))
     size = sum(len(v) for k, v in site.items() if k.startswith("model/"))
     models: dict[str, dict[str, str]] = {"model": {"folder": "model/"}}
-    if policy.has(WRITTEN["onnx"]):
-        models["model"]["onnx"] = "model/policy.bin"
-        site["model/policy.bin"] = policy.path(WRITTEN["onnx"]).read_bytes()
+    if policy.has(ONNX):
+        models["model"][ONNX.key] = "model/policy.bin"
+        site["model/policy.bin"] = policy.path(ONNX).read_bytes()
     if opponent is not None:
         site.update(_model(opponent, "opponent"))
         models["opponent"] = {"folder": "opponent/"}
@@ -207,25 +212,22 @@ def _is_site(place: Path) -> bool:
 def _open_checked(folder: Path) -> Bundle:
     found = Bundle.open(folder)
     found.verify_hashes()
-    for key, why in (
-        ("tfjs", "the page runs TensorFlow.js"),
-        ("bytes", "what the page's answers are held against is computed from it"),
-    ):
-        if not found.has(WRITTEN[key]):
-            file = WRITTEN[key].first_file_of(found.name)
+    for needed, why in NEEDED.items():
+        if not found.has(WRITTEN[needed]):
             raise BundleError(
-                f"has no {file}",
+                f"has no {WRITTEN[needed].first_file_of(found.name)}",
                 where=str(folder),
                 why=why,
-                fix="export it again with --to bytes,tfjs and without --for",
+                fix=f"export it again with --to {','.join(sorted(NEEDED))} and without --for",
             )
     return found
 
 
 def _model(found: Bundle, place: str) -> dict[str, bytes]:
     """The model of a bundle: data alone. What else lies in its folder (a script, a page) would be its maker's code."""
-    names = [n for n in found.contract.files if WRITTEN["tfjs"].owns(n, found.name) and PurePosixPath(n).suffix in DATA]
-    return {f"{place}/{name.removeprefix('tfjs/')}": (found.folder / name).read_bytes() for name in sorted(names)}
+    names = [n for n in found.contract.files if TFJS.owns(n, found.name) and PurePosixPath(n).suffix in DATA]
+    folder = f"{TFJS.main_of(found.name)}/"
+    return {f"{place}/{name.removeprefix(folder)}": (found.folder / name).read_bytes() for name in sorted(names)}
 
 
 def _opponent(first: Bundle, scene: Scene) -> Bundle | None:

@@ -13,7 +13,7 @@ from string import Template
 
 from converters.formats.bundle import bundle
 from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import FROZEN_GRAPH
 from signatures.contract import Contract
 from signatures.errors import naming
 from signatures.ids import bounds_text
@@ -123,7 +123,7 @@ class Bundle:
 
 def read_bundle(folder: Path) -> Bundle:
     """A bundle by its policy.json. Raises BundleError, also where its .bytes is not the one that was written."""
-    found, frozen = bundle.Bundle.open(folder), WRITTEN["bytes"]
+    found, frozen = bundle.Bundle.open(folder), FROZEN_GRAPH
     nodes: frozenset[str] = frozenset()
     if found.has(frozen):
         found.verify_hashes(frozen)

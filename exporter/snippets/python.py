@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from converters.formats.registry import ONNX, SAVED_MODEL
 from exporter.snippets.contract import (
     STEPS,
     Bundle,
@@ -20,7 +21,7 @@ def onnxruntime(bundle: Bundle) -> str:
     run = "dict(zip(names, session.run(names, feeds)))"
     return fill_template(
         "onnxruntime.py",
-        path=string_literal(bundle.path(f"{bundle.name}.onnx")),
+        path=string_literal(bundle.path(ONNX.main_of(bundle.name))),
         play=play(bundle, [f"outputs = {run}"]),
     )
 
@@ -31,7 +32,9 @@ def saved_model(bundle: Bundle) -> str:
         "answer = policy(**{name: tf.constant(value) for name, value in feeds.items()})",
         "outputs = {name: tensor.numpy() for name, tensor in answer.items()}",
     ]
-    return fill_template("saved_model.py", path=string_literal(bundle.path("saved_model")), play=play(bundle, run))
+    return fill_template(
+        "saved_model.py", path=string_literal(bundle.path(SAVED_MODEL.main_of(bundle.name))), play=play(bundle, run)
+    )
 
 
 def load_policy(bundle: Bundle) -> str:

@@ -8,7 +8,7 @@ from string import Template
 from typing import Any
 
 from converters.formats.format import Code, Format
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
 from exporter.snippets import agent, csharp, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle, string_literal
 from signatures.errors import BundleError, UsageError
@@ -17,30 +17,44 @@ from signatures.records import dataclass
 
 @dataclass(frozen=True)
 class Target:
-    """One way to call a policy: its name for ``--for``, title, language, and the formats it needs (any of them)."""
+    """One way to call a policy: its name for ``--for``, title, language, and the formats it needs: any of them, or of
+    several that it needs together.
+    """
 
     name: str
     title: str
     language: str
-    needs: tuple[str, ...]
+    needs: tuple[Format | tuple[Format, ...], ...]
     render: Callable[[Bundle], str]
+
+    @property
+    def alternatives(self) -> list[list[str]]:
+        """The formats that it needs together, of which any choice will do."""
+        return [[f.key for f in need] if isinstance(need, tuple) else [need.key] for need in self.needs]
+
+    @property
+    def needed(self) -> str:
+        """The formats that it needs, for people."""
+        return " or ".join(map(" and ".join, self.alternatives))
 
 
 TARGETS: tuple[Target, ...] = (
-    Target("load-policy", "Python, exporter.load_policy", "python", ("onnx", "bytes"), python.load_policy),
-    Target("onnxruntime", "Python, onnxruntime", "python", ("onnx",), python.onnxruntime),
-    Target("saved-model", "Python, tf.saved_model.load", "python", ("saved_model",), python.saved_model),
-    Target("serving-docker", "TensorFlow Serving, the container", "sh", ("saved_model",), serving.docker),
-    Target("serving-rest", "TensorFlow Serving, REST with curl", "sh", ("saved_model",), serving.rest),
-    Target("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", ("saved_model",), serving.grpc),
-    Target("policy-tfjs", "A page, policy.mjs with TensorFlow.js", "html", ("tfjs",), javascript.acting_tfjs),
-    Target("policy-ort", "A page, policy.mjs with onnxruntime-web", "html", ("tfjs+onnx",), javascript.acting_ort),
-    Target("tfjs", "A page, tf.loadGraphModel", "html", ("tfjs",), javascript.plain_tfjs),
-    Target("onnxruntime-web", "A page, onnxruntime-web", "html", ("onnx",), javascript.plain_ort),
-    Target("tensorflowsharp", "C#, TensorFlowSharp", "csharp", ("bytes",), csharp.tensorflowsharp),
-    Target("internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", ("bytes",), unity.internal_brain),
-    Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", ("onnx",), csharp.inference_engine),
-    Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", ("onnx", "nn"), agent.agent),
+    Target("load-policy", "Python, exporter.load_policy", "python", (ONNX, FROZEN_GRAPH), python.load_policy),
+    Target("onnxruntime", "Python, onnxruntime", "python", (ONNX,), python.onnxruntime),
+    Target("saved-model", "Python, tf.saved_model.load", "python", (SAVED_MODEL,), python.saved_model),
+    Target("serving-docker", "TensorFlow Serving, the container", "sh", (SAVED_MODEL,), serving.docker),
+    Target("serving-rest", "TensorFlow Serving, REST with curl", "sh", (SAVED_MODEL,), serving.rest),
+    Target("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", (SAVED_MODEL,), serving.grpc),
+    Target("policy-tfjs", "A page, policy.mjs with TensorFlow.js", "html", (TFJS,), javascript.acting_tfjs),
+    Target("policy-ort", "A page, policy.mjs with onnxruntime-web", "html", ((TFJS, ONNX),), javascript.acting_ort),
+    Target("tfjs", "A page, tf.loadGraphModel", "html", (TFJS,), javascript.plain_tfjs),
+    Target("onnxruntime-web", "A page, onnxruntime-web", "html", (ONNX,), javascript.plain_ort),
+    Target("tensorflowsharp", "C#, TensorFlowSharp", "csharp", (FROZEN_GRAPH,), csharp.tensorflowsharp),
+    Target(
+        "internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", (FROZEN_GRAPH,), unity.internal_brain
+    ),
+    Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", (ONNX,), csharp.inference_engine),
+    Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", (ONNX, BARRACUDA), agent.agent),
 )
 
 
@@ -50,7 +64,7 @@ def _fill_code(found: Format, code: Code, bundle: Bundle) -> str:
 
 # The snippets that formats bring themselves.
 TARGETS += tuple(
-    Target(code.name, code.title, code.language, (found.key,), partial(_fill_code, found, code))
+    Target(code.name, code.title, code.language, (found,), partial(_fill_code, found, code))
     for found in WRITTEN.values()
     for code in found.snippets
 )
@@ -86,8 +100,8 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
             f"--for {name}: there is no such target", fix=f"one of: help, {', '.join(t.name for t in TARGETS)}"
         )
     has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
-    able = {t.name for t in chosen if any(has.issuperset(need.split("+")) for need in t.needs)}
-    lacking = {t.name: " or ".join(t.needs).replace("+", " and ") for t in chosen if t.name not in able}
+    able = {t.name for t in chosen if any(has.issuperset(keys) for keys in t.alternatives)}
+    lacking = {t.name: t.needed for t in chosen if t.name not in able}
     if len(lacking) == len(chosen):
         needed = next(iter(lacking.values()))
         raise BundleError(
@@ -117,4 +131,4 @@ def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
             why=made,
             fix=f"export-model SOURCE --for {wanted.name}",
         )
-    return "internal-brain" if "bytes" in wanted.formats else "agent"
+    return wanted.code

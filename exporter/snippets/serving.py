@@ -11,6 +11,7 @@ import json
 import math
 from typing import Any
 
+from converters.formats.registry import SAVED_MODEL
 from exporter.snippets.contract import Bundle, action_meaning, example_shape, fill_template, meaning, string_literal
 from exporter.snippets.python import play
 from signatures.roles import Role
@@ -22,7 +23,7 @@ _MOST_NUMBERS = 400
 
 def docker(bundle: Bundle) -> str:
     """The container."""
-    return fill_template("serving_docker.sh", folder=bundle.mount("saved_model"), name=bundle.name)
+    return fill_template("serving_docker.sh", folder=bundle.mount(SAVED_MODEL.main_of(bundle.name)), name=bundle.name)
 
 
 def rest(bundle: Bundle) -> str:

@@ -27,7 +27,7 @@ from converters.runtimes.pool import RuntimePool
 from exporter.verify.difference import Difference, compare
 from exporter.verify.drawn_columns import drawn_columns
 from exporter.verify.findings import Bisection
-from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
+from exporter.verify.inner_tensors import inner_tensors, outputs_read
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError
@@ -117,17 +117,18 @@ class Bisector:
 
     @cached_property
     def graph(self) -> Graph | None:
-        """The first graph that agrees with the reference: the policy's, the .bytes', the SavedModel's."""
+        """The first graph that agrees with the reference: the policy's, the .bytes', another file's."""
         return next((g for g in self._graphs() if self._agrees(g)), None)
 
     def _graphs(self) -> Iterator[Graph]:
         yield self._runnable
         with contextlib.suppress(ExportModelError, OSError):
             yield runnable(read_graph(self.tested.reference.read_bytes()))
-        saved = self.tested.artefacts.get("saved_model")
-        if saved is not None:
-            with contextlib.suppress(ExportModelError, OSError):
-                yield runnable(saved_graph(saved))
+        for key, path in self.tested.artefacts.items():
+            read = WRITTEN[key].graph
+            if read is not None and path != self.tested.reference:
+                with contextlib.suppress(ExportModelError, OSError):
+                    yield runnable(read(path))
 
     @cached_property
     def _runnable(self) -> Graph:

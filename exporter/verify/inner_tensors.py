@@ -6,12 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from converters.formats.frozen_graph.reader import from_graph_def
 from converters.formats.intermediate_tensors import InnerTensors, Loaded, View, no_tensors
-from converters.formats.registry import WRITTEN
-from converters.formats.saved_model.reader import read_saved_model
-from converters.formats.saved_model.source import FILE, frozen_model, values_beside
-from converters.graph.nodes import Graph, ref, split_ref
+from converters.formats.registry import FROZEN_GRAPH, WRITTEN
+from converters.graph.nodes import ref, split_ref
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.participants import Participant
 
@@ -26,7 +23,7 @@ def inner_tensors(
     """
     key, _, signature = participant.format.partition(":")
     loaded = Loaded(path, participant.runtime, participant.model.run, pool, signature)
-    form = WRITTEN.get(key, WRITTEN["bytes"])  # the reference and the original are frozen graphs
+    form = WRITTEN.get(key, FROZEN_GRAPH)  # the reference and the original are frozen graphs
     with (form.inner or no_tensors)(loaded) as found:
         if participant.fed is None:
             yield found
@@ -39,13 +36,6 @@ def inner_tensors(
             return next((v for name in names if (v := view(name)) is not None), None)
 
         yield InnerTensors(find_view, lambda feeds, fetch: run(own(feeds), fetch), foreign=True)
-
-
-def saved_graph(folder: Path) -> Graph:
-    """The graph of a SavedModel of ours. Raises SourceError and its like where the file is damaged."""
-    saved = read_saved_model((folder / FILE).read_bytes())
-    values = values_beside(folder)
-    return from_graph_def(saved.graph_def, saved.detached) if values is None else frozen_model(saved, values).graph
 
 
 def outputs_read(nodes: Sequence[str], reads: Sequence[str]) -> dict[str, list[str]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from converters.files.children.process import LoadedModel, RunFailedError
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.source import OriginalRun
 from converters.graph.nodes import Graph
 from converters.runtimes.pool import RuntimePool
@@ -21,6 +21,7 @@ from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
 if TYPE_CHECKING:
+    from converters.policy.policy import Policy
     from exporter.verify.reference import Reference
 
 #: The runtime that takes longest to start, by far.
@@ -36,9 +37,9 @@ Run = Callable[[Sequence[Feeds], Sequence[str]], list[dict[str, np.ndarray]]]
 Loading = Callable[[RuntimePool, bool], tuple[LoadedModel, Run]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PolicyUnderTest:
-    """What is verified: the artefacts of one policy, and where its source is."""
+    """What is verified: the artefacts of one policy, and where its source is; ``policy_under_test`` makes it."""
 
     name: str
     signature: PolicySignature
@@ -61,7 +62,55 @@ class PolicyUnderTest:
     runs_elsewhere: bool = False
 
 
-@dataclass
+def write_reference(policy: Policy, folder: Path, name: str = "reference") -> Path:
+    """Write the policy as the numpy kernels run it; return the file. Raises OSError."""
+    from converters.formats.frozen_graph.writer import frozen_graph
+
+    folder.mkdir(exist_ok=True)
+    file = folder / FROZEN_GRAPH.main_of(name)
+    frozen_graph(policy).write(file)
+    return file
+
+
+def policy_under_test(
+    policy: Policy,
+    artefacts: Mapping[str, Path],
+    scratch: Path,
+    *,
+    sizes: Mapping[str, int],
+    reference: Path | None = None,
+    source: OriginalRun | None = None,
+    files: Mapping[str, Path] | None = None,
+    profile: str | None = None,
+    batch: int | None = None,
+    runs_elsewhere: bool = False,
+) -> PolicyUnderTest:
+    """Return what is verified of a policy and its ``artefacts`` (format → path that a loader is given).
+
+    ``reference`` is what the numpy kernels run; without one it is the artefact that is a frozen graph, else one that is
+    written to ``scratch``. ``files`` are the bundle's own, where the artefacts are copies. Raises OSError.
+    """
+    from converters.formats.saved_model.writer import signatures_of
+
+    reference = reference or artefacts.get(FROZEN_GRAPH.key) or write_reference(policy, scratch)
+    return PolicyUnderTest(
+        name=policy.name,
+        signature=policy.signature,
+        graph=policy.graph,
+        artefacts=artefacts,
+        sizes=sizes,
+        reference=reference,
+        source=source,
+        source_map=policy.source,
+        signatures={k: ([s.name for s in i], [s.name for s in o]) for k, (i, o) in signatures_of(policy).items()},
+        profile=profile,
+        files=artefacts if files is None else files,
+        batch=batch,
+        runs_elsewhere=runs_elsewhere,
+    )
+
+
+@dataclass(kw_only=True)
 class Participant:
     """One format in one runtime: how to run it, what it can answer. ``model`` runs inner tensors too."""
 
@@ -107,7 +156,7 @@ def participants_of(
     """
     outputs = [s.name for s in tested.signature.outputs]
     if reference.original is not None:  # else it would be held against itself
-        yield Participant("reference", "numpy", reference.run, reference.asked, reference.model, path=tested.reference)
+        yield reference.participant("reference", reference.asked, path=tested.reference)
     pairs = [(kind, runtime) for kind in tested.artefacts for runtime in WRITTEN[kind].runtimes]
     # A .bytes in numpy is the reference; what runs nowhere else does so there.
     alone = [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]
@@ -126,15 +175,17 @@ def participants_of(
             if tested.batch is not None and WRITTEN[kind].fixed:
                 running = partial(_in_batches, running, tested.batch, tested.signature)
             again = loading(runtime, path, WRITTEN[kind].loader(key), running)
-            try:
-                model, run = again(pool, False)
-            except RunFailedError as error:
-                failure(label, runtime, error, "*")
-                continue
-            # The numpy kernels draw from the seed of the verification, whatever the artefact.
-            anew = None if runtime == "numpy" else again
-            yield Participant(label, runtime, run, names, model, path=path, again=anew)
-            model.unload()
+            for model, run in loaded(again, pool, partial(failure, label, runtime)):
+                yield Participant(
+                    format=label,
+                    runtime=runtime,
+                    run=run,
+                    outputs=names,
+                    model=model,
+                    path=path,
+                    # The numpy kernels draw from the seed of the verification, whatever the artefact.
+                    again=None if runtime == "numpy" else again,
+                )
 
 
 def in_order(results: Iterable[Finding], tested: PolicyUnderTest) -> tuple[Finding, ...]:
@@ -158,6 +209,19 @@ def loading(runtime: str, path: Path, options: Mapping[str, Any], running: Calla
         return model, running(model)
 
     return load
+
+
+def loaded(
+    load: Loading, pool: RuntimePool, failure: Callable[[RunFailedError, str], None]
+) -> Iterator[tuple[LoadedModel, Run]]:
+    """Yield the one model that ``load`` gives, and unload it then; nothing, but a ``failure``, where it gives none."""
+    try:
+        model, run = load(pool, False)
+    except RunFailedError as error:
+        failure(error, "*")
+        return
+    yield model, run
+    model.unload()
 
 
 def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
+from pathlib import Path
 
 import numpy as np
 
 from converters.files.children.process import LoadedModel, RunFailedError
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.drawn_columns import drawn_columns
 from exporter.verify.findings import Undecided, undecided_reference
 from exporter.verify.original import Original
-from exporter.verify.participants import PolicyUnderTest
+from exporter.verify.participants import Participant, PolicyUnderTest
 from signatures.roles import Role
 
 Arrays = Mapping[str, np.ndarray]
@@ -29,7 +30,7 @@ class Reference(AbstractContextManager["Reference"]):
         self.signature = tested.signature
         #: the numpy kernels, in their child
         # A bundle of one format that no other runtime runs (a .nn) is its own reference.
-        form = next((kind for kind, path in tested.artefacts.items() if path == tested.reference), "bytes")
+        form = next((kind for kind, path in tested.artefacts.items() if path == tested.reference), FROZEN_GRAPH.key)
         self.model: LoadedModel = pool.process("numpy").load(str(tested.reference), seed=seed, format=form)
         self.original: Original | None = None
         #: outputs that a sampler in the graph decides
@@ -60,6 +61,12 @@ class Reference(AbstractContextManager["Reference"]):
         self._loaded.append(model)
         self.original = Original(model, self.signature, tested.source_map)
         self.name = f"source/{source.runtime}"
+
+    def participant(
+        self, name: str, outputs: Sequence[str], *, runtime: str = "numpy", path: Path | None = None
+    ) -> Participant:
+        """The kernels as one that takes part, for these outputs."""
+        return Participant(format=name, runtime=runtime, run=self.run, outputs=outputs, model=self.model, path=path)
 
     @property
     def runtime(self) -> str:

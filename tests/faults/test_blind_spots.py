@@ -23,7 +23,7 @@ from exporter.verify import work
 from exporter.verify.checks.densities import _joint
 from exporter.verify.checks.draws import least_likely, repeats, with_zeros
 from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
+from exporter.verify.participants import Feeds, Participant, policy_under_test
 from exporter.verify.report import ParityReport
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
@@ -53,14 +53,14 @@ def verified(
     (result,) = export([source], ExportOptions(tmp_path / "out", verify="none"))
     policy = result.policy
     file = result.folder / f"{policy.name}.bytes"
-    tested = PolicyUnderTest(policy.name, policy.signature, policy.graph, {}, {}, file)
+    tested = policy_under_test(policy, {}, tmp_path, sizes={}, reference=file)
 
     def participants(numpy: LoadedModel, failed: object) -> Iterator[Participant]:
         def run(inputs: Sequence[Feeds], fetch: Any) -> list[Arrays]:
             return [spoil(feeds, dict(running(numpy, feeding(feeds), fetch))) for feeds in inputs]
 
         outputs = [s.name for s in policy.signature.outputs]
-        yield Participant("onnx", "onnxruntime", run, outputs, numpy)
+        yield Participant(format="onnx", runtime="onnxruntime", run=run, outputs=outputs, model=numpy)
 
     return verify(tested, ("numpy", "onnxruntime"), KNOWN, pool, options or VerifyOptions(), participants=participants)
 

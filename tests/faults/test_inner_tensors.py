@@ -9,6 +9,7 @@ import pytest
 
 from converters.compiler.targets import FEWER_OPS, prepare
 from converters.formats.bundle.embed import runnable
+from converters.formats.saved_model.artifact import graph
 from converters.graph.nodes import node_of
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
@@ -16,7 +17,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.export.again import verify_folder
 from exporter.verify.difference import compare
-from exporter.verify.inner_tensors import inner_tensors, outputs_read, saved_graph
+from exporter.verify.inner_tensors import inner_tensors, outputs_read
 from exporter.verify.participants import PolicyUnderTest, participants_of
 from exporter.verify.reference import Reference
 from exporter.verify.tolerances import Tolerance
@@ -86,7 +87,7 @@ def test_every_tensor_that_a_format_has_is_the_graphs(
 
 def test_a_saved_model_has_the_same_graph_as_the_bytes(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     tested = policy_under_test(bundle("recurrent").folder, monkeypatch)
-    ours, other = runnable(tested.graph), runnable(saved_graph(tested.artefacts["saved_model"]))
+    ours, other = runnable(tested.graph), runnable(graph(tested.artefacts["saved_model"]))
     assert [(n.name, n.op, n.inputs) for n in ours.nodes] == [(n.name, n.op, n.inputs) for n in other.nodes]
     assert all(
         np.array_equal(a.value, b.value) for a, b in zip(ours.nodes, other.nodes, strict=True) if a.op == "Const"

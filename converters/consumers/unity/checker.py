@@ -22,6 +22,7 @@ from converters.consumers.unity.settings import Brain
 from converters.files.fetch import Fetched, read_bytes
 from converters.formats.barracuda import format as nn_format
 from converters.formats.recognise import recognise_path
+from converters.formats.registry import BARRACUDA, ONNX
 from signatures.errors import ExportModelError, SourceError
 from signatures.records import dataclass
 
@@ -148,10 +149,10 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
 
     Raises SourceError for a file that is neither ONNX nor ``.nn``, DamagedFileError for one that cannot be read.
     """
-    kind = recognise_path(Fetched(path)).key
-    if kind == "nn" or (path.suffix.lower() == ".nn" and kind != "onnx"):
+    found = recognise_path(Fetched(path))
+    if found is BARRACUDA or (path.suffix.lower() == ".nn" and found is not ONNX):
         return _check_nn_file(path, consumer, brain)
-    if kind != "onnx":
+    if found is not ONNX:
         raise SourceError(
             "is no .onnx and no .nn",
             where=str(path),

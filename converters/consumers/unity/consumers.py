@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from enum import Enum
 
+from converters.formats.registry import BARRACUDA, ONNX
 from signatures.errors import UsageError
 from signatures.records import dataclass
 
@@ -59,7 +60,7 @@ class Consumer:
     feeds_entities: bool = True
     fetches_action_alone: bool = False
     refusals: bool = True
-    formats: tuple[str, ...] = ("onnx", "nn")
+    formats: tuple[str, ...] = (ONNX.key, BARRACUDA.key)
     #: ML-Agents' release by number, where the runtime's importer was measured; empty: it was not.
     importer: str = ""
     #: Whether its player was run, or its code read, or that of another release run in its place.
@@ -154,7 +155,7 @@ EARLIER = {
             feeds_entities=False,
             fetches_action_alone=True,
             refusals=False,
-            formats=("nn",),
+            formats=(BARRACUDA.key,),
         ),
     )
 }

@@ -35,5 +35,7 @@ FORMATS = (
         held=_writer.held,
         runtimes=("numpy",),
         answers=_answers.answered,
+        kernels=_answers.kernels,
+        elsewhere="Unity",
     ),
 )

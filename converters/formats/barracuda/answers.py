@@ -7,6 +7,7 @@ file agrees with the other formats so says that writer and reader mean the same 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from converters.compiler.passes.normalise import normalise
 from converters.formats.barracuda.format import NnModel, parse
 from converters.formats.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
 from converters.formats.barracuda.lower import INPUT_NAMES, base_name
+from converters.formats.format import Kernels
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node
 from converters.graph.run import run_graph
@@ -53,6 +55,11 @@ def answered(signature: PolicySignature) -> list[str]:
     scored = any(s.role is Role.LOG_PROBS for s in signature.outputs)
     unanswered = {*_UNWRITTEN, *((Role.SAMPLED,) if scored else ())}
     return [s.name for s in signature.outputs if s.role not in unanswered]
+
+
+def kernels(path: Path) -> Kernels:
+    """A ``.nn`` of ours, run by the numpy kernels. Raises DamagedFileError."""
+    return NnPolicy(path.read_bytes()).run
 
 
 class NnPolicy:

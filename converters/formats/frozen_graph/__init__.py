@@ -26,6 +26,9 @@ FORMATS = (
         ports=_artifact.ports,
         vetted=_artifact.safe_copy,
         inner=_artifact.inner,
+        unity=True,
+        graph=_artifact.graph,
+        kernels=_artifact.kernels,
         runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
     ),
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,25 +17,37 @@ from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
 from converters.files.fetch import read_bytes
 from converters.files.memory_mapped import Mapped
-from converters.formats.format import Port, Ports
+from converters.formats.bundle.embed import runnable
+from converters.formats.format import Kernels, Port, Ports
 from converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from converters.formats.frozen_graph.subgraph import subgraph
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names
-from converters.graph.nodes import node_of
+from converters.graph.nodes import Graph, node_of
 from converters.graph.ops.table import is_fed
+from converters.graph.run import run_graph
 
 
 def ports(path: Path) -> Ports:
     """The ports of a file. Raises SourceError, DamagedFileError, GraphError."""
-    graph = read_graph(read_bytes(path))
-    places = [n for n in graph.nodes if is_fed(n)]
+    read = read_graph(read_bytes(path))
+    places = [n for n in read.nodes if is_fed(n)]
     inputs = tuple(Port(n.name, n.attrs["dtype"].name if "dtype" in n.attrs else None, n.dims) for n in places)
-    return Ports(path, inputs, tuple(Port(n.name) for n in graph.nodes), {"kind": "graph"}, open=True)
+    return Ports(path, inputs, tuple(Port(n.name) for n in read.nodes), {"kind": "graph"}, open=True)
+
+
+def graph(path: Path) -> Graph:
+    """The graph of a file. Raises SourceError, DamagedFileError, GraphError."""
+    return read_graph(path.read_bytes())
+
+
+def kernels(path: Path) -> Kernels:
+    """A ``.bytes`` of ours, run by the numpy kernels. Raises SourceError and its like, GraphError."""
+    return partial(run_graph, runnable(graph(path)))
 
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     """Those of a ``.bytes``."""
-    graph = schema.parse(schema.GraphDef, Mapped().read(loaded.path), "GraphDef", Detached())  # for its names
+    message = schema.parse(schema.GraphDef, Mapped().read(loaded.path), "GraphDef", Detached())  # for its names
 
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         """TensorFlow 1.x refuses to fetch what it is fed, by the same name: it is what was fed."""
@@ -42,7 +55,7 @@ def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
         values = {name: feeds[name] for name in fetch if name in feeds}
         return {**values, **loaded.run(feeds, others)} if others else values
 
-    return contextlib.nullcontext(InnerTensors(own_names(n.name for n in graph.node), run))
+    return contextlib.nullcontext(InnerTensors(own_names(n.name for n in message.node), run))
 
 
 def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:

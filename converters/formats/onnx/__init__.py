@@ -37,6 +37,7 @@ FORMATS = (
         ports=_artifact.ports,
         vetted=_vetted.safe_copy,
         inner=_artifact.inner,
+        unity=True,
         origins=_artifact.origins,
         runtimes=("onnxruntime", "onnxruntime-web", "onnxruntime-web@chromium", "openvino"),
     ),

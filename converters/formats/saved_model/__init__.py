@@ -38,6 +38,7 @@ FORMATS = (
         ports=_artifact.ports,
         vetted=_vetted.safe_copy,
         inner=_artifact.inner,
+        graph=_artifact.graph,
         runtimes=("tensorflow",),
         signatures=True,
     ),

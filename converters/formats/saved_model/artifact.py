@@ -13,12 +13,13 @@ import numpy as np
 
 from converters.files.fetch import read_bytes
 from converters.formats.format import Ports
+from converters.formats.frozen_graph.reader import from_graph_def
 from converters.formats.frozen_graph.subgraph import subgraph
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names
 from converters.formats.saved_model.reader import read_saved_model
 from converters.formats.saved_model.source import FILE, frozen_model, values_beside
 from converters.formats.source import OriginalRun
-from converters.graph.nodes import normal_ref
+from converters.graph.nodes import Graph, normal_ref
 from signatures.errors import NotAPolicyError
 
 
@@ -35,6 +36,13 @@ def ports(path: Path) -> Ports:
         )
     options = {"kind": "saved_model", "signature": signature.key}
     return Ports(file.parent, *signature.ports(), options)
+
+
+def graph(folder: Path) -> Graph:
+    """The graph of a SavedModel of ours. Raises SourceError and its like where the file is damaged."""
+    saved = read_saved_model((folder / FILE).read_bytes())
+    values = values_beside(folder)
+    return from_graph_def(saved.graph_def, saved.detached) if values is None else frozen_model(saved, values).graph
 
 
 @contextmanager

@@ -200,17 +200,18 @@ def runner_command(script: str, name: str, *arguments: str) -> list[str]:
     return [*command, "--known"] if check_packages(js_home()) else command
 
 
-def _runtime(name: str, format_: str, packages: tuple[str, ...], how: str) -> Runtime:
+def _runtime(name: str, packages: tuple[str, ...], how: str, *, alike: bool = False) -> Runtime:
+    """``alike``: its sessions begin to draw alike, as those of onnxruntime do."""
     find, command = partial(_find, name, packages, how), partial(runner_command, "runner.mjs", name)
     return Runtime(
         *(name, find, command, install_packages),
-        sessions_alike=format_ == "onnx",
+        sessions_alike=alike,
         products_per_second=SPEEDS.get(name, 1e9),
     )
 
 
 RUNTIMES = (
-    _runtime("onnxruntime-web", "onnx", (_ONNXRUNTIME_WEB,), INSTALL_ONNXRUNTIME_WEB),
-    _runtime("tfjs-cpu", "tfjs", (_CORE, _CONVERTER, _CPU), INSTALL_TFJS),
-    _runtime("tfjs-wasm", "tfjs", (_CORE, _CONVERTER, _WASM), INSTALL_TFJS),
+    _runtime("onnxruntime-web", (_ONNXRUNTIME_WEB,), INSTALL_ONNXRUNTIME_WEB, alike=True),
+    _runtime("tfjs-cpu", (_CORE, _CONVERTER, _CPU), INSTALL_TFJS),
+    _runtime("tfjs-wasm", (_CORE, _CONVERTER, _WASM), INSTALL_TFJS),
 )

@@ -16,7 +16,9 @@ import numpy as np
 
 from converters.files.children.child import claim_stdout, serve
 from converters.files.children.frames import Tensors
-from converters.formats.bundle.embed import read_runnable, runnable
+from converters.formats.bundle.embed import runnable
+from converters.formats.format import Format
+from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import reseed
@@ -36,24 +38,19 @@ class _Model:
 
 def _load(header: Mapping[str, Any]) -> _Model:
     reseed(int(header.get("seed", 0)))
-    path, key = Path(header["path"]), header.get("format", "bytes")
-    if key == "nn":
-        from converters.formats.barracuda.answers import NnPolicy
-
-        return _Model(NnPolicy(path.read_bytes()).run)
-    return _Model(partial(run_graph, read_runnable(path.read_bytes()) if key == "bytes" else _read_back(path, key)))
+    path = Path(header["path"])
+    form = WRITTEN[header["format"]] if "format" in header else FROZEN_GRAPH
+    return _Model(partial(run_graph, _read_back(path, form)) if form.kernels is None else form.kernels(path))
 
 
-def _read_back(path: Path, key: str) -> Graph:
+def _read_back(path: Path, form: Format) -> Graph:
     """The graph of an artefact in a format that no other runtime runs, as its own reader gives it."""
     from converters.compiler.compile import compile_graph
     from converters.files.fetch import Fetched
-    from converters.formats.registry import WRITTEN
     from converters.formats.source import ReadOptions
 
-    read = WRITTEN[key].read
-    assert read is not None, f"{key} is not read"
-    (model,) = read(Fetched(path), ReadOptions())
+    assert form.read is not None, f"{form.key} is not read"
+    (model,) = form.read(Fetched(path), ReadOptions())
     (policy,) = compile_graph(model.graph, "policy", None, model.facts)
     return runnable(policy.graph)
 

@@ -33,7 +33,7 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
     wanted = profile(name)
     for release in dict.fromkeys((*wanted.checkers, *wanted.players)):
         asked = consumer(release)
-        for key in (k for k in ("onnx", "nn") if k in files and k in asked.formats):
+        for key in (k for k in asked.formats if k in files):
             checks = release in wanted.checkers and not (memory and key in wanted.own_names)
             plays = release in wanted.players
             if not checks and not plays:

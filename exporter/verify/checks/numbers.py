@@ -98,7 +98,7 @@ def check_recording(trial: Trial) -> Iterator[Finding]:
     names = [s.name for s in trial.signature.outputs if s.name not in reference.drawn]
     noisy = trial.tested.graph.descendants(golden.noiseless)
     names = [n for n in names if n not in noisy]
-    participant = Participant("golden", reference.runtime, reference.run, names, reference.model)
+    participant = reference.participant("golden", names, runtime=reference.runtime)
     worst: dict[str, tuple[Difference, str]] = {}
     answers = trial.expected[len(trial.cases) - len(golden.cases) :]
     for case, expected, arrays in zip(golden.cases, answers, golden.answers, strict=True):

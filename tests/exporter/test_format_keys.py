@@ -1,0 +1,56 @@
+"""What is decided by a format is asked of its ``Format``: outside of the rooms hardly any file names one by its key."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+
+from converters.formats.registry import WRITTEN
+from converters.runtimes.registry import RUNTIMES
+from tests.exporter.test_imports import MODULES, name_of
+
+#: Words of this project's own: others, such as ``c`` and ``bytes``, are those of runtimes, units and languages, too.
+KEYS = WRITTEN.keys() - {r.name for r in RUNTIMES} - {"bytes"}
+#: Files that may still name one: the protocol of TensorFlow's child, and words that stand for something else (fields of
+#: site.json, the name of a snippet).
+MOST = 3
+
+
+def literals(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def chosen_by_key(tree: ast.AST) -> Iterator[int]:
+    """Lines that look a format up by a literal key, or compare one's key with a literal."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name) and node.value.id == "WRITTEN":
+            if isinstance(node.slice, ast.Constant):
+                yield node.lineno
+        elif isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            keyed = any(isinstance(s, ast.Attribute) and s.attr == "key" for s in sides)
+            if keyed and any(isinstance(s, ast.Constant) and s.value in WRITTEN for s in sides):
+                yield node.lineno
+
+
+def outside() -> Iterator[tuple[str, ast.AST]]:
+    for path in MODULES:
+        if not name_of(path).startswith("converters/formats/"):
+            yield name_of(path), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def test_hardly_a_file_outside_the_rooms_names_a_format() -> None:
+    assert {"onnx", "tfjs", "nn", "saved_model"} <= KEYS
+    files = [name for name, tree in outside() if KEYS.intersection(literals(tree))]
+    assert len(files) <= MOST, files
+
+
+def test_no_decision_hangs_on_a_key() -> None:
+    assert [(name, line) for name, tree in outside() for line in chosen_by_key(tree)] == []
+
+
+def test_a_decision_would_be_found() -> None:
+    found = 'if f.key == "nn":\n    pass\nif "onnx" != f.key:\n    pass\nWRITTEN["tfjs"]\nWRITTEN[key]\nf.key == g.key'
+    assert sorted(chosen_by_key(ast.parse(found))) == [1, 3, 5]
