@@ -14,29 +14,26 @@ HEAD = """\
 
 Barracuda, Sentis and the Inference Engine do not read every ONNX as the operators are defined. Here is what is known,
 by importer and construct: 352 small models, one construct each, run in each importer outside the Editor, and 87 more
-in the players of ML-Agents. What an importer is not named for it reads rightly, if the construct was among these. The
-same tables as JSON, with the exceptions of each importer:
+in the players of ML-Agents ([what they do](tasks/unity-checker.md)). What an importer is not named for it reads
+rightly, if the construct was among these. The
+program has more of it: for each importer what it throws, how to fix it, and the small model that shows it.
 
 ```sh
 export-model consumers                          # the importers
 export-model consumers "Barracuda 2.0.0"        # what one of them misreads
-export-model consumers --json > consumers.json  # everything on this page
+export-model consumers --json > consumers.json  # everything, with exceptions, fixes and evidence
 ```
 
 `--for` writes a policy without any of it; [`inspect --unity`](tasks/unity-checker.md) finds them in a file. *wrong*:
 it imports and runs, and gives other numbers or another shape, without an error. *refused*: the import throws.
-*fails*: the run throws. *lost*: an output cannot be fetched. The evidence is the name of the small model.
-"""
-PLAYED = """\
-What ML-Agents' own code does with inputs and outputs of other forms than it expects, by release (`--unity`). Names in
-braces stand for those of the model. What has no evidence was read in the code, not run.
+*fails*: the run throws. *lost*: an output cannot be fetched.
 """
 
 
 def page() -> str:
     """Return the page in Markdown."""
     tables = published()
-    return "\n".join((HEAD, *_importers(tables), *_readings(tables["readings"]), *_players(tables["players"]))) + "\n"
+    return "\n".join((HEAD, *_importers(tables), *_readings(tables["readings"]))) + "\n"
 
 
 def _importers(tables: Mapping[str, Any]) -> Iterator[str]:
@@ -52,42 +49,18 @@ def _importers(tables: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _readings(readings: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """One line for a construct: the importers of a rule, and what the last of them throws."""
+    """Yield a line for each construct and reading."""
     yield "## Constructs\n"
-    rules: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    rules: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for r in readings:
-        key = (", ".join(r["ops"]), r["construct"], r["reading"], r["evidence"])
-        rules.setdefault(key, []).append(r)
+        rules.setdefault((", ".join(r["ops"]), r["construct"], r["reading"]), []).append(r)
     yield from _table(
-        ("operators", "construct", "reading", "since", "until", "exception", "evidence"),
+        ("operators", "construct", "reading", "since", "until"),
         (
-            (ops, construct, reading, of[0]["since"], of[-1]["until"] or "", _code(of[-1]["exception"]), evidence)
-            for (ops, construct, reading, evidence), of in sorted(rules.items(), key=lambda item: item[0][0])
+            (*key, of[0]["since"], of[-1]["until"] or "")
+            for key, of in sorted(rules.items(), key=lambda item: item[0][0])
         ),
     )
-
-
-def _players(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    yield f"## Players\n\n{PLAYED}"
-    yield from _table(
-        ("of", "form", "outcome", "releases", "exception", "fix", "evidence"),
-        (
-            (
-                ", ".join(r["of"]),
-                r["form"],
-                r["outcome"],
-                ", ".join(r["releases"]),
-                _code(r["exception"]),
-                r["fix"],
-                ", ".join(r["evidence"]),
-            )
-            for r in rows
-        ),
-    )
-
-
-def _code(text: str | None) -> str:
-    return "" if text is None else f"`` {' '.join(text.split())} ``"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

@@ -207,10 +207,8 @@ def page(content: Mapping[str, Any]) -> str:
         "",
         "## Worst difference",
         "",
-        "The largest |a − b| of any element of any output, over all inputs: also the ones of ±1e3, where the "
-        "outputs of a policy without a normaliser are thousands, and one unit in their last place is 1e-4 and more. "
-        "That is why the bound is relative above 1, and why the next table counts elements. In brackets the median of "
-        "the policies' own worst.",
+        "The largest |a − b| of any element of any output, over all inputs: also those of ±1e3, where outputs are "
+        "thousands and the bound is relative. In brackets the median of the policies' own worst.",
         "",
         *_table(
             ["format", "runtime", *(f"{KINDS[k]} ({content['kinds'][k]})" for k in kinds)],
@@ -258,11 +256,9 @@ def _profiles(counted: Mapping[str, Any]) -> list[str]:
         "",
         f"Counted on {counted['date']} by `python -m tests.figures --profiles`: {counted['files']} files and folders "
         f"(public models, genuine trainings, other trainers), of which {unread} are not read as a policy; the others "
-        f"hold {counted['policies']}. *Held* is written, has no construct or layer that an importer of that profile "
-        "misreads by the recorded verdicts, is accepted by our checkers of its releases, and acts as the policy does: "
-        "actions, memories and what is drawn from are compared under the names, layouts and dtypes of that consumer, "
-        "with 1, 3 and 16 agents: ONNX in onnxruntime, `.bytes` in TensorFlow 1.4 and 1.7, `.nn` by the layer rules "
-        "of the format.",
+        f"hold {counted['policies']}. *Held* is written, has nothing that an importer of that profile misreads, is "
+        "accepted by our checkers of its releases, and acts as the policy does under that consumer's names, with 1, 3 "
+        "and 16 agents: ONNX in onnxruntime, `.bytes` in TensorFlow 1.4 and 1.7, `.nn` by the layer rules.",
         "",
         *_table(
             ["`--for`", "format", "held", "refused", "why"],

@@ -228,7 +228,7 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
     """docs/onnx-operators.md: counts, and what is refused, with the reason. Expansions of an operator count with it."""
     states = Counter(o.state for _, o in outcomes)
     refused: dict[str, dict[str, int]] = {}
-    right = Counter(t.subject for t, o in outcomes if o.state == "right")
+    right = {t.subject.partition(",")[0] for t, o in outcomes if o.state == "right"}
     for test, found in outcomes:
         if found.state == "refused":
             reasons = refused.setdefault(test.subject, {})
@@ -240,17 +240,21 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
         "one observation without a batch axis is cut into the test's inputs, its outputs are the action. The export is",
         f"run for three agents in numpy and onnxruntime. {states['right']} give the expected numbers,",
         f"{states['wrong']} give others, {states['refused']} are refused, {states['no kernel']} use a type that",
-        f"onnxruntime has no kernel for, and {states['no policy']} are no policy (strings, sequences, draws).",
+        f"onnxruntime has no kernel for, and {states['no policy']} are not policies (strings, sequences, draws).",
         "",
         f"Converted in at least one form: {', '.join(sorted(right))}.",
         "",
-        "What is refused, with the reason and the number of tests:",
+        "What is refused, by reason, with the number of tests:",
         "",
-        "| operator | reason | tests |",
-        "|---|---|---|",
+        "| reason | operators |",
+        "|---|---|",
     ]
-    for kind, reasons in sorted(refused.items()):
-        lines += [f"| {kind} | {reason} | {count} |" for reason, count in sorted(reasons.items())]
+    by_reason: dict[str, Counter[str]] = {}
+    for kind, reasons in refused.items():
+        for reason, count in reasons.items():
+            by_reason.setdefault(reason, Counter())[kind] += count
+    for reason, kinds in sorted(by_reason.items(), key=lambda item: (-item[1].total(), item[0])):
+        lines.append(f"| {reason} | {', '.join(f'{kind} {count}' for kind, count in sorted(kinds.items()))} |")
     return "\n".join(
         [*lines, "", "`python -m tests.onnx_reader.node_tests` writes this page; a test holds a part of it.", ""]
     )

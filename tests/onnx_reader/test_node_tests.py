@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -21,4 +22,5 @@ def test_what_is_converted_is_right_and_what_is_refused_stands_on_the_page(tmp_p
         found = outcome(test, tmp_path, None)
         assert found.state != "wrong", (test.name, found.reason)
         if found.state == "refused":
-            assert f"| {test.subject} | {found.reason} |" in page, test.name
+            rows = [line for line in page.splitlines() if line.startswith(f"| {found.reason} | ")]
+            assert any(re.search(rf"[|,] {re.escape(test.subject)} \d", row) for row in rows), test.name
