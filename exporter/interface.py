@@ -246,8 +246,8 @@ def play(
 
     - ``reference``, ``candidates``: as for ``compare``. Without candidates the formats of the bundle play, or those
       that an export of the source would write.
-    - ``env``: ``3DBall``, ``GridWorld``, ``Hallway``, ``Tennis`` or ``Crawler2D``, or a function that makes a World
-      (exporter/play/worlds.py) for a policy's signature.
+    - ``env``: ``3DBall``, ``GridWorld``, ``Hallway``, ``Tennis`` or ``Crawler2D``; a Gymnasium id; ``module:make``,
+      your own code, which runs in this process; or a function that makes a World (exporter/play/worlds.py).
     - ``options``: episodes, seed, margin, and whether actions are drawn; ``partner``: the bundle that plays the other
       side, where there is one.
     - ``names``, ``read``, ``verify``: as for ``compare``.

@@ -10,6 +10,7 @@ from exporter.acting.loading import load_policy
 from exporter.play.environments import ENVIRONMENTS
 from exporter.play.environments.base import Observation
 from exporter.play.environments.tennis import follow_ball
+from exporter.play.gymnasium_world import gymnasium_maker, own_maker
 from exporter.play.worlds import Decide, MakeWorld, OwnWorld, World, own_scene
 from exporter.serve.scenes import SCENES, other_side
 from signatures.contract import POLICY
@@ -21,11 +22,10 @@ from signatures.spec import PolicySignature
 def world_maker(env: str, place: Path, partner: Path | str | None = None) -> MakeWorld:
     """Return what makes the world called ``env`` for a policy at ``place``. Raises UsageError where there is none."""
     name = next((n for n in ENVIRONMENTS if n.casefold() == env.casefold()), None)
-    if name is None:
-        known = ", ".join(ENVIRONMENTS)
-        raise UsageError(f"--env {env}: unknown environment", fix=f"one of {known}")
     if partner is not None and all(s.side is None for s in SCENES if s.name == name):
-        raise UsageError(f"--partner does not go with --env {name}", why="one policy plays there", fix="leave it out")
+        raise UsageError(f"--partner does not go with --env {env}", why="one policy plays there", fix="leave it out")
+    if name is None:
+        return own_maker(env) if ":" in env else gymnasium_maker(env, list(ENVIRONMENTS))
 
     def make(signature: PolicySignature) -> World:
         scene = own_scene(name, signature)

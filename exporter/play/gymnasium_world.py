@@ -1,0 +1,236 @@
+"""Environments with Gymnasium's interface: its own by id, and the user's own code. One environment for each episode.
+
+What is asked of an environment: ``reset(seed=)`` → (observation, info), ``step(action)`` → (observation, reward,
+terminated, truncated, info), ``action_space``; Gymnasium need not be installed for code that has these. Masks are taken
+where they usually are: ``info["action_mask"]``, the observation's ``action_mask``, or the method ``action_masks()``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from exporter.play.worlds import MakeWorld, Outcome, View
+from signatures.errors import UsageError
+from signatures.roles import Role
+from signatures.spec import PolicySignature, TensorSpec
+
+Array = np.ndarray
+_MASKS = ("action_mask", "action_masks")
+_SUCCESS = ("is_success", "success")
+
+
+class GymnasiumWorld:
+    """Environments side by side; each row is one that is reset from a seed of its own."""
+
+    def __init__(
+        self, name: str, make: Callable[[], Any], signature: PolicySignature, notes: tuple[str, ...] = ()
+    ) -> None:
+        self.name, self.notes = name, notes
+        self._make, self._signature = make, signature
+        self._environments = [self._made()]
+        self._masked = any(s.role is Role.MASKS for s in signature.inputs)
+        self._space = getattr(self._environments[0], "action_space", None)
+        self._check_actions()
+        seen, info = self._reset(self._environments[0], 0)
+        _observed(signature, seen, self.name)
+        if self._masked and self._masks_of(self._environments[0], seen, info) is None:
+            raise UsageError(
+                f"--env {name}: the policy takes masks, and the environment gives none",
+                fix='give them as info["action_mask"], 1 for what is allowed',
+            )
+
+    def begin(self, episodes: int, seed: int) -> View:
+        """Reset an environment for each episode."""
+        while len(self._environments) < episodes:
+            self._environments.append(self._made())
+        seeds = np.random.SeedSequence(seed).generate_state(episodes) >> np.uint32(1)
+        rows = [self._reset(env, int(s)) for env, s in zip(self._environments[:episodes], seeds, strict=True)]
+        self._ended = np.zeros(episodes, bool)
+        self._rows = [self._row(env, *row) for env, row in zip(self._environments, rows, strict=False)]
+        return self._view()
+
+    def step(self, continuous: Array | None, discrete: Array | None) -> Outcome:
+        """Step every environment whose episode goes on."""
+        count = len(self._rows)
+        rewards, ended, success = np.zeros(count), self._ended.copy(), np.zeros(count, bool)
+        for row in np.flatnonzero(~self._ended):
+            env = self._environments[row]
+            action = self._action(
+                None if continuous is None else continuous[row], None if discrete is None else discrete[row]
+            )
+            with _own_code(self.name, "step"):
+                seen, reward, terminated, truncated, info = env.step(action)
+                rewards[row], ended[row] = float(reward), bool(terminated or truncated)
+            success[row] = any(bool(info.get(key, False)) for key in _SUCCESS)
+            self._rows[row] = self._row(env, seen, info)
+        self._ended = ended
+        return Outcome(self._view(), rewards, ended, success)
+
+    def _made(self) -> Any:
+        with _own_code(self.name, "making it"):
+            return self._make()
+
+    def _reset(self, env: Any, seed: int) -> tuple[Any, Mapping[str, Any]]:
+        with _own_code(self.name, "reset"):
+            seen, info = env.reset(seed=seed)
+        return seen, info
+
+    def _row(self, env: Any, seen: Any, info: Mapping[str, Any]) -> tuple[dict[str, Array], Array | None]:
+        masks = self._masks_of(env, seen, info) if self._masked else None
+        return _observed(self._signature, seen, self.name), masks
+
+    def _view(self) -> View:
+        names = [s.name for s in self._signature.observations]
+        stacked = {name: np.stack([observations[name] for observations, _ in self._rows]) for name in names}
+        masks = [m for _, m in self._rows if m is not None]
+        return View(stacked, np.stack(masks).astype(np.float32) if masks else None)
+
+    def _masks_of(self, env: Any, seen: Any, info: Mapping[str, Any]) -> Array | None:
+        for place in (info, seen):
+            found = next((place[k] for k in _MASKS if k in place), None) if isinstance(place, Mapping) else None
+            if found is not None:
+                break
+        else:
+            method = getattr(getattr(env, "unwrapped", env), "action_masks", None)
+            if method is None:
+                return None
+            with _own_code(self.name, "action_masks"):
+                found = method()
+        parts = found if isinstance(found, tuple | list) and np.ndim(found[0]) else [found]
+        return np.concatenate([np.asarray(part, np.float32).reshape(-1) for part in parts])
+
+    # ---- actions
+
+    def _check_actions(self) -> None:
+        """Raise UsageError where the policy's actions are not the environment's."""
+        sizes, box = _choices(self._space), getattr(self._space, "shape", None)
+        signature = self._signature
+        width = next((s.shape[-1] for s in (h.spec for h in signature.heads) if s.is_continuous), None)
+        if sizes is not None:
+            fits = signature.action_space == "discrete" and signature.branches == sizes
+        else:
+            count = None if box is None else int(np.prod(box))
+            fits = signature.action_space == "continuous" and width in (None, count)
+        if not fits:
+            does = f"branches {list(signature.branches)}" if signature.branches else f"{width} continuous actions"
+            raise UsageError(
+                f"--env {self.name}: the policy does not fit the environment",
+                why=f"the environment takes {self._space}; the policy gives {does}",
+                fix="choose an environment that the policy was trained in",
+            )
+
+    def _action(self, continuous: Array | None, discrete: Array | None) -> Any:
+        """Return one action as the environment takes it: a number, a list of choices, or a box within its bounds."""
+        if continuous is None:
+            assert discrete is not None
+            if not hasattr(self._space, "nvec"):
+                return int(discrete[0]) + int(getattr(self._space, "start", 0))
+            return np.asarray(discrete, np.int64)
+        space: Any = self._space
+        low, high = getattr(space, "low", -np.inf), getattr(space, "high", np.inf)
+        return np.clip(continuous.reshape(space.shape), low, high).astype(getattr(space, "dtype", np.float32))
+
+
+def _choices(space: Any) -> tuple[int, ...] | None:
+    """Return the branches of a space of choices; None where it is none."""
+    if hasattr(space, "nvec"):
+        return tuple(int(n) for n in np.asarray(space.nvec).reshape(-1))
+    return (int(space.n),) if hasattr(space, "n") else None
+
+
+def _observed(signature: PolicySignature, seen: Any, name: str) -> dict[str, Array]:
+    """Return one agent's observations by the policy's names. Raises UsageError where they do not fit."""
+    specs = signature.observations
+    if isinstance(seen, Mapping):
+        given = {key: np.asarray(value) for key, value in seen.items() if key not in _MASKS}
+    else:
+        given = {specs[0].name: np.asarray(seen)} if len(specs) == 1 else {"the observation": np.asarray(seen)}
+    found = {}
+    for spec in specs:
+        key = (
+            spec.name
+            if spec.name in given
+            else next((k for k, v in given.items() if len(given) == len(specs) == 1), "")
+        )
+        array = None if key not in given else _shaped(spec, given[key])
+        if array is None:
+            shapes = ", ".join(f"{k} {list(v.shape)}" for k, v in given.items())
+            raise UsageError(
+                f"--env {name}: the policy does not fit the environment",
+                why=f"the policy observes {spec.name!r} {spec.shape_text}; the environment gives {shapes}",
+                fix="give observations by the policy's names and in its shapes",
+            )
+        found[spec.name] = array
+    return found
+
+
+def _shaped(spec: TensorSpec, array: Array) -> Array | None:
+    """Return an observation in the policy's shape: as it is, flat, or one number of several as a vector with a 1."""
+    wanted = spec.shape[1:]
+    if len(wanted) == array.ndim and all(n in (None, m) for n, m in zip(wanted, array.shape, strict=True)):
+        return array
+    if len(wanted) == 1 and array.size == wanted[0]:
+        return array.reshape(-1)
+    if len(wanted) == 1 and array.ndim == 0 and array.dtype.kind in "iu" and wanted[0] is not None:
+        return np.eye(wanted[0], dtype=np.float32)[int(array)] if 0 <= int(array) < wanted[0] else None
+    return None
+
+
+# ------------------------------------------------------------------ by name
+
+
+def gymnasium_maker(env: str, known: Sequence[str]) -> MakeWorld:
+    """Return what makes worlds of a Gymnasium id. Raises UsageError where Gymnasium is not installed, or has none."""
+    try:
+        gymnasium: Any = importlib.import_module("gymnasium")
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"--env {env}: unknown environment",
+            why="Gymnasium, which may have one of that name, is not installed",
+            fix=f"one of {', '.join(known)}; a Gymnasium id after pip install 'export-model[gym]'; or module:make",
+        ) from error
+    if env not in gymnasium.registry:
+        raise UsageError(
+            f"--env {env}: unknown environment",
+            why="Gymnasium has none of that name either",
+            fix=f"one of {', '.join(known)}, a Gymnasium id such as CartPole-v1, or module:make",
+        )
+    return lambda signature: GymnasiumWorld(env, lambda: gymnasium.make(env), signature)
+
+
+def own_maker(env: str) -> MakeWorld:
+    """Return what makes worlds of ``module:make``: code of the user's own, imported from the current folder, too."""
+    module, _, function = env.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    with _own_code(env, "importing it"):
+        found = getattr(importlib.import_module(module), function, None)
+    if not callable(found):
+        raise UsageError(
+            f"--env {env}: {module} has no function {function!r}", fix="name one that makes an environment"
+        )
+    note = f"the environment {env} is your own code; it ran in this process"
+    return lambda signature: GymnasiumWorld(env, found, signature, (note,))
+
+
+@contextmanager
+def _own_code(name: str, doing: str) -> Iterator[None]:
+    """Errors of an environment's code are about that. Raises UsageError."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except Exception as error:
+        raise UsageError(
+            f"--env {name}: {doing} failed",
+            why=f"{type(error).__name__}: {error}",
+            fix="look at the environment's own code",
+        ) from error
