@@ -28,8 +28,8 @@ SPEAK_ONNX = ("converters/formats/onnx/", "converters/consumers/unity/")
 def listed(tree: ast.AST, *, translates: bool = False) -> Iterator[tuple[int, set[str]]]:
     """(line, ops) of every literal collection that names at least two ops.
 
-    ``translates``: but for the keys and the values of a dictionary, ``dict.fromkeys`` too: a table from the words of a
-    format to ops, or from ops to the functions that write them.
+    ``translates``: but for a table from the words of a format to ops, or from ops to the words, sentences and functions
+    of a format, ``dict.fromkeys`` too. One that has a truth, a number or nothing for an op says what the op is like.
     """
     tables = {id(part) for found in ast.walk(tree) for part in _keys(found)} if translates else set[int]()
     for found in ast.walk(tree):
@@ -37,11 +37,21 @@ def listed(tree: ast.AST, *, translates: bool = False) -> Iterator[tuple[int, se
             parts: list[ast.expr | None] = list(found.elts)
         elif isinstance(found, ast.Dict) and not translates:
             parts = [*found.keys, *found.values]
+        elif isinstance(found, ast.Dict):
+            parts = [k for k, v in zip(found.keys, found.values, strict=True) if _is_fact(v)]
+        elif translates and isinstance(found, ast.Call) and any(map(_is_fact, found.args[1:] or [ast.Constant(None)])):
+            parts = [p for keys in _keys(found) for p in getattr(keys, "elts", ())]
         else:
             continue
         ops = {p.value for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, str)} & NAMES
         if len(ops) > 1:
             yield found.lineno, ops
+
+
+def _is_fact(value: ast.expr) -> bool:
+    """Whether all that a table has for an op are truths and numbers."""
+    parts = value.elts if isinstance(value, ast.Tuple | ast.List | ast.Set) else [value]
+    return all(isinstance(p, ast.Constant) and not isinstance(p.value, str) for p in parts)
 
 
 def _keys(node: ast.AST) -> list[ast.expr]:
@@ -76,6 +86,19 @@ def test_a_table_that_translates_is_told_from_a_list() -> None:
     table = 'A = {"Add": "AddV2", "Mul": "Sub", **dict.fromkeys(("MatMul", "Conv2D"), f)}'
     assert list(listed(ast.parse(table), translates=True)) == []
     assert list(listed(ast.parse('A = {"x": ("MatMul", "Conv2D")}'), translates=True)) == [(1, {"MatMul", "Conv2D"})]
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        'A = {"Sum": False, "Mean": True}',
+        'A = {"Sum": (0, 1), "Mean": (), "Add": f}',
+        'A = dict.fromkeys(("Sum", "Mean"), 1)',
+        'A = {**dict.fromkeys(("Sum", "Mean"))}',
+    ],
+)
+def test_a_table_of_facts_is_no_translation(table: str) -> None:
+    assert list(listed(ast.parse(table), translates=True)) == [(1, {"Sum", "Mean"})]
 
 
 # ------------------------------------------------------------------ traits

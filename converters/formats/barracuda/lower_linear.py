@@ -15,6 +15,7 @@ from converters.formats.barracuda.lower_base import NnBuilder
 from converters.formats.barracuda.lower_elementwise import applied
 from converters.formats.barracuda.lower_values import Value
 from converters.formats.barracuda.vocabulary import Activation, C, LayerType, N
+from converters.graph.ops.table import traits
 from converters.graph.types import BATCH
 
 #: A first pad of −1 is TensorFlow's SAME.
@@ -164,9 +165,8 @@ _REDUCED = {
     "All": LayerType.REDUCE_MIN,
     "Prod": LayerType.REDUCE_PROD,
 }
-#: Whether a sum is divided by the number of its terms.
-_DIVIDED = {"Sum": False, "Mean": True}
-REDUCTIONS = (*_DIVIDED, *_REDUCED)
+#: Ops that one layer of its own reduces by; sums and means are products.
+REDUCED = tuple(_REDUCED)
 
 
 def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -189,27 +189,28 @@ def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
 def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
     n, h, w, c = value.dims
     op, width = b.node.op, h * w * c
+    summed, mean = op not in _REDUCED, traits(b.node).takes == "mean"
     # All pixels of each channel: what is left of the image is one.
     pixels = C not in places and all(length == 1 or place in places for place, length in ((1, h), (2, w)))
-    if op in _DIVIDED and whole:
+    if summed and whole:
         b.made_up(width)
-        share = 1.0 if op == "Sum" else 1 / width
+        share = 1 / width if mean else 1.0
         return b.dense(name, np.full((width, 1), share), np.zeros(1))
-    if op in _DIVIDED and pixels:
-        mean = b.layer(LayerType.GLOBAL_AVG_POOL2D, [name], (n, 1, 1, c), label="" if op == "Mean" else "mean")
-        return mean if op == "Mean" else b.scaled(mean, h * w)
-    if op in _DIVIDED and places == [C]:
-        kernel = np.full((1, 1, c, 1), 1.0 if op == "Sum" else 1 / c)
+    if summed and pixels:
+        pooled = b.layer(LayerType.GLOBAL_AVG_POOL2D, [name], (n, 1, 1, c), label="" if mean else "mean")
+        return pooled if mean else b.scaled(pooled, h * w)
+    if summed and places == [C]:
+        kernel = np.full((1, 1, c, 1), 1 / c if mean else 1.0)
         data = [("kernel", kernel), ("bias", np.zeros((1, 1, 1, 1)))]
         return b.layer(LayerType.CONV2D, [name], (n, h, w, 1), stride=(1, 1), data=data)
     largest = _REDUCED.get(op) is LayerType.REDUCE_MAX
-    if (op in _DIVIDED or largest) and C not in places:
+    if (summed or largest) and C not in places:
         kind = LayerType.MAX_POOL2D if largest else LayerType.AVG_POOL2D
         down, across = (h if 1 in places else 1), (w if 2 in places else 1)
         pooled = b.layer(
             kind, [name], (n, h // down, w // across, c), pool=(across, down), stride=(across, down), label="pooled"
         )
-        return b.scaled(pooled, down * across) if op == "Sum" else pooled
+        return b.scaled(pooled, down * across) if summed and not mean else pooled
     if op in _REDUCED and whole and len(places) > 1:
         name = b.layer(LayerType.FLATTEN, [name], (n, 1, 1, width), label="flat")
         return b.layer(_REDUCED[op], [name], (n, 1, 1, 1))

@@ -70,7 +70,7 @@ _OPS: Mapping[str, tuple[Lower, slice]] = {
     **dict.fromkeys(("_FusedMatMul", "_FusedConv2D"), (linear.fused, _ALL)),
     "DepthwiseConv2dNative": (linear.depthwise, _ALL),
     **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
-    **dict.fromkeys(linear.REDUCTIONS, (linear.reduce, _FIRST)),
+    **dict.fromkeys(("Sum", "Mean", *linear.REDUCED), (linear.reduce, _FIRST)),
     **dict.fromkeys(("Softmax", "LogSoftmax"), (linear.softmax, _ALL)),
     **dict.fromkeys(("ArgMax", "ArgMin"), (linear.arg_best, _FIRST)),
     "Multinomial": (linear.drawn_class, _FIRST),
