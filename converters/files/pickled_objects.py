@@ -15,7 +15,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -64,12 +64,17 @@ class Instance:
         return state.get(name, default) if isinstance(state, dict) else default
 
 
-def unpickle_objects(data: bytes, storage: Callable[[tuple[Any, ...]], Any] | None = None) -> Any:
-    """Return the value of a pickle that may hold objects. ``storage`` makes what a persistent id stands for.
+def unpickle_objects(
+    data: bytes,
+    storage: Callable[[tuple[Any, ...]], Any] | None = None,
+    names: Mapping[tuple[str, str], Any] | None = None,
+) -> Any:
+    """Return the value of a pickle that may hold objects. ``storage`` makes what a persistent id stands for; ``names``
+    are functions of this program, for names that the pickle calls.
 
     Raises NotAPolicyError for a name that acts on the machine, DamagedFileError for what breaks the rules of pickles.
     """
-    return carry_out(_Objects(storage or _no_storage, 4 * len(data) + (1 << 16)), io.BytesIO(data))
+    return carry_out(_Objects(storage or _no_storage, names or {}, 4 * len(data) + (1 << 16)), io.BytesIO(data))
 
 
 def _no_storage(identity: tuple[Any, ...]) -> Any:
@@ -79,15 +84,21 @@ def _no_storage(identity: tuple[Any, ...]) -> Any:
 class _Objects(Machine):
     """A machine for which every other class is a name."""
 
-    def __init__(self, storage: Callable[[tuple[Any, ...]], Any], most_copied: int) -> None:
+    def __init__(
+        self,
+        storage: Callable[[tuple[Any, ...]], Any],
+        names: Mapping[tuple[str, str], Any],
+        most_copied: int,
+    ) -> None:
         super().__init__(storage)
+        self._names = {**NAMES, **names}
         self.opcodes = _OPCODES
         self._most_copied = most_copied
 
     def imported(self, module: str, name: str) -> Any:
         """Return what is known of an imported name. Raises NotAPolicyError for one that acts on the machine."""
-        if (module, name) in NAMES:
-            return NAMES[module, name]
+        if (module, name) in self._names:
+            return self._names[module, name]
         if (module, name) == ("_codecs", "encode"):
             return Function("encode", self._encoded)
         root = module.partition(".")[0]

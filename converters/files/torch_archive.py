@@ -13,6 +13,7 @@ import math
 import struct
 import zipfile
 import zlib
+from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -113,23 +114,32 @@ class Archive:
                 names = [n for n in entries if n == "data.pkl" or n.endswith("/data.pkl")]
                 if len(names) != 1:
                     raise _damaged_error("it has no data.pkl, or more than one", "torch.save writes one")
-                root = names[0].removesuffix("data.pkl")
-                if f"{root}constants.pkl" in entries or any(n.startswith(f"{root}code/") for n in entries):
-                    raise NotAPolicyError(
-                        "is a TorchScript module (torch.jit.save)",
-                        why="it holds code of its own, which is not run",
-                        fix="give the checkpoint of the run, or export the module to ONNX with torch.onnx.export",
-                    )
-                self._check_sizes(list(entries.values()))
-                if f"{root}byteorder" in entries and archive.read(f"{root}byteorder") == b"big":
-                    self._order = ">"
-                for name, entry in entries.items():
-                    if name.startswith(f"{root}data/"):
-                        self._storages[name.removeprefix(f"{root}data/")] = self._uncompressed_entry(entry)
-                pickle = archive.read(names[0])
+                return self._of_entries(archive, entries, names[0].removesuffix("data.pkl"))
         except ZIP_ERRORS as error:
             raise _damaged_error(f"its archive cannot be read: {error}", "the file is cut off or damaged") from error
-        return unpickle(io.BytesIO(pickle), self._persistent)
+
+    def _of_entries(self, archive: zipfile.ZipFile, entries: Mapping[str, zipfile.ZipInfo], root: str) -> Any:
+        """Return what was saved. Raises what reading a ZIP archive raises, too."""
+        if f"{root}constants.pkl" in entries or any(n.startswith(f"{root}code/") for n in entries):
+            raise NotAPolicyError(
+                "is a TorchScript module (torch.jit.save)",
+                why="a state dictionary is expected here",
+                fix="give the module itself",
+            )
+        self._check_sizes(entries.values())
+        self._read_order(archive, entries, root)
+        self._take_storages(entries, f"{root}data/", "")
+        return unpickle(io.BytesIO(archive.read(f"{root}data.pkl")), self._persistent)
+
+    def _read_order(self, archive: zipfile.ZipFile, entries: Mapping[str, zipfile.ZipInfo], root: str) -> None:
+        if f"{root}byteorder" in entries and archive.read(f"{root}byteorder") == b"big":
+            self._order = ">"
+
+    def _take_storages(self, entries: Mapping[str, zipfile.ZipInfo], folder: str, prefix: str) -> None:
+        """Keep the storages in a folder of the archive, their keys behind a prefix."""
+        for name, entry in entries.items():
+            if name.startswith(folder):
+                self._storages[prefix + name.removeprefix(folder)] = self._uncompressed_entry(entry)
 
     def _uncompressed_entry(self, entry: zipfile.ZipInfo) -> memoryview:
         """What ``ZipFile.read`` gives of an entry that is not compressed, without a copy. Raises what that raises."""
@@ -144,7 +154,7 @@ class Archive:
             raise zipfile.BadZipFile(f"bad CRC-32 for {entry.filename!r}")
         return content
 
-    def _check_sizes(self, entries: list[zipfile.ZipInfo]) -> None:
+    def _check_sizes(self, entries: Collection[zipfile.ZipInfo]) -> None:
         for entry in entries:
             if entry.compress_type != zipfile.ZIP_STORED:
                 raise NotAPolicyError(
