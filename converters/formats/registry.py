@@ -19,6 +19,7 @@ ROOMS = (
     "litert",
     "c",
     "stable_baselines3",
+    "torchscript",
     "torch_checkpoint",
     "keras",
 )

@@ -1,0 +1,31 @@
+"""TorchScript modules (``torch.jit.save``): legged_gym, unitree_rl_gym, Isaac Lab, and others."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from converters.formats.format import Format, deferred
+
+if TYPE_CHECKING:
+    from converters.files.file_probe import Content
+    from converters.formats.torchscript import source as _source
+else:
+    (_source,) = deferred(__name__, "source")
+
+
+def _sniff(file: Content) -> bool:
+    """What torch.jit.save writes: an archive with a pickle, and code beside it."""
+    names = file.entries
+    return any(n.endswith("data.pkl") for n in names) and any("code/__torch__" in n for n in names)
+
+
+FORMATS = (
+    Format(
+        key="torchscript",
+        label="a TorchScript module (.pt, torch.jit.save)",
+        sniff=_sniff,
+        read=_source.read,
+        takes=frozenset({"sensors"}),
+        library="torch",
+    ),
+)

@@ -1,0 +1,245 @@
+"""Ops on each element by itself; of numbers alone they are computed while the program is walked through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from converters.formats.torchscript.machine import Machine, unknown_length
+from converters.formats.torchscript.ops.scalars import NUMBERS
+from converters.formats.torchscript.values import LengthFoundError, OpenLength, Tensor
+from converters.graph.nn import activations
+from converters.graph.nn.activations import Activation
+from converters.graph.types import BOOL, FLOAT32
+from signatures.errors import UnsupportedOpError
+
+
+def _floats(m: Machine, x: Any) -> str:
+    return m.b.cast(m.ref(x), FLOAT32)
+
+
+def _unary(function: Activation) -> Callable[..., Tensor]:
+    return lambda m, x: Tensor(function(m.b, _floats(m, x)))
+
+
+def _op(name: str) -> Callable[..., Tensor]:
+    return _unary(activations.of_op(name))
+
+
+def _kept(name: str) -> Callable[..., Tensor]:
+    """An op that keeps whole numbers whole."""
+    return lambda m, x: Tensor(m.b.add(name, [m.ref(x)]))
+
+
+# ------------------------------------------------------------------ two operands
+
+
+def _numbers(m: Machine, name: str, a: Any, b: Any) -> Any:
+    for one, other in ((a, b), (b, a)):
+        if isinstance(one, OpenLength):
+            if name in ("eq", "ne") and isinstance(other, int):
+                raise LengthFoundError(one.symbol, other)
+            raise unknown_length()
+    if any(isinstance(v, list | tuple) and any(isinstance(i, list | tuple) for i in v) for v in (a, b)):
+        raise UnsupportedOpError("lists of lists are compared", why="lists of numbers are known")
+    if isinstance(a, list | tuple) and name in ("eq", "ne"):
+        return (list(a) == list(b)) is (name == "eq")
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return m.number(NUMBERS[name](a, b))
+    if name in ("eq", "ne"):
+        return (a == b) is (name == "eq")
+    raise UnsupportedOpError(f"{type(a).__name__} and {type(b).__name__} are joined", why="numbers are expected")
+
+
+def _tensors(*values: Any) -> bool:
+    return any(isinstance(v, Tensor) for v in values)
+
+
+def _binary(op: str, name: str) -> Callable[..., Any]:
+    def translate(m: Machine, a: Any, b: Any) -> Any:
+        return Tensor(m.b.add(op, list(m.pair(a, b)))) if _tensors(a, b) else _numbers(m, name, a, b)
+
+    return translate
+
+
+def _scaled(op: str, name: str, *, swapped: bool = False) -> Callable[..., Any]:
+    """``add(a, b, alpha)``: a + alpha·b."""
+
+    def translate(m: Machine, a: Any, b: Any, alpha: Any = 1) -> Any:
+        if not _tensors(a, b):
+            return _numbers(m, name, *((b, a) if swapped else (a, b)))
+        if swapped:
+            a, b = b, a
+            return Tensor(m.b.add(op, list(m.pair(a, _times(m, b, alpha)))))
+        return Tensor(m.b.add(op, list(m.pair(a, _times(m, b, alpha)))))
+
+    return translate
+
+
+def _times(m: Machine, value: Any, factor: Any) -> Any:
+    if factor == 1:
+        return value
+    return Tensor(m.b.add("Mul", list(m.pair(value, factor)))) if isinstance(value, Tensor) else value * factor
+
+
+def _divided(m: Machine, a: Any, b: Any, rounding_mode: Any = None) -> Any:
+    if not _tensors(a, b):
+        return m.number(a / b)
+    left, right = (m.b.cast(r, FLOAT32) for r in m.pair(a, b))
+    made = m.b.add("RealDiv", [left, right])
+    if rounding_mode is None:
+        return Tensor(made)
+    if rounding_mode != "floor":
+        raise UnsupportedOpError("it rounds by another rule", why="floor is known")
+    return Tensor(m.b.add("Floor", [made]))
+
+
+def _floor_divided(m: Machine, a: Any, b: Any) -> Any:
+    return _divided(m, a, b, "floor") if _tensors(a, b) else m.number(a // b)
+
+
+def _power(m: Machine, x: Any, exponent: Any) -> Any:
+    if not _tensors(x, exponent):
+        raise UnsupportedOpError("a power of two numbers", why="it may be any number")
+    if isinstance(exponent, int | float) and exponent in (2, 0.5, 1):
+        value = _floats(m, x)
+        return Tensor(value if exponent == 1 else m.b.add("Square" if exponent == 2 else "Sqrt", [value]))
+    a, b = m.pair(x, exponent)
+    return Tensor(m.b.add("Pow", [m.b.cast(a, FLOAT32), m.b.cast(b, FLOAT32)]))
+
+
+def _clamp(m: Machine, x: Any, min: Any = None, max: Any = None) -> Tensor:
+    value = m.ref(x)
+    low, high = (b if b is None or isinstance(b, int | float) else m.ref(b) for b in (min, max))
+    value = value if m.b.is_float(value) else m.b.cast(value, FLOAT32)
+    return Tensor(activations.clip(m.b, value, low, high))
+
+
+def _logical(op: str) -> Callable[..., Any]:
+    def translate(m: Machine, a: Any, b: Any) -> Any:
+        if not _tensors(a, b):
+            return (a and b) if op == "LogicalAnd" else (a or b)
+        return Tensor(m.b.add(op, [m.b.cast(m.ref(v), BOOL) for v in (a, b)]))
+
+    return translate
+
+
+def _not(m: Machine, x: Any) -> Any:
+    return Tensor(m.b.add("LogicalNot", [m.b.cast(m.ref(x), BOOL)])) if isinstance(x, Tensor) else not x
+
+
+def _where(m: Machine, condition: Any, a: Any, b: Any) -> Tensor:
+    left, right = m.pair(a, b)
+    return Tensor(m.b.where(m.b.cast(m.ref(condition), BOOL), left, right))
+
+
+def _masked_fill(m: Machine, x: Any, mask: Any, value: Any) -> Tensor:
+    return _where(m, mask, value, x)
+
+
+def _negated(m: Machine, x: Any) -> Any:
+    return Tensor(m.b.add("Neg", [m.ref(x)])) if isinstance(x, Tensor) else -x
+
+
+# ------------------------------------------------------------------ activations
+
+
+def _elu(m: Machine, x: Any, alpha: Any = 1, scale: Any = 1, input_scale: Any = 1) -> Tensor:
+    if (scale, input_scale) != (1, 1):
+        raise UnsupportedOpError("an elu of other scales", why="only alpha is known")
+    return Tensor(activations.elu(m.b, _floats(m, x), float(alpha)))
+
+
+def _gelu(m: Machine, x: Any, approximate: Any = "none") -> Tensor:
+    return Tensor(activations.gelu(m.b, _floats(m, x), tanh=approximate == "tanh"))
+
+
+def _softplus(m: Machine, x: Any, beta: Any = 1, threshold: Any = 20) -> Tensor:
+    value = activations.scale_and_shift(m.b, _floats(m, x), float(beta))
+    return Tensor(activations.scale_and_shift(m.b, m.b.add("Softplus", [value]), 1 / float(beta)))
+
+
+def _bounded(low: float | None, high: float | None) -> Callable[..., Tensor]:
+    return lambda m, x: Tensor(activations.clip(m.b, _floats(m, x), low, high))
+
+
+def _dropout(m: Machine, x: Any, p: Any, train: Any) -> Any:
+    if train and p:
+        raise UnsupportedOpError("dropout of a module that is in training", why="call eval() before it is saved")
+    return x
+
+
+def _copy(m: Machine, target: Any, source: Any, non_blocking: Any = False) -> Tensor:
+    """What ``copy_`` puts into a tensor."""
+    return source if isinstance(source, Tensor) else Tensor(m.ref(source, m.ref(target)))
+
+
+def _filled(m: Machine, x: Any, value: Any = 0) -> Tensor:
+    like = m.ref(x)
+    return Tensor(m.b.broadcast(m.b.number(like, float(value)), m.b.shape(like)))
+
+
+def _random(m: Machine, *given: Any, **named: Any) -> Tensor:
+    raise UnsupportedOpError(
+        "it draws random numbers", why="noise inside of a TorchScript module is not translated", fix="trace the mean"
+    )
+
+
+OPS: Mapping[str, Callable[..., Any]] = {
+    **{name: _op(op) for name, op in (("relu", "Relu"), ("tanh", "Tanh"), ("sigmoid", "Sigmoid"), ("exp", "Exp"))},
+    **{name: _op(op) for name, op in (("log", "Log"), ("sqrt", "Sqrt"), ("rsqrt", "Rsqrt"), ("sin", "Sin"))},
+    **{name: _op(op) for name, op in (("cos", "Cos"), ("tan", "Tan"), ("floor", "Floor"), ("ceil", "Ceil"))},
+    **{name: _op(op) for name, op in (("round", "Round"), ("reciprocal", "Reciprocal"), ("log1p", "Log1p"))},
+    **{name: _op(op) for name, op in (("expm1", "Expm1"), ("erf", "Erf"), ("softsign", "Softsign"))},
+    **{name: _kept(op) for name, op in (("abs", "Abs"), ("sign", "Sign"), ("square", "Square"))},
+    "neg": _negated,
+    "relu6": _bounded(0, 6),
+    "selu": _unary(activations.selu),
+    "silu": _unary(activations.swish),
+    "mish": _unary(activations.mish),
+    "log_sigmoid": _unary(activations.log_sigmoid),
+    "hardsigmoid": _unary(partial(activations.hard_sigmoid, alpha=1 / 6, beta=0.5)),
+    "hardswish": _unary(activations.hard_swish),
+    "elu": _elu,
+    "celu": lambda m, x, alpha=1: Tensor(activations.celu(m.b, _floats(m, x), float(alpha))),
+    "leaky_relu": lambda m, x, slope=0.01: Tensor(activations.leaky_relu(m.b, _floats(m, x), float(slope))),
+    "prelu": lambda m, x, slope: Tensor(activations.prelu(m.b, _floats(m, x), m.ref(slope))),
+    "gelu": _gelu,
+    "softplus": _softplus,
+    "hardtanh": _clamp,
+    "clamp": _clamp,
+    "clip": _clamp,
+    "clamp_min": lambda m, x, low: _clamp(m, x, low),
+    "clamp_max": lambda m, x, high: _clamp(m, x, None, high),
+    "add": _scaled("Add", "add"),
+    "sub": _scaled("Sub", "sub"),
+    "rsub": _scaled("Sub", "sub", swapped=True),
+    "mul": _binary("Mul", "mul"),
+    "div": _divided,
+    "true_divide": _divided,
+    "floor_divide": _floor_divided,
+    "pow": _power,
+    "maximum": lambda m, a, b: Tensor(m.b.add("Maximum", list(m.pair(a, b)))),
+    "minimum": lambda m, a, b: Tensor(m.b.add("Minimum", list(m.pair(a, b)))),
+    "eq": _binary("Equal", "eq"),
+    "ne": _binary("NotEqual", "ne"),
+    "lt": _binary("Less", "lt"),
+    "le": _binary("LessEqual", "le"),
+    "gt": _binary("Greater", "gt"),
+    "ge": _binary("GreaterEqual", "ge"),
+    "logical_and": _logical("LogicalAnd"),
+    "logical_or": _logical("LogicalOr"),
+    "__and__": _logical("LogicalAnd"),
+    "__or__": _logical("LogicalOr"),
+    "logical_not": _not,
+    "bitwise_not": _not,
+    "where": _where,
+    "masked_fill": _masked_fill,
+    "dropout": _dropout,
+    "feature_dropout": _dropout,
+    "copy": _copy,
+    "fill": _filled,
+    "zero": _filled,
+    **dict.fromkeys(("randn", "randn_like", "rand", "rand_like", "normal", "multinomial", "bernoulli"), _random),
+}
