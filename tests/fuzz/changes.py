@@ -7,6 +7,7 @@ import copy
 import io
 import json
 import pickletools
+import re
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
@@ -281,6 +282,74 @@ def saved_zip(files: Files, random: Random) -> Files:
     else:
         entries["policy.pth"] = pickled({"policy.pt": entries["policy.pth"]}, random)["policy.pt"]
     return {"policy.zip": zipped(entries)}
+
+
+def script(files: Files, random: Random) -> Files:
+    """The code of a TorchScript module changed, its attributes, or another part of the archive."""
+    data = files["policy.pt"]
+    if random.random() < 0.05:
+        return {"policy.pt": mutation.damaged(data, random)}
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        kept = [(e.filename, e.compress_type, archive.read(e)) for e in archive.infolist()]
+    draw = random.random()
+    chosen = [
+        i for i, (n, _, _) in enumerate(kept) if n.endswith(".py" if draw < 0.65 else ".pkl" if draw < 0.9 else "")
+    ]
+    at = random.choice(chosen)
+    name, method, content = kept[at]
+    if draw < 0.65:
+        content = _code(content.decode(), random).encode("utf-8", "surrogatepass")
+    elif draw < 0.9:
+        content = mutation.parts(_opcodes(content), random, _opcode)
+    else:
+        content = mutation.damaged(content, random)
+    kept[at] = name, method, content
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for name, method, content in kept:
+            archive.writestr(zipfile.ZipInfo(name), content, method)
+    return {"policy.pt": made.getvalue()}
+
+
+#: What stands in code where a word of it stood.
+_WORDS = (
+    "-1",
+    "0",
+    "1",
+    "9223372036854775807",
+    "1000000",
+    "None",
+    "True",
+    "[]",
+    "(1, 2)",
+    "input",
+    "self",
+    "x",
+    "1e999",
+)
+_LINES = (
+    "    x = [x, x]", "    input = torch.cat([input, input], 0)", "    for i in range(100):", "    while True:",
+    "    if torch.gt(input, 0):", "    return None", "    import os", "    self.training = 3",
+    "    x = torch.mul(x, x)",
+    "    input = torch.expand(input, [1000, 1000])", "    x = torch.copy_(torch.slice(x, 0, 1), x)",
+)  # fmt: skip
+
+
+def _code(text: str, random: Random) -> str:
+    """A program with a word, a number or a line that is another's."""
+    for _ in range(random.choice((1, 1, 1, 2, 4))):
+        lines = text.splitlines()
+        words = [m.span() for m in re.finditer(r"[\w.]+", text)]
+        how = random.randrange(5)
+        if how < 3 and words:
+            begin, end = random.choice(words)
+            other = random.choice(words)
+            text = text[:begin] + (text[slice(*other)] if how == 0 else random.choice(_WORDS)) + text[end:]
+        elif lines:
+            line = random.choice(lines) if how == 3 else random.choice(_LINES)
+            place = random.randrange(len(lines) + 1)
+            text = "\n".join([*lines[:place], line, *lines[place + random.randrange(2) :]])
+    return text
 
 
 def statistics(files: Files, random: Random) -> Files:

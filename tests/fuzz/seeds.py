@@ -168,6 +168,10 @@ def _torch() -> list[Files]:
     return _single("policy.pt", [f.read_bytes() for f in sorted((FOLDER / "torch_checkpoint").glob("*.pt"))])
 
 
+def _torchscript() -> list[Files]:
+    return _single("policy.pt", [f.read_bytes() for f in sorted((FOLDER / "torchscript").glob("*.pt"))])
+
+
 def _keras() -> list[Files]:
     layers = [test_keras_config.DENSE, test_keras_config.layer("LSTM", "keras.src.layers.rnn.lstm")]
     config = json.dumps(test_keras_config.model(*layers)).encode()
@@ -274,6 +278,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "LiteRT", Reader(_litert, changes.flatbuffer, "policy.tflite")
     yield "checkpoint", Reader(_checkpoints, changes.checkpoint)
     yield "PyTorch", Reader(_torch, changes.pickled, "policy.pt")
+    yield "TorchScript", Reader(_torchscript, changes.script, "policy.pt")
     yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), changes.tfjs)
     yield "layers model", Reader(_web_layers, changes.tfjs)
     yield "Stable-Baselines3", Reader(_saved_zips, changes.saved_zip, "policy.zip")
