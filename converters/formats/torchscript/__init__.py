@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, deferred
+from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.files.file_probe import Content
     from converters.formats.torchscript import source as _source
 else:
-    (_source,) = deferred(__name__, "source")
+    (_source,) = defer_imports(__name__, "source")
 
 
 def _sniff(file: Content) -> bool:
