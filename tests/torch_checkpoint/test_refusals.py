@@ -283,7 +283,7 @@ def test_the_command_line(tmp_path: Path) -> None:
     assert (tmp_path / "out/checkpoint/checkpoint.onnx").is_file()
     for text in ("2,3x", "2,x", "two", "2,3x0x4", "2,3x99999999999x4"):
         wrong = export_model(path, "-o", tmp_path / "out", "--sensors", text)
-        assert wrong.status == 2 and "is no shape of a sensor" in wrong.err
+        assert wrong.status == 2 and "is not the shape of a sensor" in wrong.err
 
 
 def names_read(path: Path, step: int | None = None) -> dict[str, list[str]]:
