@@ -92,6 +92,6 @@ def _roles(given: Mapping[str, str | Role], flag: str) -> dict[str, Role]:
         parsed = role if isinstance(role, Role) else parse_role(role)
         if parsed is None:
             known = ", ".join(r.value for r in Role)
-            raise UsageError(f"{flag} {name}={role}: there is no such role", fix=f"the roles are {known}")
+            raise UsageError(f"{flag} {name}={role}: unknown role", fix=f"the roles are {known}")
         roles[name] = parsed
     return roles

@@ -134,7 +134,7 @@ def json_of(text: str | bytes) -> Any:
 
 
 def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")
 
 
 def _finite(text: str) -> float:
@@ -192,7 +192,7 @@ def parse_signature(whole: Field) -> PolicySignature:
     named = {s.name: s for s in inputs}
     preprocess = {name: _preprocess(entry) for name, entry in whole["preprocess"].members().items()}
     if not preprocess.keys() <= named.keys():
-        raise whole["preprocess"].error(f"names {min(preprocess.keys() - named.keys())!r}, which is no input")
+        raise whole["preprocess"].error(f"names {min(preprocess.keys() - named.keys())!r}, which is not an input")
     try:
         labels = parse_labels(whole["labels"].value)
     except ValueError as error:
@@ -217,7 +217,7 @@ def parse_source_map(source: Field, signature: PolicySignature) -> SourceMap:
     parts = {name: tuple(_part(p) for p in given.items()) for name, given in source["parts"].members().items()}
     names = {s.name for s in (*signature.inputs, *signature.outputs)}
     if not parts.keys() <= names:
-        raise source["parts"].error(f"names {min(parts.keys() - names)!r}, which is no input or output")
+        raise source["parts"].error(f"names {min(parts.keys() - names)!r}, which is not an input or output")
     return SourceMap(
         feeds=sources(signature.inputs, parts),
         fetches=sources(signature.outputs, parts),
@@ -332,7 +332,7 @@ def _preprocess(entry: Field) -> dict[str, Any]:
 def _pair(entry: Field) -> list[Field]:
     found = entry.items()
     if len(found) != 2:
-        raise entry.error("is no pair")
+        raise entry.error("must be a pair")
     return found
 
 
@@ -362,12 +362,12 @@ def _array(entry: Field) -> np.ndarray:
     try:
         value = np.array(entry["value"].value)
         if value.size > _MOST_FIXED or value.dtype.kind not in "biuf":
-            raise entry["value"].error("is no array of numbers")
+            raise entry["value"].error("must be an array of numbers")
         return value.astype(dtype)
     except (ValueError, TypeError, OverflowError) as error:
         if isinstance(error, FieldError):
             raise
-        raise entry["value"].error("is no array of numbers") from error
+        raise entry["value"].error("must be an array of numbers") from error
 
 
 # ------------------------------------------------------------------ files
@@ -375,7 +375,7 @@ def _array(entry: Field) -> np.ndarray:
 
 def _sha256(entry: Field) -> str:
     if not isinstance(entry.value, str) or not _SHA256.fullmatch(entry.value):
-        raise entry.error("is no sha256 in hexadecimal")
+        raise entry.error("must be a sha256 in hexadecimal")
     return entry.value
 
 

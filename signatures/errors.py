@@ -206,7 +206,7 @@ def naming(path: object) -> Iterator[None]:
             "needs more memory than there is",
             where=str(path),
             why=str(error) or "the system gave no more",
-            fix="if it is no larger than other policies, it is damaged: freeze it again from its checkpoint",
+            fix="if other policies are as large, it is damaged: freeze it again from its checkpoint",
         ) from error
     except _BROKEN as error:
         raise GraphError(

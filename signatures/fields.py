@@ -38,7 +38,7 @@ class Field:
     def __getitem__(self, key: str) -> Field:
         """A member of an object; one that is not there is null."""
         if not isinstance(self.value, dict):
-            raise self.error("is no object")
+            raise self.error("must be an object")
         return Field(self.value.get(key), f"{self.path}.{key}" if self.path else key)
 
     def members(self) -> dict[str, Field]:
@@ -46,7 +46,7 @@ class Field:
         if self.missing:
             return {}
         if not isinstance(self.value, dict):
-            raise self.error("is no object")
+            raise self.error("must be an object")
         return {Field(key, f"{self.path}: the name").text(): self[key] for key in self.value}
 
     def items(self, most: int = 100_000) -> list[Field]:
@@ -54,13 +54,13 @@ class Field:
         if self.missing:
             return []
         if not isinstance(self.value, list) or len(self.value) > most:
-            raise self.error(f"is no list of at most {most} items")
+            raise self.error(f"must be a list of at most {most} items")
         return [Field(item, f"{self.path}[{i}]") for i, item in enumerate(self.value)]
 
     def text(self, *, blank: bool = False) -> str:
         """Printable characters on one line."""
         if not isinstance(self.value, str) or not self.value.isprintable() or len(self.value) > MOST_CHARACTERS:
-            raise self.error(f"is no text of at most {MOST_CHARACTERS} printable characters")
+            raise self.error(f"must be text of at most {MOST_CHARACTERS} printable characters")
         if not self.value and not blank:
             raise self.error("is empty")
         return self.value
@@ -74,25 +74,25 @@ class Field:
     def integer(self, low: int, high: int = 2**63 - 1) -> int:
         """A whole number from ``low`` to ``high``."""
         if not isinstance(self.value, int) or isinstance(self.value, bool) or not low <= self.value <= high:
-            raise self.error(f"is no integer from {low} to {high}")
+            raise self.error(f"must be an integer from {low} to {high}")
         return self.value
 
     def number(self) -> int | float:
         """A finite number."""
         if not isinstance(self.value, int | float) or isinstance(self.value, bool) or not _is_finite(self.value):
-            raise self.error("is no finite number")
+            raise self.error("must be a finite number")
         return self.value
 
     def truth(self) -> bool:
         """True or false; false where it is missing."""
         if not isinstance(self.value, bool | None):
-            raise self.error("is neither true nor false")
+            raise self.error("must be true or false")
         return bool(self.value)
 
     def shape(self) -> tuple[int | None, ...]:
         """Sizes of axes, None for a free one."""
         if not isinstance(self.value, list):
-            raise self.error("is no list of sizes")
+            raise self.error("must be a list of sizes")
         return tuple(None if item.missing else item.integer(0, 2**31 - 1) for item in self.items(32))
 
 

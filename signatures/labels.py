@@ -25,19 +25,19 @@ def parse_labels(content: Any) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, Mapping):
-        raise ValueError("the labels are no table")
+        raise ValueError("labels must be a table")
     for key in content:
         if key not in PARTS:
             raise ValueError(f"{key!r} is none of {', '.join(PARTS)}")
     named = content.get("observations", {})
     if not isinstance(named, Mapping):
-        raise ValueError("'observations' is no table of lists, one per observation")
+        raise ValueError("'observations' must be a table of lists, one per observation")
     for name in named:
         if not str(name).isprintable():
-            raise ValueError(f"{name!r} is no name of an observation")
+            raise ValueError(f"{name!r} is not the name of an observation")
     branches = content.get("branches", [])
     if not isinstance(branches, Sequence) or isinstance(branches, str):
-        raise ValueError("'branches' is no list of lists, one per branch")
+        raise ValueError("'branches' must be a list of lists, one per branch")
     found: dict[str, Any] = {
         "observations": {str(name): _texts(texts, f"observation {name!r}") for name, texts in named.items()},
         "actions": _texts(content.get("actions", []), "'actions'"),
@@ -51,7 +51,7 @@ def _texts(texts: Any, where: str) -> list[str]:
         raise ValueError(f"{where} has no list of texts")
     for text in texts:
         if not isinstance(text, str) or not text.strip() or not text.isprintable() or len(text) > MAX_LENGTH:
-            raise ValueError(f"{where}: {text!r} is no text of 1 to {MAX_LENGTH} printable characters on one line")
+            raise ValueError(f"{where}: {text!r} must be text of 1 to {MAX_LENGTH} printable characters on one line")
     return list(texts)
 
 
@@ -68,7 +68,7 @@ def validate_labels(content: Any, signature: PolicySignature) -> dict[str, Any]:
     for name, texts in labels.get("observations", {}).items():
         if name not in wanted["observations"]:
             known = ", ".join(wanted["observations"]) or "none whose numbers can be named"
-            raise UsageError(f"labels: there is no vector observation {name!r}", fix=f"the policy has {known}")
+            raise UsageError(f"labels: unknown vector observation {name!r}", fix=f"the policy has {known}")
         _check_count(texts, wanted["observations"][name], f"observation {name!r}", "numbers")
     if "actions" in labels:
         if not wanted["actions"]:

@@ -105,7 +105,7 @@ def test_memory_is_handed_from_step_to_step() -> None:
 def test_path_knows_the_fixtures_only() -> None:
     assert path("visual") == FOLDER / "visual.bytes"
     assert path("visual.npz") == FOLDER / "visual.npz"
-    with pytest.raises(ValueError, match="no fixture 'nothing'"):
+    with pytest.raises(ValueError, match="unknown fixture 'nothing'"):
         path("nothing")
 
 

@@ -196,7 +196,7 @@ def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain
     chosen = tuple(b for b in brains if b.label == wanted)
     if not chosen:
         names = ", ".join(b.label or "(no scope)" for b in brains)
-        raise UsageError(f"--brain {wanted}: there is no such brain", fix=f"this graph has: {names}")
+        raise UsageError(f"--brain {wanted}: unknown brain", fix=f"this graph has: {names}")
     return chosen
 
 

@@ -94,6 +94,6 @@ def profile(name: str) -> Profile:
             return known
     close = suggestion(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
     raise UsageError(
-        f"--for {name}: there is no such profile",
+        f"--for {name}: unknown profile",
         fix=f"{close}the profiles are {', '.join(p.name for p in PROFILES)}",
     )

@@ -101,7 +101,7 @@ def open_regular_file(path: Path, most: int = MAX_BYTES) -> BinaryIO:
     except OSError as error:
         raise unreadable(path, error) from error
     except ValueError as error:  # a null character in the path
-        raise SourceError("is no path", where=repr(str(path)), why=str(error), fix="check the path") from error
+        raise SourceError("cannot be a path", where=repr(str(path)), why=str(error), fix="check the path") from error
     with contextlib.ExitStack() as refused:
         refused.enter_context(file)
         status = os.fstat(file.fileno())

@@ -88,7 +88,7 @@ class Archive:
     def _persistent(self, identity: tuple[Any, ...]) -> Storage:
         """``("storage", storage type, key, device, elements)``; before PyTorch 1.6 a view's place follows."""
         if len(identity) < 5 or identity[0] not in ("storage", b"storage"):
-            raise _damaged_error("a persistent id is no storage's", "the pickle is damaged")
+            raise _damaged_error("a persistent id must be a storage's", "the pickle is damaged")
         kind, key, count = identity[1], identity[2], identity[4]
         if not isinstance(kind, StorageType) or not isinstance(key, str) or not isinstance(count, int):
             raise _damaged_error("a storage has no type, key or length", "the pickle is damaged")

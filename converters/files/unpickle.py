@@ -145,7 +145,7 @@ class Machine:
     def top(self, kind: type) -> Any:
         """The container that is being filled."""
         if not isinstance(self.stack[-1], kind):
-            raise damaged_error(f"its pickle fills something that is no {kind.__name__}")
+            raise damaged_error(f"its pickle fills something other than a {kind.__name__}")
         return self.stack[-1]
 
     def extend(self, values: Sequence[Any]) -> None:
@@ -180,7 +180,7 @@ class Machine:
         """What a call gives."""
         function, arguments = self.last(2)
         if not isinstance(function, Function) or not isinstance(arguments, tuple):
-            raise damaged_error("its pickle calls something that is no function")
+            raise damaged_error("its pickle calls something other than a function")
         self.copied += sum(len(a) for a in arguments if isinstance(a, tuple | list | dict | str | bytes))
         if self.copied > MAX_COPIED:
             raise damaged_error(f"the calls of its pickle copy more than {MAX_COPIED} items")
@@ -195,7 +195,7 @@ class Machine:
         """What a persistent id stands for."""
         identity = self.pop()
         if not isinstance(identity, tuple):
-            raise damaged_error("a persistent id in its pickle is no tuple")
+            raise damaged_error("a persistent id in its pickle must be a tuple")
         return self.storage(identity)
 
 

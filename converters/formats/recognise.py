@@ -148,7 +148,7 @@ def _nothing_in(folder: Path) -> SourceError:
     else:
         fix = "give a run's folder (models/<run>, results/<run>), a SavedModel, a TensorFlow.js model, or a model file"
     return SourceError(
-        "there is no model in this folder",
+        "no model found in this folder",
         where=str(folder),
         why=f"it holds {shown}" if inside else "it is empty",
         fix=fix,

@@ -39,7 +39,7 @@ def format_for_writing(key: str) -> Format:
     """The format of a word of ``--to``. Raises UsageError."""
     if key not in WRITTEN:
         raise UsageError(
-            f"--to {key}: there is no such format",
+            f"--to {key}: unknown format",
             fix=f"{suggestion(key, WRITTEN)}the formats are {', '.join(WRITTEN)}",
         )
     return WRITTEN[key]

@@ -106,7 +106,7 @@ class Builder:
             raise GraphError(
                 f"a length or an index of {name!r} has more than 32 bits",
                 why=str(error),
-                fix="the model is damaged, or is no policy; export it again",
+                fix="the model is damaged, or not a policy; export it again",
             ) from error
 
     def number(self, like: str, value: float, name: str = "const") -> str:

@@ -179,7 +179,7 @@ def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[Tensor
         raise GraphError(
             f"node {node.name!r} ({node.op}) makes a tensor of {largest} elements",
             why=f"no policy has one of more than {MAX_ELEMENTS} per row",
-            fix="the graph is damaged, or is no policy; freeze it again from its checkpoint",
+            fix="the graph is damaged, or not a policy; freeze it again from its checkpoint",
         )
 
 

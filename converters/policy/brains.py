@@ -315,7 +315,7 @@ def _brain_of_sink(
     sinks = [n for n in sinks if n not in echoes] or echoes
     if not sinks:
         raise NotAPolicyError(
-            "there is no policy in this graph",
+            "no policy found in this graph",
             why="no node depends on a placeholder, so nothing is computed from an observation",
             fix="give the frozen graph of the policy, or name its output with --output NAME=action",
         )

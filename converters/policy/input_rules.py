@@ -249,9 +249,7 @@ def contradicted_names(given: Named, role: Role | None) -> tuple[str, ...]:
             axes = " or ".join(map(str, ranks))
             said.append(f"its name is that of {meant} in {whose}, which has {axes} axes")
         elif meant is Role.VISUAL and is_board(given.base, given.node):
-            said.append(
-                f"its name is that of {meant} in {whose}, which is no smaller than {_LEAST_IMAGE}x{_LEAST_IMAGE}"
-            )
+            said.append(f"its name is that of {meant} in {whose}, which is at least {_LEAST_IMAGE}x{_LEAST_IMAGE}")
         elif meant is not Role.VECTOR and is_whole(given.node) != (meant in _COUNTED):
             kind = "integers" if meant in _COUNTED else "floats"
             said.append(f"its name is that of {meant} in {whose}, which is of {kind}")

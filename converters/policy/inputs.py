@@ -107,7 +107,7 @@ class _Inputs:
         if self.wanted:
             name = next(iter(self.wanted))
             raise UsageError(
-                f"--input names {name!r}, which is no input of this policy",
+                f"--input names {name!r}, which is not an input of this policy",
                 why=close_names(name, [n.name for n in self.found])
                 or f"its inputs are {', '.join(n.name for n in self.found)}",
                 fix="export-model inspect FILE lists them",

@@ -51,7 +51,7 @@ def chosen_runtimes(
     for name in names:
         if name not in known:
             raise UsageError(
-                f"there is no runtime {name!r}", fix=f"{suggestion(name, known)}the runtimes are {', '.join(known)}"
+                f"unknown runtime {name!r}", fix=f"{suggestion(name, known)}the runtimes are {', '.join(known)}"
             )
         if not known[name].installed:
             raise RuntimeUnavailableError(f"the runtime {name} is not installed", fix=known[name].how)

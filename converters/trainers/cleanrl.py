@@ -186,7 +186,7 @@ def _layer_norm(net: Network, x: str, name: str) -> str:
     sizes = [shape[i] for i in ((3, 1, 2) if rank == 4 else (1,))]
     if len(net.state.shape(f"{name}.weight")) != len(sizes):
         raise net.state.unsupported_error(
-            name, "it is no LayerNorm: what it takes together (groups, a batch) is not in the file"
+            name, "it must be a LayerNorm: what it takes together (groups, a batch) is not in the file"
         )
     scale, bias = (net.state.array(f"{name}.{part}", *map(int, sizes)) for part in ("weight", "bias"))
     if rank == 4:

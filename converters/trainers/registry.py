@@ -52,7 +52,7 @@ def _unknown_error(value: Any) -> NotAPolicyError:
         )
     *labels, last = (t.label for t in TRAINERS if t.by_names)
     return NotAPolicyError(
-        "is no checkpoint of a policy whose network is known",
+        "must be a checkpoint of a policy whose network is known",
         why=f"it holds {_content(value)}, not the names that {', '.join(labels)} or {last} give; a state "
         "dictionary does not say what is computed with it",
         fix="export the model to ONNX in its own project (torch.onnx.export), and give that; of "

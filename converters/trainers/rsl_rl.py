@@ -124,7 +124,7 @@ def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
             return {name: role}
     raise net.state.damaged_error(
         "its policy has no deviation of its own",
-        "it has none, or one that depends on the observation, or is no Gaussian: which, the weights do not tell",
+        "it has none, or one that depends on the observation, or is not a Gaussian: which, the weights do not tell",
     )
 
 

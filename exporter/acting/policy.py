@@ -170,7 +170,7 @@ class LoadedPolicy:
                 raise UsageError(f"the observation {name!r} is missing", fix=f"there are {known}")
         for name in observations:
             if name not in names:
-                raise UsageError(f"there is no observation {name!r}", fix=f"there are {known}")
+                raise UsageError(f"unknown observation {name!r}", fix=f"there are {known}")
         return dict(observations)
 
     def _check_parameters(self, given: Mapping[str, npt.ArrayLike]) -> None:
@@ -178,7 +178,7 @@ class LoadedPolicy:
         for name in given:
             if name not in wanted:
                 known = ", ".join(wanted) or "none"
-                raise UsageError(f"there is no parameter {name!r}", fix=f"the policy's parameters: {known}")
+                raise UsageError(f"unknown parameter {name!r}", fix=f"the policy's parameters: {known}")
         for name, shape in wanted.items():
             if name not in given:
                 raise UsageError(f"the parameter {name!r} is missing", fix=f"parameters={{{name!r}: …}}")
@@ -233,7 +233,7 @@ class LoadedPolicy:
             array = np.asarray(value, spec.dtype)
         except (TypeError, ValueError) as error:
             raise UsageError(
-                f"{spec.name!r} is no array of numbers", why=str(error), fix="give rows of one length"
+                f"{spec.name!r} must be an array of numbers", why=str(error), fix="give rows of one length"
             ) from error
         if array.ndim == len(spec.shape) - 1:
             array = array[None]
@@ -311,7 +311,7 @@ class Agent:
         rows = np.atleast_1d(np.asarray(agents, np.int64))
         count = next((len(a) for a in (last.continuous, last.discrete) if a is not None), 0)
         if ((rows < 0) | (rows >= count)).any():
-            raise UsageError(f"there is no agent {agents}", fix=f"they are numbered 0 to {count - 1}")
+            raise UsageError(f"unknown agent {agents}", fix=f"they are numbered 0 to {count - 1}")
         self._last = replace(last, memory=_clear_rows(last.memory, rows), discrete=_clear_rows(last.discrete, rows))
 
     def decide(

@@ -60,7 +60,6 @@ def install_command(name: str) -> None:
         return
     how = {r.name: r.find().how for r in chosen}.get(name)
     raise UsageError(
-        f"runtimes install {name}: "
-        + ("there is no such runtime" if how is None else "this command does not install it"),
+        f"runtimes install {name}: " + ("unknown runtime" if how is None else "this command does not install it"),
         fix=how or "export-model runtimes lists the runtimes and how to install each",
     )

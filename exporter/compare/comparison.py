@@ -319,12 +319,12 @@ def _match(
     spared = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
     for spec in signature.outputs:
         if spec.name not in found and spec.name not in spared:
-            text = f"there is no output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
+            text = f"missing output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
             problems.append(_Problem(spec.name, text))
     needed = policy.graph.ancestors(found)
     for spec in lacking:
         if spec.role is not Role.NOISE and spec.name in needed:
-            text = f"there is no input {aliases[spec.name][0]!r}; there are {_names(own.inputs)}"
+            text = f"missing input {aliases[spec.name][0]!r}; there are {_names(own.inputs)}"
             problems.append(_Problem(spec.name, text, blocking=True))
     for spec in signature.inputs:
         wrong = misfit(spec, inputs[spec.name]) if spec.name in inputs else ""

@@ -27,7 +27,7 @@ def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
             f"--labels {path}: is neither JSON nor TOML", why=str(error)[:200], fix="correct the file"
         ) from error
     if not isinstance(content, dict):
-        raise UsageError(f"--labels {path}: is no table", fix="see docs/acting.md for its form")
+        raise UsageError(f"--labels {path}: must be a table", fix="see docs/acting.md for its form")
     return content
 
 
@@ -51,4 +51,4 @@ def check_labels(labels: Mapping[str, Any] | None, policies: Sequence[str]) -> N
     named = (labels or {}).get("policies")
     for name in named if isinstance(named, Mapping) else ():
         if name not in policies:
-            raise UsageError(f"labels: there is no policy {name!r}", fix=f"there are {', '.join(policies)}")
+            raise UsageError(f"labels: unknown policy {name!r}", fix=f"there are {', '.join(policies)}")

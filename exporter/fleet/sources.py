@@ -173,7 +173,7 @@ def _lines(path: Path) -> Iterator[str]:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise UsageError(
-            f"{path} is no list of paths", why=str(error), fix="write one path a line, in UTF-8"
+            f"{path} must be a list of paths", why=str(error), fix="write one path a line, in UTF-8"
         ) from error
     for line in text.splitlines():
         if line.strip() and not line.lstrip().startswith("#"):

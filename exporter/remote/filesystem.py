@@ -113,7 +113,7 @@ def asking(address: str, *, writes: bool = False) -> Iterator[None]:
         said = error.__cause__ if isinstance(error, FileNotFoundError) and is_http(address) else None
         said = error if said is None else said
         if isinstance(said, FileNotFoundError):
-            raise kind("there is no such file", where=path_text(address), fix="check the address") from error
+            raise kind("no such file", where=path_text(address), fix="check the address") from error
         raise kind(
             "cannot be written" if writes else "cannot be fetched",
             where=path_text(address),

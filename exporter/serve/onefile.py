@@ -55,7 +55,7 @@ def _embed(name: str, data: bytes) -> object:
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise _damaged_error(f"{name} is no JSON", str(error)[:200]) from error
+        raise _damaged_error(f"{name} must be JSON", str(error)[:200]) from error
 
 
 def _as_json(files: Mapping[str, object]) -> str:

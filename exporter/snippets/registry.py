@@ -90,15 +90,13 @@ class Snippet:
 def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], dict[str, str]]:
     """(snippets, target → the format it lacks). ``name`` chooses one, all that begin so (``serving``), or the consumer.
 
-    Raises UsageError where there is no such target, BundleError where the bundle lacks the format of all chosen, or was
+    Raises UsageError for an unknown target, BundleError where the bundle lacks the format of all chosen, or was
     made for another consumer.
     """
     name = _for_consumer(bundle, name)
     chosen = [t for t in TARGETS if name in (None, t.name)] or [t for t in TARGETS if t.name.startswith(f"{name}-")]
     if not chosen:
-        raise UsageError(
-            f"--for {name}: there is no such target", fix=f"one of: help, {', '.join(t.name for t in TARGETS)}"
-        )
+        raise UsageError(f"--for {name}: unknown target", fix=f"one of: help, {', '.join(t.name for t in TARGETS)}")
     has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
     able = {t.name for t in chosen if any(has.issuperset(keys) for keys in t.alternatives)}
     lacking = {t.name: t.needed for t in chosen if t.name not in able}

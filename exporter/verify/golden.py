@@ -48,7 +48,7 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
         spec = specs.get(name) or specs.get(name.removesuffix(":0"))
         if spec is None:
             known = ", ".join(s.name for s in (*signature.inputs, *signature.outputs))
-            raise _recording_error(path, f"{name!r} is no input or output of the policy", f"there are {known}")
+            raise _recording_error(path, f"{name!r} is not an input or output of the policy", f"there are {known}")
         given[spec.name] = _fitting(path, spec, array)
     rows = _rows(path, signature, given)
     for spec in signature.inputs:
@@ -86,7 +86,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             names = archive.namelist()
             odd = next((name for name in names if not name.endswith(".npy")), None)
             if odd is not None:
-                raise ValueError(f"{odd[:80]!r} is no array")
+                raise ValueError(f"{odd[:80]!r} must be an array")
             whole = sum(entry.file_size for entry in archive.infolist())
             if whole > MAX_UNPACKED_FREE + MAX_UNPACKED_FACTOR * len(data):
                 raise ValueError(f"its {len(data)} bytes unpack to {whole}")

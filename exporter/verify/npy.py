@@ -27,7 +27,7 @@ _AS_JSON = {"'": '"', "(": "[", ")": "]", "True": "true", "False": "false"}
 def read_array(data: bytes) -> np.ndarray:
     """The array, a view of the bytes. Raises ValueError, TypeError, RecursionError, struct.error for what is none."""
     if not data.startswith(_MAGIC):
-        raise ValueError("it is no array of numpy's")
+        raise ValueError("it must be a numpy array")
     begin, form = (10, "<H") if data[6:7] == b"\x01" else (12, "<I")
     (length,) = struct.unpack_from(form, data, 8)
     if length > min(_MOST_CHARACTERS, len(data) - begin):

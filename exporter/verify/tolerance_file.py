@@ -58,7 +58,7 @@ def _rule(entry: Any, where: str) -> ToleranceRule:
         if value is not None and (not isinstance(value, str) or not value):
             raise UsageError(f"{key} must be a name", where=where, fix=_FIX)
         if value is not None and value not in known.get(key, [value]):
-            raise UsageError(f"there is no {key} {value!r}", where=where, fix=f"one of: {', '.join(known[key])}")
+            raise UsageError(f"unknown {key} {value!r}", where=where, fix=f"one of: {', '.join(known[key])}")
     bounds = {key: entry[key] for key in ("atol", "rtol") if key in entry}
     if not bounds:
         raise UsageError("gives neither atol nor rtol", where=where, fix=_FIX)

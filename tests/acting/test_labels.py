@@ -89,17 +89,17 @@ def test_several_policies_have_labels_by_name(tmp_path: Path) -> None:
     }
     assert results["twobrains-StrikerBrain"]["labels"] == {"actions": ["a", "b", "c"]}
     assert "labels" not in results["twobrains-Goalie-Brain-2"]
-    with pytest.raises(UsageError, match="there is no policy 'Keeper'"):
+    with pytest.raises(UsageError, match="unknown policy 'Keeper'"):
         export_model(fixture("twobrains"), tmp_path, labels={"policies": {"Keeper": {}}}, verify="none")
 
 
 @pytest.mark.parametrize(
     ("labels", "words"),
     [
-        ({"observations": {"stat": ["x"] * 10}}, "there is no vector observation 'stat'"),
+        ({"observations": {"stat": ["x"] * 10}}, "unknown vector observation 'stat'"),
         ({"observations": {"state": ["x"] * 9}}, "has 9 texts, the policy has 10 numbers"),
-        ({"observations": {"state": [1] * 10}}, "1 is no text"),
-        ({"observations": ["x"]}, "is no table of lists"),
+        ({"observations": {"state": [1] * 10}}, "1 must be text"),
+        ({"observations": ["x"]}, "must be a table of lists"),
         ({"actions": ["x"]}, "no continuous actions"),
         ({"branches": [["x"] * 3]}, "has 1 texts, the policy has 3 branches"),
         ({"branches": [["x"] * 3, ["x"] * 3, ["x"] * 4]}, "branch 1"),

@@ -147,7 +147,7 @@ def test_what_is_missing_or_wrong_is_named(bundles: Bundles) -> None:
     for observations, words in (
         ({}, f"'{name}' is missing"),
         ({name: np.zeros((2, 99))}, r"has the shape \[2, 99\]"),
-        ({name: observed(policy)[name], "stat": 0}, "no observation 'stat'"),
+        ({name: observed(policy)[name], "stat": 0}, "unknown observation 'stat'"),
     ):
         with pytest.raises(UsageError, match=words):
             policy.decide(observations)
@@ -300,7 +300,7 @@ def test_one_of_several_agents_begins_anew(bundles: Bundles) -> None:
     expected = policy.decide(observed(policy, rows=3, seed=1), memory=memory, previous=previous, deterministic=True)
     np.testing.assert_array_equal(after.memory, expected.memory)
     assert before.memory[1].any()  # a decision that was given away is not changed
-    with pytest.raises(UsageError, match="no agent 3"):
+    with pytest.raises(UsageError, match="unknown agent 3"):
         agent.reset(3)
 
 
@@ -368,7 +368,7 @@ def test_noise_that_was_kept_is_not_drawn_again(tmp_path: Path) -> None:
     ("given", "words"),
     [
         ({}, "the parameter 'goal' is missing"),
-        ({"goal": [0, 0], "gaol": 1}, "there is no parameter 'gaol'"),
+        ({"goal": [0, 0], "gaol": 1}, "unknown parameter 'gaol'"),
         ({"goal": [0, 0, 0]}, r"the parameter 'goal' has the shape \[3\]"),
     ],
 )

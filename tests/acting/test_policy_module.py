@@ -137,7 +137,7 @@ def test_where_nothing_can_be_drawn_it_says_so(kind: str, bundles: Bundles) -> N
     *empty, unknown = drive(bundles("discrete"), kind, requests)
     for answer in empty:
         assert "nothing can be drawn" in answer.get("error", ""), answer
-    assert "there is no parameter 'gaol'" in unknown["error"]
+    assert "unknown parameter 'gaol'" in unknown["error"]
 
 
 def test_flat_and_nested_numbers_are_one(bundles: Bundles) -> None:
@@ -153,7 +153,7 @@ def test_what_is_missing_or_wrong_is_named(bundles: Bundles) -> None:
     requests: list[tuple[dict[str, Any], str]] = [
         ({"observations": {}}, "the observation 'state' is missing"),
         ({"observations": {"state": [0.0] * 7}}, "'state' has 7 numbers; [agents, 8] is wanted"),
-        ({"observations": {"state": [0.0] * 8, "stat": 1}}, "there is no observation 'stat'"),
+        ({"observations": {"state": [0.0] * 8, "stat": 1}}, "unknown observation 'stat'"),
         ({"observations": [0.0] * 8, "options": {"seed": -1}}, "the seed is -1"),
         ({"observations": {"state": [[0.0] * 6] * 4}}, "[agents, 8] is wanted"),
         ({"observations": {"state": [[0.0] * 4] * 2}}, "[agents, 8] is wanted"),

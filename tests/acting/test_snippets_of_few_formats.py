@@ -20,7 +20,7 @@ def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:
     assert "left out: policy-ort needs tfjs and onnx" in ran.out
     assert "(--for tensorflowsharp)" in ran.out
     is_refused(run("snippets", result.folder, "--for", "onnxruntime"), "has no onnx", "fix")
-    is_refused(run("snippets", result.folder, "--for", "swift"), "there is no such target", "onnxruntime")
+    is_refused(run("snippets", result.folder, "--for", "swift"), "unknown target", "onnxruntime")
     is_refused(run("snippets", tmp_path / "none"), "not a bundle")
 
 

@@ -150,7 +150,7 @@ def test_a_memory_that_does_not_fit_is_refused() -> None:
     m.input(X, 1, 1, 3)
     m.memory(4, "a_h", "nowhere")
     m.layer("action", 50, X)
-    with pytest.raises(DamagedFileError, match="'nowhere', which is no input"):
+    with pytest.raises(DamagedFileError, match="'nowhere', which must be an input"):
         graph_of(m.model())
 
 

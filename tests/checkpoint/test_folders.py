@@ -120,7 +120,7 @@ def test_a_checkpoint_without_a_graph_gives_way_to_an_export_of_its_step(tmp_pat
     with pytest.raises(ExportModelError, match=r"Hop-9\.onnx"):
         read_source(run)
     (run / "Hop-9.onnx").unlink()
-    with pytest.raises(SourceError, match="no graph beside the checkpoint"):
+    with pytest.raises(SourceError, match="graph is missing beside the checkpoint"):
         read_source(run)
 
 

@@ -210,11 +210,11 @@ def test_a_graph_alone_says_what_it_lacks(tmp_path: Path) -> None:
 
 def test_a_checkpoint_alone_says_what_it_lacks(tmp_path: Path) -> None:
     bundle(tmp_path / "model-1.ckpt", policy().variables)
-    with pytest.raises(SourceError, match="no graph beside the checkpoint"):
+    with pytest.raises(SourceError, match="graph is missing beside the checkpoint"):
         read_source(tmp_path / "model-1.ckpt")
     (tmp_path / "checkpoint").write_text('model_checkpoint_path: "model-9"\n')
     (tmp_path / "model-1.ckpt.index").unlink()
-    with pytest.raises(SourceError, match="no checkpoint in the folder"):
+    with pytest.raises(SourceError, match="the folder holds no checkpoint"):
         read_source(tmp_path / "checkpoint")
 
 

@@ -43,6 +43,6 @@ def test_what_is_larger_fails_and_says_by_how_much(name: str, most: int) -> None
 
 
 def test_a_format_that_was_not_written_has_no_budget() -> None:
-    with pytest.raises(UsageError, match="no such format") as caught:
+    with pytest.raises(UsageError, match="unknown format") as caught:
         check_budget({"tfsj": 1}, WRITTEN)
     assert "tfjs" in (caught.value.fix or "")

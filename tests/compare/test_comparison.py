@@ -180,7 +180,7 @@ def test_a_lost_name_is_a_failure_that_says_what_to_map(bundles: Bundles, tmp_pa
     )
     failure = only_failure(compare_artefacts(fixture("discrete"), [file], runtimes=RUNTIMES, pool=pool))
     assert (failure.output, failure.runtime) == ("action", "onnxruntime")
-    assert "there is no output 'action'" in failure.reason
+    assert "missing output 'action'" in failure.reason
     assert "--map action=Identity" in failure.reason
     mapped = compare_artefacts(fixture("discrete"), [file], names={"action": "Identity"}, runtimes=RUNTIMES, pool=pool)
     assert mapped.passed is True
@@ -198,7 +198,7 @@ def test_a_web_model_without_its_signatures_names_is_found(bundles: Bundles, tmp
     report = compare_artefacts(fixture("discrete"), [folder], runtimes=RUNTIMES, pool=pool)
     assert report.passed is False
     assert {f.output for f in report.failures} >= {"action", "value_estimate"}
-    assert all("there is no output" in f.reason for f in report.failures)
+    assert all("missing output" in f.reason for f in report.failures)
 
 
 def test_an_op_that_the_runtime_does_not_know(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
@@ -257,7 +257,7 @@ def test_an_input_that_is_missing_or_too_much(bundles: Bundles, tmp_path: Path, 
     report = compare_artefacts(fixture("discrete"), [file], runtimes=RUNTIMES, pool=pool)
     assert report.passed is False
     reasons = {f.output: f.reason for f in report.failures}
-    assert "there is no input 'action_masks'" in reasons["action_masks"]
+    assert "missing input 'action_masks'" in reasons["action_masks"]
     assert "an input 'temperature' that the reference has not" in reasons["temperature"]
 
 

@@ -74,7 +74,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     arrays = rows(spec, 3)
     observation = spec.observations[0].name
     for change, words in (
-        ({"extra": np.zeros(3)}, "'extra' is no input or output"),
+        ({"extra": np.zeros(3)}, "'extra' is not an input or output"),
         ({observation: np.zeros((3, 99), np.float32)}, "is wanted"),
         ({observation: arrays[observation][:2]}, "the same number of rows"),
         ({observation: np.array([["a"] * arrays[observation].shape[1]] * 3)}, "is wanted"),

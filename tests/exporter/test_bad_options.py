@@ -61,8 +61,8 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--opset", "12"], ["opset 12", "13 to 21"]),
         (["--opset", "22"], ["opset 22"]),
         (["--opset", "-1"], ["opset -1"]),
-        (["--verify", "tensorflo"], ["there is no runtime 'tensorflo'", "numpy, tensorflow"]),
-        (["--verify", "onnxruntime,torch"], ["there is no runtime 'torch'"]),
+        (["--verify", "tensorflo"], ["unknown runtime 'tensorflo'", "numpy, tensorflow"]),
+        (["--verify", "onnxruntime,torch"], ["unknown runtime 'torch'"]),
         (["--seed", "-1"], ["seed is -1"]),
         (["--atol", "nan"], ["atol is nan"]),
         (["--golden", "nowhere.npz"], ["--golden needs a verification", "--verify none"]),
@@ -132,9 +132,9 @@ def test_a_brain_that_is_not_there_lists_those_that_are(out: Path) -> None:
     [
         ({"names": "unity"}, "names='unity'"),
         ({"noise": "some"}, "noise='some'"),
-        ({"inputs": {"state": "deed"}}, "--input state=deed: there is no such role"),
+        ({"inputs": {"state": "deed"}}, "--input state=deed: unknown role"),
         ({"to": "onx"}, "did you mean onnx"),
-        ({"verify": ["nothing"]}, "there is no runtime 'nothing'"),
+        ({"verify": ["nothing"]}, "unknown runtime 'nothing'"),
         ({"opset": 99}, "opset 99"),
     ],
 )

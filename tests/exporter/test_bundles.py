@@ -255,7 +255,7 @@ def test_a_contract_of_another_schema_is_refused(text: str, ball: Path) -> None:
 @pytest.mark.parametrize("text", ["[]", "null", "7", '"policy"'])
 def test_a_contract_that_is_no_object_is_refused(text: str, ball: Path) -> None:
     (ball / "policy.json").write_text(text)
-    is_no_bundle(ball, ball / "policy.json", "is no object")
+    is_no_bundle(ball, ball / "policy.json", "must be an object")
 
 
 SPOILT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
@@ -264,33 +264,36 @@ SPOILT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a name of dots": (lambda c: c.update(name=".."), "name is not the name"),
     "a name that is a number": (lambda c: c.update(name=3), "name is not the name"),
     "no files": (lambda c: c.pop("files"), "files is empty"),
-    "files that are a list": (lambda c: c.update(files=["continuous.bytes"]), "files is no object"),
+    "files that are a list": (lambda c: c.update(files=["continuous.bytes"]), "files must be an object"),
     "a file without a hash": (
         lambda c: c["files"]["continuous.bytes"].pop("sha256"),
-        "files.continuous.bytes.sha256 is no sha256",
+        "files.continuous.bytes.sha256 must be a sha256",
     ),
-    "a file without a size": (lambda c: c["files"]["continuous.bytes"].update(bytes="7"), "bytes is no integer"),
-    "a file that is a number": (lambda c: c["files"].update(a=7), "files.a is no object"),
-    "no source": (lambda c: c.pop("source"), "source is no object"),
-    "a source without a hash": (lambda c: c["source"].pop("sha256"), "source.sha256 is no sha256"),
-    "no tool": (lambda c: c.pop("tool"), "tool is no object"),
-    "a name that cannot be printed": (lambda c: c["inputs"][0].update(name="st\nate"), "inputs[0].name is no text"),
-    "a shape that is none": (lambda c: c["inputs"][0].update(shape="wide"), "inputs[0].shape is no list"),
-    "a length beyond all": (lambda c: c["inputs"][0].update(shape=[None, 10**12]), "inputs[0].shape[1] is no integer"),
-    "a length below zero": (lambda c: c["inputs"][0].update(shape=[None, -1]), "inputs[0].shape[1] is no integer"),
+    "a file without a size": (lambda c: c["files"]["continuous.bytes"].update(bytes="7"), "bytes must be an integer"),
+    "a file that is a number": (lambda c: c["files"].update(a=7), "files.a must be an object"),
+    "no source": (lambda c: c.pop("source"), "source must be an object"),
+    "a source without a hash": (lambda c: c["source"].pop("sha256"), "source.sha256 must be a sha256"),
+    "no tool": (lambda c: c.pop("tool"), "tool must be an object"),
+    "a name that cannot be printed": (lambda c: c["inputs"][0].update(name="st\nate"), "inputs[0].name must be text"),
+    "a shape that is none": (lambda c: c["inputs"][0].update(shape="wide"), "inputs[0].shape must be a list"),
+    "a length beyond all": (
+        lambda c: c["inputs"][0].update(shape=[None, 10**12]),
+        "inputs[0].shape[1] must be an integer",
+    ),
+    "a length below zero": (lambda c: c["inputs"][0].update(shape=[None, -1]), "inputs[0].shape[1] must be an integer"),
     "a dtype that is none": (lambda c: c["inputs"][0].update(dtype="floaty"), "inputs[0].dtype is 'floaty'"),
     "a role that is none": (lambda c: c["inputs"][0].update(role="deed"), "inputs[0].role is 'deed'"),
     "a role of outputs": (lambda c: c["inputs"][0].update(role="continuous"), "inputs[0].role is 'continuous'"),
-    "a source that is a number": (lambda c: c["inputs"][0].update(source=7), "inputs[0].source is no text"),
+    "a source that is a number": (lambda c: c["inputs"][0].update(source=7), "inputs[0].source must be text"),
     "two inputs of one name": (lambda c: c["inputs"].append(c["inputs"][0]), "inputs has two tensors of one name"),
     "no outputs": (lambda c: c.update(outputs=[]), "outputs lacks an action"),
     "one action of a hybrid": (
         lambda c: c.update(action_space="hybrid", outputs=c["outputs"][:1]),
         "outputs lacks an action",
     ),
-    "outputs that are names": (lambda c: c.update(outputs=["action"]), "outputs[0] is no object"),
+    "outputs that are names": (lambda c: c.update(outputs=["action"]), "outputs[0] must be an object"),
     "an action space that is none": (lambda c: c.update(action_space="all"), "action_space is 'all'"),
-    "a branch without actions": (lambda c: c.update(branches=[0]), "branches[0] is no integer"),
+    "a branch without actions": (lambda c: c.update(branches=[0]), "branches[0] must be an integer"),
     "a memory of nothing": (
         lambda c: c.update(memory={"size": 4, "input": "h", "output": "h", "layout": []}),
         "memory.input is 'h'",
@@ -305,24 +308,24 @@ SPOILT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "a spread that is no number": (
         lambda c: c["inputs"][1].update(distribution={"kind": "normal", "mean": 0, "std": "wide"}),
-        "inputs[1].distribution.std is no finite number",
+        "inputs[1].distribution.std must be a finite number",
     ),
     "how to prepare what is no input": (
         lambda c: c.update(preprocess={"eye": {"layout": "NHWC", "range": [0, 1], "from_bytes": "x"}}),
-        "preprocess names 'eye', which is no input",
+        "preprocess names 'eye', which is not an input",
     ),
     "a layout that is none": (
         lambda c: c.update(preprocess={"state": {"layout": "WHNC", "range": [0, 1], "from_bytes": "x"}}),
         "preprocess.state.layout is 'WHNC'",
     ),
-    "a constant that is a word": (lambda c: c["constants"].update(a="b"), "constants.a is no finite number"),
+    "a constant that is a word": (lambda c: c["constants"].update(a="b"), "constants.a must be a finite number"),
     "a note that moves the cursor": (lambda c: c["notes"].append("\x1b[2J"), "notes["),
     "labels that are a list": (lambda c: c.update(labels=[1]), "labels"),
     "fixed values": (
         lambda c: c["source"].update(fixed={"state:0": {"dtype": "O", "value": 1}}),
         "source.fixed.state:0.dtype is 'O'",
     ),
-    "rows that are none": (lambda c: c["source"].update(rows=0), "source.rows is no integer"),
+    "rows that are none": (lambda c: c["source"].update(rows=0), "source.rows must be an integer"),
 }
 
 

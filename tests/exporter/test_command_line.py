@@ -137,7 +137,7 @@ def test_where_files_are_run_is_said_the_same_way_in_every_command(flag: str, tm
         assert (ran.status, ran.err) == (0, ""), ran
         assert ran.out.endswith("NOT VERIFIED: no independent runtime ran\n")
         is_refused(export_model(*words, flag, "numpy"), "--allow-unverified", status=3)
-        is_refused(export_model(*words, flag, "nothing"), "there is no runtime")
+        is_refused(export_model(*words, flag, "nothing"), "unknown runtime")
 
 
 def test_what_is_listed_fits_it_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,7 @@ def test_the_runtimes_as_json_say_how_to_install_each() -> None:
 def test_what_pip_installs_is_not_installed_by_the_command() -> None:
     is_refused(export_model("runtimes", "install", "onnxruntime"), "does not install it", "pip install")
     is_refused(export_model("runtimes", "install", "numpy"), "does not install it", "pip install")
-    is_refused(export_model("runtimes", "install", "nothing"), "there is no such runtime", "export-model runtimes")
+    is_refused(export_model("runtimes", "install", "nothing"), "unknown runtime", "export-model runtimes")
 
 
 @pytest.mark.parametrize(

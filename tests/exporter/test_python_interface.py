@@ -144,7 +144,7 @@ def test_what_the_command_line_refuses_is_raised(tmp_path: Path) -> None:
         export_model([])
     with pytest.raises(BundleError, match="not a bundle"):
         verify_bundle(tmp_path)
-    with pytest.raises(UsageError, match="there is no runtime"):
+    with pytest.raises(UsageError, match="unknown runtime"):
         export_model(BALL, tmp_path / "out", verify=["nothing"])
     assert files_in(tmp_path) == {"text.bytes"}
 

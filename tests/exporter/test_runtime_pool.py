@@ -83,7 +83,7 @@ def test_names_are_taken_in_their_order_and_numpy_is_always_there(here: set[str]
 
 
 def test_names_that_are_none_or_not_installed_are_refused(here: set[str]) -> None:
-    with pytest.raises(UsageError, match="there is no runtime 'torch'") as caught:
+    with pytest.raises(UsageError, match="unknown runtime 'torch'") as caught:
         names("torch")
     assert caught.value.fix == f"the runtimes are {', '.join(NAMES)}"
     with pytest.raises(RuntimeUnavailableError, match=r"tf1\.4 is not installed"):

@@ -76,7 +76,7 @@ def test_a_budget_for_a_format_that_is_not_written_is_refused_before_anything_is
         nothing, "-o", tmp_path / "out", "--to", "onnx", "--verify", "onnxruntime", "--max-size", "tfjs=60kB"
     )
     assert ran.status == 2
-    assert "--max-size tfjs=…: there is no such format here" in ran.err
+    assert "--max-size tfjs=…: unknown format here" in ran.err
     assert "there are onnx, total" in ran.err
 
 

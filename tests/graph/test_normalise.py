@@ -403,7 +403,7 @@ def test_ops_that_reach_outside_are_refused_as_such() -> None:
     ("made", "said"),
     [
         (node("y", "MaxPool", "x", strides=(1, 2, 2, 1), padding="SAME"), "lacks the attribute 'ksize'"),
-        (node("y", "Cast", "x", SrcT=F32, DstT=3), "DstT=3, which is no dtype"),
+        (node("y", "Cast", "x", SrcT=F32, DstT=3), "DstT=3; it must be a dtype"),
     ],
 )
 def test_damaged_attributes_are_named(made: Any, said: str) -> None:

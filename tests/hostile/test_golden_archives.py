@@ -57,7 +57,7 @@ def test_what_is_no_array_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "recorded.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("state", b"hello")
-    with pytest.raises(UsageError, match="'state' is no array"):
+    with pytest.raises(UsageError, match="'state' must be an array"):
         read_golden(path, SIGNATURE)
 
 

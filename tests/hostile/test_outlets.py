@@ -163,4 +163,4 @@ def test_a_pipe_in_a_bundle_is_waited_for_by_nobody(name: str, tmp_path: Path) -
     os.mkfifo(tmp_path / "continuous" / name)
     ran = export_model("verify", tmp_path / "continuous", "--runtimes", "numpy", "--allow-unverified")
     assert ran.status == 2
-    assert "it is no file" in ran.err
+    assert "it must be a file" in ran.err

@@ -85,7 +85,7 @@ def test_a_run_is_exported_after_training(export_policies: Any, tmp_path: Path) 
 
 def test_what_is_no_run_is_said(export_policies: Any, tmp_path: Path) -> None:
     call, _ = export_policies
-    with pytest.raises(ValueError, match="there is no model in this folder"):
+    with pytest.raises(ValueError, match="no model found in this folder"):
         call(tmp_path, tmp_path / "out")
 
 

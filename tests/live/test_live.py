@@ -105,20 +105,20 @@ def test_another_process_writes_the_same_bytes(trained: Trained, tmp_path: Path)
 
 
 REFUSED = {
-    "no session": ("UsageError", "Graph, which is no tf.compat.v1.Session"),
+    "no session": ("UsageError", "must be a tf.compat.v1.Session; it is a Graph"),
     "closed": ("UsageError", "the session cannot be run"),
     "not initialised": ("NotAPolicyError", "no value for the variable 'dense/kernel' (and 1 more)"),
     "without a policy": ("SignatureError", "not clear which output is the action"),
     "a session and a function": ("UsageError", "session and tf_function were given"),
     "a step": ("UsageError", "step=3"),
-    "no function": ("UsageError", "which is no tf.function"),
+    "no function": ("UsageError", "must be a tf.function"),
     "never traced": ("UsageError", "traced for no signatures"),
     "traced twice": ("UsageError", "traced for 2 signatures"),
     "strings": ("UnsupportedOpError", "StringLength"),
     "nested": ("SourceError", "TensorFlow cannot save it"),
     "called once": ("UsageError", "takes 2 rows only"),
     "one row": ("UsageError", "takes 1 rows only"),
-    "no model": ("UsageError", "Dense, which is no Keras model"),
+    "no model": ("UsageError", "must be a Keras model; it is a Dense"),
     "a subclass": ("UsageError", "does not say its inputs"),
     "never built": ("UsageError", "does not say its inputs"),
     "in a graph": ("UsageError", "a tf.Graph is the default"),

@@ -53,7 +53,7 @@ def test_lost_signature_names_are_named(
     (theirs / "model.json").write_text(json.dumps(model))
     report = compare_artefacts(bundle.folder / "saved_model", [theirs], runtimes=RUNTIMES, pool=pool)
     assert report.passed is False
-    assert "there is no output 'action'; there are 'Identity_0'" in next(
+    assert "missing output 'action'; there are 'Identity_0'" in next(
         f.reason for f in report.failures if f.output == "action"
     )
 

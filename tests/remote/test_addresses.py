@@ -145,7 +145,7 @@ def test_a_folder_is_one_source_and_errors_name_the_address(memory: Any) -> None
     assert not here.exists()
     with pytest.raises(SourceError, match=r"^memory://runs/notes\.txt: "):
         export_model("memory://runs/notes.txt", "memory://out", verify="none")
-    with pytest.raises(SourceError, match=r"memory://gone\.onnx: there is no such file"):
+    with pytest.raises(SourceError, match=r"memory://gone\.onnx: no such file"):
         export_model("memory://gone.onnx", "memory://out", verify="none")
 
 

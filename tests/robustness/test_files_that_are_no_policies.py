@@ -234,7 +234,7 @@ def test_a_file_beyond_two_gigabytes_is_refused_without_reading_it(tmp_path: Pat
 
 def test_a_path_that_cannot_be_one_is_refused(tmp_path: Path) -> None:
     is_refused(export_model(tmp_path / ("x" * 5000)), "cannot be read")
-    with pytest.raises(SourceError, match="is no path"):  # no command line can say this, but a program can
+    with pytest.raises(SourceError, match="cannot be a path"):  # no command line can say this, but a program can
         inspect_model("a\0b.bytes")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     is_refused(export_model(tmp_path / "loop"), tmp_path / "loop", "cannot be read")

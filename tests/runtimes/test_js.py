@@ -22,7 +22,7 @@ NODES, WEIGHT = ("modelTopology", "node"), ("weightsManifest", 0, "weights", 0)
     ("path", "value", "why"),
     [
         (NODES, [node("out_1", "Identity", "out_2"), node("out_2", "Identity", "out_1")], "depends on itself"),
-        (NODES, [node("out_1", "ReadFile"), node("out_2", "ReadFile")], "'out_2': there is no kernel for the op ReadF"),
+        (NODES, [node("out_1", "ReadFile"), node("out_2", "ReadFile")], "'out_2': no kernel for the op ReadF"),
         (NODES, [node("out_2", "Identity", "elsewhere")], "the graph has no node 'elsewhere'"),
         (NODES, None, "model.json holds no graph"),
         ((*WEIGHT, "shape"), [1 << 20], "the weights are cut off"),

@@ -125,7 +125,7 @@ def test_an_activation_of_ones_own_is_said_and_one_that_is_known_is_not_overrule
     assert [n.op for n in said.graph.nodes] == [n.op for n in elu.graph.nodes]
     with pytest.raises(UsageError, match="contradicts the file"):
         read_source(saved("a2c_discrete", tmp_path), ReadOptions(activation="tanh"))
-    with pytest.raises(UsageError, match="no such activation"):
+    with pytest.raises(UsageError, match="unknown activation"):
         read_source(unknown, ReadOptions(activation="elou"))
 
 

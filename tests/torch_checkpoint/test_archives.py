@@ -239,8 +239,8 @@ def test_what_a_pickle_asks_for_says_what_it_is(module: str, name: str, said: st
         (b"\x80\x02h\x05.", "cannot be read"),
         (b"\x80\x02}]K\x01s.", "a key in its pickle is a list"),
         (b"\x80\x02K\x01", "cannot be read"),
-        (b"\x80\x02K\x01K\x01R.", "no function"),
-        (b"\x80\x02K\x01Q.", "no tuple"),
+        (b"\x80\x02K\x01K\x01R.", "other than a function"),
+        (b"\x80\x02K\x01Q.", "must be a tuple"),
         (b"\x80\x02cbuiltins\n.", "cannot be read"),
         (b"\x80\x05\x8e" + struct.pack("<Q", 2**60) + b"x.", "cannot be read"),
         (b"\x80\x02r\xff\xff\xff\x7f.", "cannot be read"),
@@ -257,7 +257,7 @@ def test_pickles_that_are_wrong(payload: bytes, words: str | None, tmp_path: Pat
 
 def test_a_pickle_that_is_nested_deeply_is_only_data(tmp_path: Path) -> None:
     deep = b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."
-    with pytest.raises(NotAPolicyError, match="no checkpoint of a policy"):
+    with pytest.raises(NotAPolicyError, match="must be a checkpoint of a policy"):
         read_source(saved(tmp_path, zipped({"a/data.pkl": deep})))
 
 

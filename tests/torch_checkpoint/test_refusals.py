@@ -83,7 +83,7 @@ def test_a_checkpoint_of_rllib_is_a_folder_without_a_model(tmp_path: Path) -> No
 def test_another_checkpoint_is_refused_with_what_it_holds(value: Any, words: str, tmp_path: Path) -> None:
     for data in (Writer().zip(value), Writer().row(value)):
         (tmp_path / "a.pth").write_bytes(data)
-        with pytest.raises(NotAPolicyError, match="no checkpoint of a policy") as caught:
+        with pytest.raises(NotAPolicyError, match="must be a checkpoint of a policy") as caught:
             read_source(tmp_path / "a.pth")
         assert words in str(caught.value)
         assert "torch.onnx.export" in str(caught.value)

@@ -206,7 +206,7 @@ def test_what_stands_between_layers_and_has_no_weights_is_not_guessed(tmp_path: 
     for state, words, told in (
         (_sequence((0, (4, 3)), (3, (2, 4))), "2 modules without weights stand between its layers 0 and 3", {}),
         (_sequence((0, (4, 3)), (1, (2, 4))), "nothing stands between its layers 0 and 1", {}),
-        (image, "network.1.*it is no LayerNorm", {"sensors": EYE}),
+        (image, "network.1.*it must be a LayerNorm", {"sensors": EYE}),
     ):
         with pytest.raises(SourceError, match=rf"(?s){words}"):
             _exported(tmp_path, state, **told)

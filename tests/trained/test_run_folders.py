@@ -52,7 +52,7 @@ def test_the_readme_holds_the_report() -> None:
 
 
 def test_there_is_no_other_trained_policy() -> None:
-    with pytest.raises(ValueError, match="there is no trained policy 'Walker'; there are 3DBall"):
+    with pytest.raises(ValueError, match="unknown trained policy 'Walker'; there are 3DBall"):
         run_folder("Walker")
 
 

@@ -250,7 +250,7 @@ def test_nn_of_another_format_version_is_refused_with_its_number(tmp_path: Path)
 def test_other_files_are_refused_by_us(tmp_path: Path) -> None:
     path = tmp_path / "policy.txt"
     path.write_text("no model")
-    with pytest.raises(SourceError, match=r"no \.onnx"):
+    with pytest.raises(SourceError, match=r"must be an \.onnx or a \.nn"):
         check_file(path, CONSUMERS["R22"], BRAIN)
 
 

@@ -48,7 +48,7 @@ def constant_value(node: Node, value: float) -> np.ndarray:
         raise GraphError(
             f"the placeholder {node.name!r} takes {math.prod(dims)} elements",
             why=f"no policy has a tensor of more than {MAX_ELEMENTS} per row",
-            fix="the graph is damaged, or is no policy; freeze it again from its checkpoint",
+            fix="the graph is damaged, or not a policy; freeze it again from its checkpoint",
         )
     if dtype.kind in "iu":
         limits = np.iinfo(dtype)

@@ -89,7 +89,14 @@ _KINDS: Mapping[AttrKind, tuple[type, ...]] = {
     "shape": (TensorShape,),
 }
 
-_WORDS = {"type": "dtype", "int": "integer", "float": "number", "bool": "truth value", "str": "text", "shape": "shape"}
+_WORDS = {
+    "type": "a dtype",
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "shape": "a shape",
+}
 
 
 def _check_kind(node: Node, attr: Attr, given: Any) -> None:
@@ -98,7 +105,7 @@ def _check_kind(node: Node, attr: Attr, given: Any) -> None:
     single = not isinstance(attr.default, tuple) and attr.default is not REQUIRED
     if (single and isinstance(given, tuple)) or not all(isinstance(i, _KINDS[attr.kind]) for i in items):
         raise GraphError(
-            f"node {node.name!r} ({node.op}) has {attr.name}={str(given)[:80]}, which is no {_WORDS[attr.kind]}",
+            f"node {node.name!r} ({node.op}) has {attr.name}={str(given)[:80]}; it must be {_WORDS[attr.kind]}",
             why="the op cannot be computed without it",
             fix="the graph is damaged; freeze it again from its checkpoint",
         )

@@ -224,7 +224,7 @@ class _Unroller:
         return flow
 
     def _number(self, node: Node, reference: str, turn: int | None) -> int | None:
-        """A condition, a size; None where it is not known. Raises GraphError where it is no whole number."""
+        """A condition, a size; None where it is not known. Raises GraphError where it is not a whole number."""
         value = self.constant(self.plain(reference, turn))
         if value is None:
             return None

@@ -154,7 +154,7 @@ def check_file(path: Path, consumer: Consumer, brain: Brain | None = None) -> Un
         return _check_nn_file(path, consumer, brain)
     if found is not ONNX:
         raise SourceError(
-            "is no .onnx and no .nn",
+            "must be an .onnx or a .nn",
             where=str(path),
             why="Unity's importers read these two",
             fix=f"export it with --for {consumer.profile}, and check what that writes",

@@ -155,7 +155,7 @@ def _by_sentis(file: OnnxFile, consumer: Consumer) -> Iterator[Thrown]:
                     "OnnxImportException",
                     f"The given key '{name}' was not present in the dictionary.",
                     f"node {file.producers[name].output[0]} ({file.producers[name].op_type})",
-                    f"there is no such operator: --for {consumer.profile} writes the policy without it",
+                    f"the importer does not know this operator: --for {consumer.profile} writes the policy without it",
                 )
         yield from _attributes(node, consumer, file.opset)
     declared = {i.name for i in file.inputs}

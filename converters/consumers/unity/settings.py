@@ -101,7 +101,7 @@ def parse_sensors(text: str) -> tuple[Sensor, ...]:
     for part in parts:
         if not re.fullmatch("[1-9][0-9]{0,6}(x[1-9][0-9]{0,6}){0,2}", part):
             raise UsageError(
-                f"--sensors {text}: {part} is no shape of a sensor",
+                f"--sensors {text}: {part} is not the shape of a sensor",
                 fix="one shape per sensor: 8 for a vector, 20x4 for a BufferSensor, 3x84x84 (C, H, W) for a camera",
             )
     return sensors_of([[int(n) for n in part.split("x")] for part in parts])
@@ -118,7 +118,7 @@ def parse_actions(text: str) -> tuple[int, tuple[int, ...]]:
         elif kind == "discrete" and re.fullmatch("[0-9]{1,6}(,[0-9]{1,6})*", numbers):
             branches = tuple(int(n) for n in numbers.split(","))
         else:
-            raise UsageError(f"--actions {text}: {part or 'nothing'} is no kind of actions", fix=f"give {_ACTIONS}")
+            raise UsageError(f"--actions {text}: {part or 'nothing'} is not a kind of actions", fix=f"give {_ACTIONS}")
     return continuous, branches
 
 

@@ -55,7 +55,7 @@ def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
             array = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype, copy=False)
             tensors[entry["name"]] = array.reshape(entry["shape"])
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise FramingError(f"what it said is no frame: {error}") from error
+        raise FramingError(f"what it said cannot be read as a frame: {error}") from error
     return header, tensors
 
 

@@ -269,9 +269,7 @@ class _Parser:
         count = self._integer()
         left = len(self._data) - self._at
         if count < 0 or count * smallest > left:
-            raise self._error(
-                f"{self._what}: a count of {count}", f"there is no room for that in the {left} bytes left"
-            )
+            raise self._error(f"{self._what}: a count of {count}", f"only {left} bytes are left for that")
         return count
 
     def _ints(self) -> Ints:

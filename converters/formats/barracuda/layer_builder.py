@@ -193,14 +193,14 @@ class LayerBuilder(Builder):
         """A shape among the layer's fields as N, H, W, C."""
         if len(values) in (4, 8):
             return four_axes(tuple(values), self.location)
-        raise self.damaged(f"it holds {list(values)}", "that is no shape of four or eight axes")
+        raise self.damaged(f"it holds {list(values)}", "a shape must have four or eight axes")
 
     def whole(self, array: npt.NDArray[np.float32]) -> list[int]:
         """Numbers that stand for lengths or indices, in order; a ``.nn`` holds them as floats."""
         with np.errstate(invalid="ignore"):
             fit = bool(np.all(np.abs(array) < MAX_ELEMENTS))
         if not fit:
-            raise self.damaged("an index or length in it is no number of that size", "its dataset is damaged")
+            raise self.damaged(f"an index or length in it is beyond {MAX_ELEMENTS}", "its dataset is damaged")
         return [int(v) for v in array.reshape(-1)]
 
     def sized(self, *lengths: int) -> None:

@@ -80,7 +80,7 @@ _OPS: Mapping[str, tuple[Lower, slice]] = {
 _WHY: Mapping[str, str] = {
     "Multinomial": "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
     "OneHot": "it takes a row of indices per agent, and gives the classes on the last axis",
-    **dict.fromkeys(("Select", "SelectV2"), "it chooses an infinite number, and infinity times 0 is no number"),
+    **dict.fromkeys(("Select", "SelectV2"), "it chooses an infinite number, and infinity times 0 is NaN"),
 }
 
 
@@ -139,7 +139,7 @@ def _unknown(b: NnBuilder, node: Node) -> UnsupportedOpError:
             "and other inputs have no place in version 16 of the format",
             "give it a value with --set NAME=VALUE or its role with --input NAME=ROLE, or leave nn out of --to",
         )
-    return b.refused("there is no layer for it", _WHY.get(node.op, "no layer that every Barracuda has computes it"))
+    return b.refused("no layer computes it", _WHY.get(node.op, "no layer that every Barracuda has computes it"))
 
 
 def _value(b: NnBuilder, values: dict[str, Value], reference: str) -> Value:

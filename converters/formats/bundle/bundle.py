@@ -83,7 +83,7 @@ class Bundle:
             raise BundleError(
                 f"{error.field} {error.why}",
                 where=str(path),
-                why="this is no contract that this version of export-model reads",
+                why="this version of export-model does not read such a contract",
                 fix=f"{_AGAIN}, or use the version of export-model that wrote it",
             ) from error
         if not contract.files:
@@ -277,5 +277,5 @@ def _file_size(path: Path) -> int:
     """Bytes of a file that can be read to its end. Raises OSError for what is none (a pipe never ends)."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "it is no file", str(path))
+        raise OSError(errno.EINVAL, "it must be a file", str(path))
     return found.st_size

@@ -62,7 +62,7 @@ def read_checkpoint(
         raise of_objects(checkpoint)
     if path is None:
         raise SourceError(
-            "there is no graph beside the checkpoint",
+            "the graph is missing beside the checkpoint",
             where=prefix.name,
             why="a checkpoint has values only; what is computed with them is in raw_graph_def.pb or in its .meta",
             fix=f"put the run's raw_graph_def.pb, or {prefix.name}.meta, beside it",
@@ -92,7 +92,7 @@ def newest(found: Sequence[listing.Kept], step: int | None, folder: Path) -> lis
     if not found:
         _refuse_version_1(folder)
         raise SourceError(
-            "there is no checkpoint in the folder",
+            "the folder holds no checkpoint",
             where=str(folder),
             why="a checkpoint is a file called <name>-<step>.cptk.index or .ckpt.index, with a .data file beside it",
             fix="give the folder that training wrote to, or the frozen graph",
@@ -108,7 +108,7 @@ def newest(found: Sequence[listing.Kept], step: int | None, folder: Path) -> lis
 def no_such_step(step: int, steps: Sequence[int]) -> UsageError:
     """The error that lists the steps there are."""
     shown = ", ".join(map(str, sorted(set(steps)))) or "none"
-    return UsageError(f"--step {step}: there is no checkpoint of that step", fix=f"the steps are {shown}")
+    return UsageError(f"--step {step}: no checkpoint has that step", fix=f"the steps are {shown}")
 
 
 def left_out(names: Sequence[str]) -> tuple[str, ...]:

@@ -309,7 +309,7 @@ def _encode_signed(value: int) -> bytes:
     magnitude = ~value if value < 0 else value
     length = magnitude.bit_length() // 7 + 1
     if length > 8:
-        raise ValueError(f"{value} is no extent")
+        raise ValueError(f"{value} must be an extent of at most 8 bytes")
     word = bytearray(value.to_bytes(length, "big", signed=True))
     word[0] ^= 0xFF00 >> length & 0xFF
     return bytes(word)

@@ -56,7 +56,7 @@ def encode(graph: Graph, *, explicit: bool = False, detached: Detached | None = 
                 _set(proto.attr[attr.name], attr.kind, value)
             except (AttributeError, TypeError, ValueError) as error:
                 raise GraphError(
-                    f"node {node.name!r} ({node.op}) has {attr.name}={value!r}, which is no {attr.kind}",
+                    f"node {node.name!r} ({node.op}) has {attr.name}={value!r}; it must be of the kind {attr.kind}",
                     fix="the graph is damaged; freeze it again from its checkpoint",
                 ) from error
     return message

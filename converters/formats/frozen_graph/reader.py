@@ -99,7 +99,7 @@ def _check_placeholder(name: str, attrs: dict[str, Any]) -> None:
         if not isinstance(attrs.get(key, TensorShape(None) if key == "shape" else None), kind):
             raise DamagedFileError(
                 f"the placeholder {name!r} has {key} {attrs.get(key)!r}",
-                why=f"that is no {key}, so what it takes cannot be known",
+                why=f"it must be a {key}, so what it takes cannot be known",
                 fix="freeze the graph again; this file is damaged",
             )
 

@@ -132,7 +132,9 @@ class _Weights:
     def _array(self, data: Any) -> np.ndarray:
         """A dataset that lies in the file as it is; raises DamagedFileError."""
         if not isinstance(data, self.h5py.Dataset) or data.is_virtual or data.external:
-            raise DamagedFileError(f"its {str(getattr(data, 'name', ''))[:200]!r} lies in another file, or is no array")
+            raise DamagedFileError(
+                f"its {str(getattr(data, 'name', ''))[:200]!r} lies in another file, or is not an array"
+            )
         size = _size(data.shape, data.dtype)
         if (
             data.shape is None

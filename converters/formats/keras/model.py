@@ -63,7 +63,9 @@ def model_of(config: Any) -> LayeredModel:
     """The model of a configuration. Raises DamagedFileError; KeyError and its like where it is not in Keras' form."""
     layer = layer_of(config)
     if layer.model is None:
-        raise DamagedFileError(f"its configuration is of a {layer.kind}, which is no model", fix="save the whole model")
+        raise DamagedFileError(
+            f"its configuration must be of a model; it is of a {layer.kind}", fix="save the whole model"
+        )
     return layer.model
 
 

@@ -48,7 +48,7 @@ def frozen_function(path: str, form: str, signature: str | None = None) -> Froze
             raise ValueError("the SavedModel has no signatures; save it with signatures=…")
         used = signature or ("serving_default" if "serving_default" in available else available[0])
         if used not in available:
-            raise ValueError(f"there is no signature {used!r}; there are {', '.join(available)}")
+            raise ValueError(f"unknown signature {used!r}; there are {', '.join(available)}")
         function = loaded.signatures[used]
         keys = sorted(function.structured_outputs)  # results are flattened in the order of their keys
         names = [t.name.split(":")[0] for t in function.inputs if t.dtype != tf.resource]

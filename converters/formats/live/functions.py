@@ -32,7 +32,7 @@ def read_function(tensorflow: Any, function: Any, folder: Path) -> SourceModel:
         return _read(tensorflow, lambda: function, folder, _name(name))
     if not isinstance(function, kinds.GenericFunction):
         raise UsageError(
-            f"tf_function is {type(function).__name__}, which is no tf.function",
+            f"tf_function must be a tf.function; it is a {type(function).__name__}",
             fix="wrap it: tf.function(f, input_signature=[tf.TensorSpec([None, 8], name='vector_observation')])",
         )
     name = str(getattr(function.python_function, "__name__", ""))
@@ -57,7 +57,7 @@ def read_keras(tensorflow: Any, model: Any, folder: Path) -> SourceModel:
     """The model of a Keras model, called with ``training=False``. Raises UsageError, SourceError."""
     bases = {(c.__module__.partition(".")[0], c.__name__) for c in type(model).__mro__}
     if not bases & {("keras", "Model"), ("tf_keras", "Model"), ("tensorflow", "Model")}:
-        raise UsageError(f"keras_model is {type(model).__name__}, which is no Keras model", fix="give a keras.Model")
+        raise UsageError(f"keras_model must be a Keras model; it is a {type(model).__name__}", fix="give a keras.Model")
     backend = getattr(sys.modules.get("keras"), "backend", None)
     if ("keras", "Model") in bases and backend is not None and backend.backend() != "tensorflow":
         raise UsageError(

@@ -56,7 +56,7 @@ def read_session(tensorflow: Any, session: Any, folder: Path) -> SourceModel:
     v1 = tensorflow.compat.v1
     if not isinstance(session, v1.Session | v1.InteractiveSession):
         raise UsageError(
-            f"session is {type(session).__name__}, which is no tf.compat.v1.Session",
+            f"session must be a tf.compat.v1.Session; it is a {type(session).__name__}",
             fix="give the session that the policy was trained in; of a MonitoredSession, its raw session",
         )
     data = flatten_graph(session.graph)

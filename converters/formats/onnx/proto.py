@@ -90,7 +90,7 @@ def _check_texts(model: Any) -> None:
                 if broken is not None:
                     raise DamagedFileError(
                         f"the {field} of a {message.DESCRIPTOR.name.removesuffix('Proto')} is {broken[:40]!r}",
-                        why="that is no text (UTF-8)",
+                        why="it must be text (UTF-8)",
                         fix="export or download it again",
                     )
 

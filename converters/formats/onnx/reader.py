@@ -193,7 +193,7 @@ def _input(importer: Importer, value: Any, batch: int | None, axis: int, *, alon
     kind = value.type.tensor_type
     if not value.type.HasField("tensor_type") or kind.elem_type not in DTYPES:
         raise NotAPolicyError(
-            f"the input {value.name!r} is no tensor of floats, integers or booleans",
+            f"the input {value.name!r} must be a tensor of floats, integers or booleans",
             why=f"its data type is {kind.elem_type}; policies take tensors",
         )
     dtype, dims = DTYPES[kind.elem_type], dims_of(value)

@@ -44,7 +44,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     except (ValueError, RecursionError) as error:
         raise DamagedFileError("its data is not JSON", why=str(error)[:200], fix=_COPY_AGAIN) from error
     if not isinstance(content, dict):
-        raise DamagedFileError("its data is no JSON object", why="what was saved is one", fix=_COPY_AGAIN)
+        raise DamagedFileError("its data must be a JSON object", why="what was saved is one", fix=_COPY_AGAIN)
     statistics, notes = _statistics(given, options.normaliser)
     beside = None if statistics is None else (statistics.name, given.bytes_of(statistics))
     made = rebuild(Saved(given, Archive(policy), content, activation=options.activation, statistics=beside))

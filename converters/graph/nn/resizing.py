@@ -65,7 +65,7 @@ def _places(before: int, length: int, scale: float, how: Resampling) -> Weights:
     exact = abs(scale * before - length) <= _WHOLE
     if not exact and (how.coordinates == "align_corners" or _is_symmetric_nearest(how)):
         raise UnsupportedOpError(
-            f"{before} times {scale:g} is no whole number",
+            f"{before} times {scale:g} must be a whole number",
             why=f"ONNX and onnxruntime differ on {how.coordinates} there",
         )
     # in float32, as onnxruntime has them: which of two neighbours is the nearest depends on it

@@ -208,7 +208,7 @@ def _transpose(node: Node, x: np.ndarray, permutation: np.ndarray) -> np.ndarray
 def _infer_transpose(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...], symbols: Symbols) -> Sequence[Dim]:
     permutation = require_constant(node, args, 1, "a permutation").tolist()
     if sorted(permutation) != list(range(len(shape))):
-        raise shape_error(node, args, f"{permutation} is no permutation of {len(shape)} axes")
+        raise shape_error(node, args, f"{permutation} must be a permutation of {len(shape)} axes")
     return [shape[p] for p in permutation]
 
 

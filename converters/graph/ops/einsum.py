@@ -38,7 +38,7 @@ def einsum(
     simple = "." not in left + result and all(len(set(t)) == len(t) for t in (*terms, result))
     if not simple or len(terms) != len(tensors) or len(terms) > _OPERANDS or set(result) - set(left):
         raise UnsupportedOpError(
-            f"the equation {equation[:80]!r} is no plain product",
+            f"the equation {equation[:80]!r} must be a plain product",
             why="one or two operands without repeated labels are written as products; no policy uses others",
         )
     lone = [[c for c in t if c not in result and left.count(c) == 1] for t in terms]

@@ -51,9 +51,7 @@ def activation_from_user(name: str) -> Activation:
     """The one that the user names. Raises UsageError."""
     found = activation_named(name)
     if found is None:
-        raise UsageError(
-            f"--activation {name}: there is no such activation", fix=f"one of: {', '.join(sorted(_KNOWN))}"
-        )
+        raise UsageError(f"--activation {name}: unknown activation", fix=f"one of: {', '.join(sorted(_KNOWN))}")
     return found
 
 

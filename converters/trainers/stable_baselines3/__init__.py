@@ -14,7 +14,9 @@ from signatures.errors import NotAPolicyError
 def _rebuild(saved: Saved, data: Mapping[str, Any]) -> Rebuilt:
     if not isinstance(saved.value, dict):
         raise NotAPolicyError(
-            "its policy.pth is no state dictionary", why="model.save writes one", fix="save the model again: model.save"
+            "its policy.pth must be a state dictionary",
+            why="model.save writes one",
+            fix="save the model again: model.save",
         )
     normaliser = None if saved.statistics is None else read_normaliser(*saved.statistics)
     return Rebuilt(*to_graph(data, saved.archive, saved.value, saved.activation, normaliser))

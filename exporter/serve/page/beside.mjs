@@ -76,7 +76,7 @@ export async function dropped(items, onnxruntime) {
     return policy(await artifacts(folder, read));
   }
   const onnx = find(".onnx");
-  if (onnx === undefined) throw new Error("there is no tfjs/model.json and no .onnx in it");
+  if (onnx === undefined) throw new Error("it has neither a tfjs/model.json nor an .onnx");
   if (onnxruntime === undefined) throw new Error("an .onnx needs onnxruntime-web, which this page has not: drop the bundle's folder");
   const bytes = await files.get(onnx).arrayBuffer();
   return policy(bytes, metadata(new Uint8Array(bytes), EMBEDDED), withOnnx(onnxruntime));

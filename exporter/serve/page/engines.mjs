@@ -109,7 +109,7 @@ function device(tf, backend) {
 // ---- onnxruntime-web ------------------------------------------------------------------------------------------------
 
 export const withOnnx = (module) => async ({ onnx }) => {
-  if (onnx === undefined) throw new Error("there is no ONNX model of this policy here");
+  if (onnx === undefined) throw new Error("this policy has no ONNX model here");
   const ort = await import(new URL(module, document.baseURI).href);
   ort.env.wasm.wasmPaths = new URL("vendor/", document.baseURI).href;
   ort.env.wasm.numThreads = 1;

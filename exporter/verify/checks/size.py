@@ -38,7 +38,7 @@ def check_budget(budget: Mapping[str, int], sizes: Mapping[str, int]) -> None:
     for name in budget:
         if name not in (*sizes, TOTAL):
             known = ", ".join((*sizes, TOTAL))
-            raise UsageError(f"--max-size {name}=…: there is no such format here", fix=f"there are {known}")
+            raise UsageError(f"--max-size {name}=…: unknown format here", fix=f"there are {known}")
 
 
 def sizes(budget: Mapping[str, int], written: Mapping[str, int]) -> Iterator[Finding]:

@@ -75,7 +75,7 @@ class Op:
         """A subgraph."""
         found = self.attrs.get(name)
         if not hasattr(found, "initializer"):
-            raise self.op_error(f"its attribute {name} is no graph", "the op cannot be computed without it")
+            raise self.op_error(f"its attribute {name} must be a graph", "the op cannot be computed without it")
         return found
 
     def _attribute(self, name: str, default: Any, kind: type | tuple[type, ...]) -> Any:

@@ -244,7 +244,7 @@ export class Policy {
     const given = this.#named(observations);
     for (const name of Object.keys(parameters)) {
       if (!this.contract.inputs.some((spec) => spec.role === "parameter" && spec.name === name)) {
-        throw new Error(`there is no parameter '${name}'`);
+        throw new Error(`unknown parameter '${name}'`);
       }
     }
     const special = { masks, memory_in: memory, prev_action: previous };
@@ -291,7 +291,7 @@ export class Policy {
       if (observations[name] === undefined) throw new Error(`the observation '${name}' is missing; there are ${names}`);
     }
     for (const name of Object.keys(observations)) {
-      if (!names.includes(name)) throw new Error(`there is no observation '${name}'; there are ${names}`);
+      if (!names.includes(name)) throw new Error(`unknown observation '${name}'; there are ${names}`);
     }
     return observations;
   }
@@ -386,7 +386,7 @@ export class Agent {
     const data = memory && memory.data.slice();
     for (const agent of [agents].flat()) {
       if (!Number.isInteger(agent) || agent < 0 || agent >= count) {
-        throw new RangeError(`there is no agent ${agent}; they are numbered 0 to ${count - 1}`);
+        throw new RangeError(`unknown agent ${agent}; they are numbered 0 to ${count - 1}`);
       }
       data?.fill(0, agent * memory.shape[1], (agent + 1) * memory.shape[1]);
       discrete?.[agent].fill(0);

@@ -104,7 +104,7 @@ export class GraphModel {
 
 function prepared(node) {
   const op = SPELLINGS[node.op] ?? node.op;
-  if (!DATA.has(op) && !Object.hasOwn(KERNELS, op)) throw new Error(`node '${node.name}': there is no kernel for the op ${node.op}`);
+  if (!DATA.has(op) && !Object.hasOwn(KERNELS, op)) throw new Error(`node '${node.name}': no kernel for the op ${node.op}`);
   return { ...node, kernel: KERNELS[op], attrs: Object.fromEntries(Object.entries(node.attr ?? {}).map(([k, v]) => [k, attribute(v)])) };
 }
 
@@ -117,7 +117,7 @@ function parsed(reference) {
 function valueOf(values, reference) {
   const [name, index] = parsed(reference);
   const value = values.get(name)?.[index];
-  if (value === undefined) throw new Error(`there is no value for '${reference}'`);
+  if (value === undefined) throw new Error(`no value for '${reference}'`);
   return value;
 }
 
