@@ -16,7 +16,9 @@ from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from exporter.export.pipeline import ExportResult
+    from exporter.play.report import PlayReport
     from exporter.reports.entry import Entry
+    from exporter.reports.write import Documents
     from exporter.verify.report import ParityReport
     from exporter.verify.tolerances import ToleranceRule
 
@@ -101,11 +103,18 @@ class Console:
     def write_reports(self, entries: Callable[[], Sequence[Entry]]) -> None:
         """Write the reports that were asked for; ``entries`` is not called where there are none."""
         if self.wants_reports:
+            from exporter.reports.write import parity_documents
+
+            self.write_documents(parity_documents(functools.cache(entries)))
+
+    def write_documents(self, documents: Documents) -> None:
+        """Write the reports that were asked for."""
+        if self.wants_reports:
             from exporter.reports.markdown import UNSEEN
             from exporter.reports.write import Destinations
 
             echo = functools.partial(say_lines, keep=UNSEEN)
-            Destinations(self.junit, self.markdown, self.html).write(entries(), echo)
+            Destinations(self.junit, self.markdown, self.html).write(documents, echo)
 
     # ---- results, for people
 
@@ -139,6 +148,15 @@ class Console:
         say(f"{report.policy}: {place}")
         self._notes(report.notes)
         self._report(report)
+
+    def played(self, report: PlayReport) -> None:
+        """One policy that played."""
+        if self._silent or (self.quiet and report.passed is True):
+            return
+        self._notes(report.notes)
+        for line in report.lines():
+            say_lines(line)
+        say_paragraph(report.sentence, colour={True: "green", False: "red", None: "yellow"}[report.passed])
 
     def _notes(self, notes: Sequence[str]) -> None:
         for note in () if self.quiet else notes:

@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
 from exporter.cli.options import located, pairs, trusting, understanding
-from exporter.cli.terminal import Progress, say_json, say_lines, say_paragraph
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
-
-_COLOURS = {True: "green", False: "red", None: "yellow"}
 
 
 @command(
@@ -51,9 +49,7 @@ _COLOURS = {True: "green", False: "red", None: "yellow"}
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
 @trusting
 @located
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-@click.option("-q", "--quiet", is_flag=True, help="Print only what disagrees.")
-@click.option("-v", "--verbose", is_flag=True, help="Print every step.")
+@reporting
 @understanding
 def play_command(
     reference: Path,
@@ -68,10 +64,8 @@ def play_command(
     mapped: tuple[str, ...],
     trust_source: bool,
     runtimes: str,
-    as_json: bool,
-    quiet: bool,
-    verbose: bool,
     compiling: CompileOptions,
+    console: Console,
 ) -> None:
     """Play an environment with every format in the installed runtimes, and compare what they earn.
 
@@ -83,8 +77,9 @@ def play_command(
     from exporter.play.play import play_policy
     from exporter.verify.options import VerifyOptions
 
+    console.prepare()
     options = PlayOptions(episodes, seed, margin, likeliest)
-    with Progress(quiet=quiet or as_json, verbose=verbose) as progress:
+    with console.progress() as progress:
         report = play_policy(
             reference,
             env,
@@ -94,16 +89,15 @@ def play_command(
             names=pairs(mapped, "--map"),
             understanding=compiling,
             read=ReadOptions(trust_source=trust_source),
-            judging=VerifyOptions(runtimes=runtimes),
+            judging=VerifyOptions(runtimes=runtimes, rules=console.rules()),
             progress=progress,
         )
-    if as_json:
-        say_json(report.to_dict())
-    elif not quiet or report.passed is not True:
-        for note in report.notes:
-            say_paragraph(note, "note: ", "    ")
-        for line in report.lines():
-            say_lines(line)
-        say_paragraph(report.sentence, colour=_COLOURS[report.passed])
+    console.check_rules([report.replay])
+    console.played(report)
+    console.json(report.to_dict())
+    if console.wants_reports:
+        from exporter.play.documents import play_documents
+
+        console.write_documents(play_documents(report))
     if report.passed is False or (strict and report.passed is None):
         sys.exit(1)

@@ -14,7 +14,7 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RuntimeInfo
 from exporter.acting.policy import LoadedPolicy
 from exporter.play.episodes import Episodes, play_episodes
-from exporter.play.equivalence import Equivalence, equivalence
+from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, Equivalence, equivalence
 from exporter.play.options import PlayOptions
 from exporter.play.recording import Recorder
 from exporter.play.replay import replay
@@ -42,6 +42,25 @@ class Played:
     runtime: str
     episodes: Episodes
     compared: Equivalence
+
+    @property
+    def where(self) -> str:
+        """The format and the runtime."""
+        return f"{self.format} in {self.runtime}"
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong or open; empty where it is equivalent."""
+        c = self.compared
+        if c.verdict == EQUIVALENT:
+            return ""
+        off = (
+            f"mean return {c.difference:+.3g} ({CONFIDENCE:.0%}: {c.low:+.3g} to {c.high:+.3g}), margin {c.margin:.3g}"
+        )
+        if c.verdict == DIFFERENT:
+            return f"different: {off}"
+        needed = "no number of episodes" if c.needed is None else f"about {c.needed:,} episodes"
+        return f"not decided: {off}; {needed} would decide (--episodes)"
 
 
 class Match:

@@ -71,7 +71,7 @@ class PlayReport:
             count = len(self.played)
             parts.append(
                 f"{count} of {count} agree in {self.recorded} recorded steps and earn what {self.reference} does, "
-                f"{_figure(self.episodes.returns.mean())} ± {_figure(self.margin)} in {self.options.episodes} episodes"
+                f"{figure(self.episodes.returns.mean())} ± {figure(self.margin)} in {self.options.episodes} episodes"
                 if self.passed
                 else "nothing played"
             )
@@ -92,24 +92,22 @@ class PlayReport:
             "verdict",
         )
         own, rows = self.episodes, []
-        mean = _figure(own.returns.mean())
+        mean = figure(own.returns.mean())
         rows.append([self.reference, "", "recorded", mean, "", "", "", f"{own.rate:,.0f}", "reference"])
         for p in self.played:
             c = p.compared
             word = replayed.get((p.format, p.runtime), "-")
-            interval = f"{_signed(c.low)} to {_signed(c.high)}"
+            interval = f"{signed(c.low)} to {signed(c.high)}"
             equal = f"{c.equal} of {c.episodes}"
-            mean, rate = _figure(p.episodes.returns.mean()), f"{p.episodes.rate:,.0f}"
-            rows.append([p.format, p.runtime, word, mean, _signed(c.difference), interval, equal, rate, c.verdict])
+            mean, rate = figure(p.episodes.returns.mean()), f"{p.episodes.rate:,.0f}"
+            rows.append([p.format, p.runtime, word, mean, signed(c.difference), interval, equal, rate, c.verdict])
         playing = {(p.format, p.runtime) for p in self.played}
         silent = [p for p in self.replay.pairs if (p.format, p.runtime) not in playing]
         rows += [[p.format, p.runtime, p.word, "", "", "", "", "", "did not play"] for p in silent]
         yield from table(head, rows).splitlines()
         for finding in self.replay.failures:
             yield from finding.explanation()
-        for p in self.undecided:
-            needed = "no number of episodes" if p.compared.needed is None else f"about {p.compared.needed:,} episodes"
-            yield f"{p.format} in {p.runtime}: not decided; {needed} would decide (--episodes)"
+        yield from (f"{p.where}: {p.sentence}" for p in self.played if p.sentence)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of play.json (play.schema.json)."""
@@ -166,9 +164,11 @@ def _names(played: tuple[Played, ...] | list[Played]) -> str:
     return ", ".join(f"{p.format} in {p.runtime}" for p in played)
 
 
-def _figure(value: float | np.floating[Any]) -> str:
+def figure(value: float | np.floating[Any]) -> str:
+    """Return a number with four digits."""
     return f"{float(value):.4g}"
 
 
-def _signed(value: float) -> str:
+def signed(value: float) -> str:
+    """Return a difference with its sign; 0 has none."""
     return "0" if value == 0 else f"{value:+.3g}"

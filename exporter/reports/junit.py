@@ -17,7 +17,11 @@ from signatures.fields import printable
 
 def junit_xml(entries: Sequence[Entry]) -> bytes:
     """The whole file, UTF-8."""
-    suites = [suite for entry in entries for suite in _suites(entry)]
+    return junit_file([suite for entry in entries for suite in suites_of(entry)])
+
+
+def junit_file(suites: Sequence[ET.Element]) -> bytes:
+    """Return a file of suites, UTF-8."""
     root = ET.Element("testsuites", name="export-model")
     root.extend(suites)
     for key in ("tests", "failures", "errors"):
@@ -26,7 +30,8 @@ def junit_xml(entries: Sequence[Entry]) -> bytes:
     return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
 
 
-def _suites(entry: Entry) -> Iterable[ET.Element]:
+def suites_of(entry: Entry) -> Iterable[ET.Element]:
+    """Return the suites of one policy, a suite for each format."""
     report = entry.report
     ran: dict[str, dict[tuple[str, str, str], list[Finding]]] = {}
     for c in report.comparisons:
@@ -49,9 +54,14 @@ def _suites(entry: Entry) -> Iterable[ET.Element]:
             place = f"{report.policy}.{kind}.{runtime}"
             case = ET.SubElement(suite_element, "testcase", classname=_text(place), name="not run")
             ET.SubElement(case, "skipped", type="export-model.not-run", message=_text(reason))
-        for key, tag in (("tests", "testcase"), ("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
-            suite_element.set(key, str(len(list(suite_element.iter(tag)))))
+        count_cases(suite_element)
         yield suite_element
+
+
+def count_cases(suite: ET.Element) -> None:
+    """Write into a suite how many cases it has, and what came of them."""
+    for key, tag in (("tests", "testcase"), ("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
+        suite.set(key, str(len(list(suite.iter(tag)))))
 
 
 def _properties(entry: Entry, kind: str) -> Iterable[tuple[str, str]]:

@@ -50,6 +50,13 @@ def page(entries: Sequence[Entry]) -> str:
     title = f"{ordered[0].name}: parity report" if alone else f"Parity report on {len(ordered)} policies"
     bundled = any(e.contract is not None for e in entries)
     data = " parity.json in the bundle holds the same as data." if bundled else ""
+    header = el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered))
+    main = el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)], _words())
+    return document(title, header, main, el("footer", f"Written by export-model {__version__}.{data}"))
+
+
+def document(title: str, *body: Markup) -> str:
+    """Return a page with the style of all reports."""
     head = el(
         "head",
         el("meta", charset="utf-8"),
@@ -58,13 +65,7 @@ def page(entries: Sequence[Entry]) -> str:
         el("title", title),
         el("style", Markup(_PARTS.joinpath("page.css").read_text(encoding="utf-8"))),
     )
-    body = el(
-        "body",
-        el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered)),
-        el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)], _words()),
-        el("footer", f"Written by export-model {__version__}.{data}"),
-    )
-    return f"<!DOCTYPE html>\n{el('html', head, body, lang='en')}\n"
+    return f"<!DOCTYPE html>\n{el('html', head, el('body', *body), lang='en')}\n"
 
 
 def _words() -> Markup:

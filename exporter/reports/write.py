@@ -13,6 +13,36 @@ from signatures.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)
+class Documents:
+    """What makes each kind of report; none is made that nobody asked for."""
+
+    junit: Callable[[], bytes]
+    html: Callable[[], str]
+    markdown: Callable[[], str]
+
+
+def parity_documents(entries: Callable[[], Sequence[Entry]]) -> Documents:
+    """Return what makes reports on verifications; ``entries`` is called for each."""
+
+    def junit() -> bytes:
+        from exporter.reports.junit import junit_xml
+
+        return junit_xml(entries())
+
+    def html() -> str:
+        from exporter.reports.page import page
+
+        return page(entries())
+
+    def markdown() -> str:
+        from exporter.reports.markdown import markdown_text
+
+        return markdown_text(entries())
+
+    return Documents(junit, html, markdown)
+
+
+@dataclass(frozen=True, slots=True)
 class Destinations:
     """The files to write; ``markdown`` may be "-", which is stdout."""
 
@@ -32,21 +62,15 @@ class Destinations:
             with _reporting(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
 
-    def write(self, entries: Sequence[Entry], echo: Callable[[str], None]) -> None:
+    def write(self, documents: Documents, echo: Callable[[str], None]) -> None:
         """Write all of them, each whole; all are made before the first is written. Raises UsageError."""
         content: list[tuple[Path, bytes]] = []
         if self.junit is not None:
-            from exporter.reports.junit import junit_xml
-
-            content.append((self.junit, junit_xml(entries)))
+            content.append((self.junit, documents.junit()))
         if self.html is not None:
-            from exporter.reports.page import page
-
-            content.append((self.html, page(entries).encode("utf-8")))
+            content.append((self.html, documents.html().encode("utf-8")))
         if self.markdown is not None:
-            from exporter.reports.markdown import markdown_text
-
-            text = markdown_text(entries)
+            text = documents.markdown()
             if self.markdown == Path("-"):
                 echo(text.rstrip("\n"))
             else:

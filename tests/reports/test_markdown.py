@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from exporter.reports.markdown import markdown_text
-from exporter.reports.write import Destinations
+from exporter.reports.write import Destinations, parity_documents
 from tests.reports.made import FAILING, PASSING, UNVERIFIED, comparison, entry
 
 
@@ -70,6 +70,6 @@ def test_the_summary_of_a_github_step_is_appended_to_and_any_other_file_replaced
     other.write_text("before\n")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
     for path in (summary, other):
-        Destinations(markdown=path).write([entry(PASSING)], pytest.fail)
+        Destinations(markdown=path).write(parity_documents(lambda: [entry(PASSING)]), pytest.fail)
     assert summary.read_text().startswith("before\n\n## export-model")
     assert other.read_text().startswith("## export-model")
