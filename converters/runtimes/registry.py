@@ -7,14 +7,27 @@ whether it is here, how its child is started and how it is installed; and its na
 
 from __future__ import annotations
 
-from converters.runtimes import c, javascript, js, litert, numpy, onnxruntime, openvino, tensorflow, tensorflow1
+import importlib
+
 from converters.runtimes.base import Runtime, RuntimeInfo
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 
-#: In the order in which they are reported.
-_FAMILIES = (numpy, tensorflow, tensorflow1, onnxruntime, javascript, js, litert, c, openvino)
-RUNTIMES: tuple[Runtime, ...] = tuple(runtime for family in _FAMILIES for runtime in family.RUNTIMES)
+#: Folders beside this file, in the order in which their runtimes are reported.
+ROOMS = (
+    "numpy",
+    "tensorflow",
+    "tensorflow1",
+    "onnxruntime",
+    "javascript",
+    "js",
+    "litert",
+    "c",
+    "openvino",
+)
+RUNTIMES: tuple[Runtime, ...] = tuple(
+    runtime for room in ROOMS for runtime in importlib.import_module(f"converters.runtimes.{room}").RUNTIMES
+)
 
 
 def available_runtimes() -> tuple[RuntimeInfo, ...]:

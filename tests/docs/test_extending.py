@@ -66,7 +66,7 @@ def test_what_the_page_says_works(tmp_path: Path) -> None:
             run(["bash", "-euo", "pipefail", "-c", block.text], block, tmp_path)
         else:
             run([sys.executable, "-c", block.text], block, tmp_path)
-    checked = ["converters/formats/dense", "converters/trainers/lander"]
+    checked = ["converters/formats/steps", "converters/runtimes/plain", "converters/trainers/lander"]
     for tool in (["ruff", "check", "--no-cache"], ["ruff", "format", "--check", "--no-cache"]):
         done = subprocess.run([sys.executable, "-m", *tool, *checked], cwd=tmp_path, capture_output=True, check=False)
         assert done.returncode == 0, done.stdout.decode()
