@@ -35,6 +35,11 @@ from signatures.roles import (
 #: Names that inputs get; an output is called otherwise, since both may be nodes of one graph.
 INPUT_NAMES = ("state", "epsilon", "action_masks", "prev_action", "recurrent_in")
 _NUMBERED = re.compile(r"(state|observation|entities|epsilon)_\d+")
+#: What an output is called that a policy is fed with.
+_OBSERVATION = re.compile(r"(obs|observations?)(_\w+)?")
+_TRAINED = ("dense", "convolution")
+#: Numbers of the largest constant that a product with no trained weight has: a transform between frames is 4 × 4.
+_LARGEST_FRAME = 16
 #: A constant that lists sizes has no more of them.
 _MAX_LISTED = 1024
 
@@ -319,6 +324,7 @@ def _brain_of_sink(
             why="no node depends on a placeholder, so nothing is computed from an observation",
             fix="give the frozen graph of the policy, or name its output with --output NAME=action",
         )
+    _check_acts(graph, sinks)
     chosen, why = _likely(graph, sinks, declared=bool(declared))
     if len(chosen) != 1:
         shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
@@ -337,6 +343,22 @@ def _brain_of_sink(
         others = _others(graph, outputs, rest, told)
         return Brain("", (*outputs, *others), _constants(graph, ""), says=says | _reasons_declared(others))
     return Brain("", outputs, _constants(graph, ""), tuple(rest), says)
+
+
+def _check_acts(graph: Graph, sinks: Sequence[Node]) -> None:
+    """Raise NotAPolicyError where all that comes out is called an observation, and no trained weight is before it."""
+    if not all(_OBSERVATION.fullmatch(plain_name(node.name)) for node in sinks):
+        return
+    upstream = graph.ancestors(node.name for node in sinks)
+    weights = (r for n in graph.nodes if n.name in upstream and traits(n).layer in _TRAINED for r in n.inputs)
+    if any((value := graph.constant(r)) is not None and value.size > _LARGEST_FRAME for r in weights):
+        return
+    shown = ", ".join(repr(node.name) for node in sinks[:4])
+    raise NotAPolicyError(
+        f"computes an observation, not an action: its output is {shown}",
+        why="no layer in it has trained weights, so it is the part in front of a policy",
+        fix=f"give the policy that is fed with it; if this is the policy all the same: --output {sinks[0].name}=action",
+    )
 
 
 def _likely(graph: Graph, sinks: Sequence[Node], *, declared: bool) -> tuple[list[Node], str]:

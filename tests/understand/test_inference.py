@@ -396,3 +396,25 @@ def test_without_an_observation_the_inputs_are_listed_with_their_shapes() -> Non
     with pytest.raises(SignatureError) as caught:
         roles(g)
     assert r"a (int32 [?, 3]), b (int32, unknown shape)" in str(caught.value)
+
+
+# ------------------------------------------------------------------ what comes in front of a policy
+
+
+def observation_graph(weight: np.ndarray, output: str) -> Graph:
+    """A product with a constant, and a sum with an input: what robots' exporters put in front of their policies."""
+    kernel = constant("kernel", weight)
+    inputs = (placeholder("gyro", (None, len(weight))), placeholder("bias", (None, weight.shape[1])))
+    return graph(*inputs, kernel, op("turned", "MatMul", "gyro", "kernel"), op(output, "Add", "turned", "bias"))
+
+
+@pytest.mark.parametrize("output", ["obs", "observation", "observations", "obs_0"])
+def test_an_output_called_an_observation_without_a_trained_weight_is_no_action(output: str) -> None:
+    turn = np.eye(4, dtype=np.float32)
+    with pytest.raises(NotAPolicyError, match="computes an observation, not an action") as caught:
+        outputs(observation_graph(turn, output))
+    assert f"--output {output}=action" in str(caught.value)
+    assert outputs(observation_graph(turn, output), {output: Role.ACTION})
+    trained = np.ones((8, 4), np.float32)
+    assert outputs(observation_graph(trained, output)) == [{output: (Role.ACTION, output)}]
+    assert outputs(observation_graph(turn, "torques")) == [{"torques": (Role.ACTION, "torques")}]
