@@ -1,7 +1,7 @@
 """export-model: trained Unity ML-Agents policies for every runtime, proven to act the same.
 
-``from exporter import export_model, inspect_model, verify_bundle, compare_artefacts, load_policy``. Nothing heavy is
-imported before it is used: a cold start is a feature.
+``import export_model`` is what users import; ``from exporter import export_model, …`` has the same with flat keywords.
+Nothing heavy is imported before it is used: a cold start is a feature.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ if TYPE_CHECKING:
     from typing import Any
 
     from exporter.acting.loading import load_policy
-    from exporter.api import export_model, inspect_model, verify_bundle
-    from exporter.compare.comparison import compare_artefacts
+    from exporter.api import compare_artefacts, export_model, inspect_model, verify_bundle
 
 __all__ = ["__version__", "compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"]
 
-_HOMES = {"load_policy": "exporter.acting.loading", "compare_artefacts": "exporter.compare.comparison"}
+_HOMES = {"load_policy": "exporter.acting.loading"}
 
 
 def __getattr__(name: str) -> Any:

@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from converters.compiler.options import CompileOptions
+from converters.formats.source import ReadOptions as FileOptions
 from exporter import interface
+from exporter.compare import comparison
 from exporter.export.labels import Labels
 from exporter.export.pipeline import ExportResult
 from exporter.inspect.inspection import Inspection
@@ -158,5 +161,39 @@ def verify_bundle(
         source=source,
         read=ReadOptions(step=step, trust_source=trust_source),
         verify=interface.judged_by(runtimes, options),
+        allow_unverified=allow_unverified,
+    )
+
+
+def compare_artefacts(
+    reference: Path | str,
+    candidates: Path | str | Sequence[Path | str],
+    *,
+    names: Mapping[str, str] | None = None,
+    runtimes: str | Sequence[str] = "auto",
+    options: VerifyOptions | None = None,
+    understanding: CompileOptions | None = None,
+    read: FileOptions | None = None,
+    allow_unverified: bool = False,
+) -> ParityReport:
+    """Compare files that any tool made with a reference: ``export_model.compare`` with flat keywords.
+
+    - ``names``: a name of the reference → what the candidates call it.
+    - ``runtimes``: as in ``verify_bundle``; ``options``: seed, samples, tolerances.
+    - ``understanding``, ``read``: how to read the reference.
+
+    Raises ExportModelError::
+
+        report = compare_artefacts("3DBall.bytes", "theirs.onnx", names={"action": "Identity"})
+        assert report.passed, report.failures
+    """
+    return comparison.compare_artefacts(
+        reference,
+        candidates,
+        names=names,
+        runtimes=runtimes,
+        options=options,
+        understanding=understanding,
+        read=read,
         allow_unverified=allow_unverified,
     )

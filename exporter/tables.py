@@ -98,3 +98,8 @@ def size_with_original(kind: str, sizes: Mapping[str, int], whole: Mapping[str, 
     """The size of a format, and what it would be with weights in float32 where these are kept in less."""
     text = size_text(sizes[kind]) if kind in sizes else ""
     return f"{text} of {size_text(whole[kind])}" if kind in whole else text
+
+
+def counted(count: int, one: str, several: str | None = None) -> str:
+    """Return a number with its noun: ``1 source``, ``2 sources``."""
+    return f"{count} {one if count == 1 else several or f'{one}s'}"

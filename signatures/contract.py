@@ -263,7 +263,7 @@ def _check_branches(whole: Field, key: str, specs: tuple[TensorSpec, ...]) -> No
 def _tensor(entry: Field, roles: Any) -> TensorSpec:
     shape, source, role = entry["shape"].shape(), entry["source"], Role(entry["role"].one_of(roles))
     if len(shape) not in _RANKS.get(role, range(33)):
-        raise entry["shape"].error(f"has {len(shape)} axes, which {role.value} has not")
+        raise entry["shape"].error(f"has {len(shape)} axes, which {role.value} cannot have")
     return TensorSpec(
         entry["name"].text(),
         role,
@@ -353,7 +353,7 @@ def _constant(value: Field) -> Constant:
 def _part(entry: Field) -> SourcePart:
     shape = entry["shape"].shape()
     if shape.count(None) != 1:
-        raise entry["shape"].error("has not one batch axis")
+        raise entry["shape"].error("must have one batch axis")
     return SourcePart(entry["tensor"].text(), shape)
 
 

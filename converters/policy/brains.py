@@ -330,7 +330,7 @@ def _brain_of_sink(
         shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
         several = f"; of each of {', '.join(n.name for n in chosen[:8])}: {why}" if chosen else ""
         raise SignatureError(
-            "no policy found: it is not clear which output is the action",
+            "no policy found: cannot tell which output is the action",
             why=f"no node is called 'action'; candidates are {shown}{several}",
             fix="name them: --output NAME=action (and, if it has them, --output NAME=value_estimate …)",
         )

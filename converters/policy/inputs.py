@@ -191,7 +191,7 @@ class _Inputs:
                 fix="export the model with the agents' axis first ([B, T, n]: batch_first=True)",
             )
         return SignatureError(
-            "no policy found: none of the inputs can be told to be an observation",
+            "no policy found: cannot tell which input is an observation",
             why=f"inputs upstream of the outputs: {names}{self._reasons(self.found)}",
             fix="say what they are: --input NAME=vector_observation, --input NAME=visual_observation, --set NAME=VALUE",
         )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from exporter import __version__
-from exporter.cli.terminal import say
+from exporter.cli.terminal import say, say_lines
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def help_all_option() -> click.Option:
 def _show_all(ctx: click.Context, parameter: click.Parameter, wanted: bool) -> None:
     if wanted and not ctx.resilient_parsing:
         ctx.meta[_ALL] = True
-        click.echo(ctx.get_help(), color=ctx.color)
+        say_lines(ctx.get_help())
         ctx.exit()
 
 

@@ -89,7 +89,5 @@ def _bundle_of(place: Path) -> Iterator[Path]:
                 fix=f"{command_text(place, '-o', 'exported')}    "
                 f"(then: {command_text('serve', Path('exported', results[0].policy.name))})",
             )
-        say(
-            f"exported for this page alone, not compared; to keep it: {command_text(place, '-o', 'exported')}", err=True
-        )
+        say(f"exported for this page only, not verified. To keep it: {command_text(place, '-o', 'exported')}", err=True)
         yield results[0].folder

@@ -333,7 +333,7 @@ def _match(
     constant, left = _constants(own, policy, {p.name for p in inputs.values()})
     if not own.open:
         for port in left:
-            text = f"it takes an input {port.name!r} that the reference has not"
+            text = f"it takes an input {port.name!r} that is not in the reference"
             problems.append(_Problem(port.name, text, blocking=True))
     outputs = {n: p.name for n, p in found.items()}
     return _Candidate(label, kind, own, inputs, outputs, constant, drawn, tuple(problems), spared)

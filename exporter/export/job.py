@@ -213,7 +213,7 @@ def fix_batch(job: Job, batch: int, formats: Sequence[Format]) -> Job:
 def smaller(job: Job, weights: Storage) -> Job:
     """The policy with its weights rounded, which a note in its contract says."""
     whole = job.policy
-    note = f"weights were rounded to {weights}; what is computed with them is float32"
+    note = f"weights are stored as {weights}; computation stays in float32"
     signature = replace(whole.signature, notes=(*whole.signature.notes, note))
     return replace(
         job, policy=replace(whole, graph=round_weights(whole.graph, weights), signature=signature), whole=whole

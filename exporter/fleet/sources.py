@@ -66,8 +66,8 @@ def sources_in(given: Sequence[Path], out: Path, passed_over: list[Path] | None 
             recognise_path(Fetched(path))  # which says what lies there instead
         if not here:
             raise UsageError(
-                f"{path_text(path)} stands for no source",
-                why=f"not a model in any form that is read: {paths_text(others)}" if others else "it matches nothing",
+                f"{path_text(path)} matches no model",
+                why=f"none of the matching files is a model: {paths_text(others)}" if others else "no file matches",
                 fix="give model files, run folders, or folders that hold them",
             )
         found.update(dict.fromkeys(here))

@@ -104,7 +104,7 @@ def measured(sources: Sequence[Path], verify: str, jobs: int, scratch: Path) -> 
         process.returncode = os.waitstatus_to_exitcode(status)
         said.seek(0)
         text = said.read().decode()
-    policies = re.search(r"(\d+) policies exported", text)
+    policies = re.search(r"(\d+) polic(?:y|ies) exported", text)
     if process.returncode or policies is None:
         raise RuntimeError(text[-2000:])
     processor = used.ru_utime + used.ru_stime

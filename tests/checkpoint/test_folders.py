@@ -59,7 +59,7 @@ def test_0_1_to_0_5(tmp_path: Path) -> None:
     assert read_from(run) == {"ppo": ["MyEnv_ppo.bytes"]}
     assert read_from(run, 50) == {"ppo": of("model-50.cptk")}
     (note, *_) = read_source(run).policies()[0].signature.notes
-    assert note == "left out beside what was read: model-50.cptk, model-7000.cptk"
+    assert note == "also here, not used: model-50.cptk, model-7000.cptk"
     frozen(run / "Other_ppo.bytes", "discrete")
     assert read_from(run) == {"MyEnv_ppo": ["MyEnv_ppo.bytes"], "Other_ppo": ["Other_ppo.bytes"]}
 

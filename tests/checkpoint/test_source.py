@@ -63,7 +63,7 @@ def test_the_newest_is_found_by_number(tmp_path: Path) -> None:
         found = only(read_source(path))
         assert found.name == "ppo"
         np.testing.assert_allclose(answer(found), expected(graphs[200], OBSERVATION), rtol=1e-6)
-        assert "left out beside what was read: model-10.cptk, model-30.cptk" in found.signature.notes
+        assert "also here, not used: model-10.cptk, model-30.cptk" in found.signature.notes
         found = only(read_source(path, ReadOptions(step=30)))
         np.testing.assert_allclose(answer(found), expected(graphs[30], OBSERVATION), rtol=1e-6)
         with pytest.raises(UsageError, match=r"--step 31: .*\n  fix: the steps are 10, 30, 200"):

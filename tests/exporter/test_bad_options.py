@@ -57,7 +57,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--set", "epsilon=much"], ["--set epsilon=much", "a number, true or false is expected"]),
         (["--set", "epsilonn=0"], ["--set names 'epsilonn'"]),
         (["--set", "action=0"], ["--set names 'action'", "not a placeholder"]),
-        (["--set", "state=0"], ["none of the inputs can be told to be an observation"]),
+        (["--set", "state=0"], ["cannot tell which input is an observation"]),
         (["--opset", "12"], ["opset 12", "13 to 21"]),
         (["--opset", "22"], ["opset 22"]),
         (["--opset", "-1"], ["opset -1"]),

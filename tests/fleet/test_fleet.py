@@ -209,7 +209,7 @@ def test_the_command_line_sums_up(sources: list[Path], tmp_path: Path) -> None:
     ran = export_model(tmp_path / "a", "-o", tmp_path / "out", "--jobs", "2", "--verify", "onnxruntime")
     assert ran.status == 2
     assert "5 of 5 sources in" in ran.out
-    assert "5 policies exported (5 verified), 1 sources REFUSED" in ran.out
+    assert "5 policies exported (5 verified), 1 source REFUSED" in ran.out
     assert "broken.bytes" in ran.err
     (tmp_path / "a" / "broken.bytes").unlink()
     ran = export_model(tmp_path / "a", "-o", tmp_path / "out", "--jobs", "1", "--verify", "onnxruntime", "--json")

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from converters.files import fetch
-from exporter import compare_artefacts, export_model, inspect_model, verify_bundle
+from exporter import export_model, inspect_model, verify_bundle
+from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in

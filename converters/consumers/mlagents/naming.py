@@ -79,7 +79,7 @@ class Dressing:
         """
         graph = self.policy.graph
         noise = {self.policy.feeds[s.name]: s for s in self.policy.signature.noise}
-        self.notes.extend(f"{spec.name} is drawn inside the model, at every step anew" for spec in noise.values())
+        self.notes.extend(f"{spec.name} is drawn inside the model, new at every step" for spec in noise.values())
         behind: set[str] = set(noise)
         later = []
         for node in graph.nodes:

@@ -116,7 +116,7 @@ def left_out(names: Sequence[str]) -> tuple[str, ...]:
     if not names:
         return ()
     shown = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-    return (f"left out beside what was read: {shown}",)
+    return (f"also here, not used: {shown}",)
 
 
 def is_version_1(path: Path) -> bool:

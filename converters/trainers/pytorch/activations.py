@@ -89,10 +89,10 @@ def activation_of(
         name, note = default
         return activation_from_user(name), (), (note,)
     raise SourceError(
-        "the checkpoint does not tell what stands between the layers of its network",
+        "the checkpoint does not say which activation its layers use",
         why="a state dictionary has weights, and an activation has none",
-        fix=f"say it: --activation NAME ({usual}); Isaac Lab writes it to params/agent.yaml, which is read where it "
-        "lies beside the checkpoint",
+        fix=f"add --activation NAME ({usual}); Isaac Lab writes it to params/agent.yaml, which is read if it is "
+        "next to the checkpoint",
     )
 
 

@@ -84,7 +84,7 @@ export const withTfjs = (backend, src) => ({ artifacts }) => exclusive(async () 
 async function unavailable(backend) {
   if (backend === "webgpu") {
     if (navigator.gpu === undefined) return "this browser has no WebGPU";
-    return (await navigator.gpu.requestAdapter()) === null ? "this device has nothing that WebGPU runs on" : null;
+    return (await navigator.gpu.requestAdapter()) === null ? "WebGPU is not available here" : null;
   }
   if (backend !== "webgl") return null;
   const canvas = document.createElement("canvas");

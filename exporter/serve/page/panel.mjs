@@ -34,7 +34,7 @@ export class Panel {
       const details = h("details", { class: "big" }, h("summary", {}, "Set the observations by hand"), columns);
       details.addEventListener("toggle", () => details.open && this.decide());
       $("panel").append(title, details);
-    } else $("panel").append(title, h("p", { class: "lead" }, "Move a slider: the policy decides again with every change."), columns);
+    } else $("panel").append(title, h("p", { class: "lead" }, "Change an input: the policy decides again."), columns);
     $("panel").hidden = false;
     this.#controls.memory?.show();
     if (!folded) void this.decide();

@@ -121,7 +121,7 @@ export class Verdict {
     const ran = this.#results.filter(({ error }) => error === undefined);
     const wrong = ran.filter(({ passed }) => !passed);
     const idle = this.#results.length - ran.length;
-    const note = idle === 0 ? "" : ` ${idle} of ${this.#results.length} did not run, the table says why.`;
+    const note = idle === 0 ? "" : ` ${idle} of ${this.#results.length} did not run (see the table).`;
     if (ran.length === 0) return this.#say(`Not checked: no backend ran here.${note}`, "fail");
     if (wrong.length > 0) {
       const said = wrong.map(({ backend, worst }) => `${backend} is off by ${text(worst.worst)} at ${worst.name}`);

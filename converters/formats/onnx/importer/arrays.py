@@ -32,7 +32,7 @@ def _constant(op: Op, net: Importer) -> str:
             if value.dtype.kind not in "biuf":  # an attribute that says to be a graph, or a text
                 break
             return net.const(value, "value")
-    raise op.op_error("it holds no numbers", "strings and sparse tensors are no part of a policy")
+    raise op.op_error("it holds no numbers", "a policy has no strings and sparse tensors")
 
 
 def _constant_of_shape(op: Op, net: Importer) -> str:

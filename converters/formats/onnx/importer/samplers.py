@@ -28,7 +28,7 @@ def _shape(op: Op, net: Importer) -> str:
 def _float(op: Op) -> None:
     """Draws are float32 in every target; ``dtype`` is the input's where it is left out."""
     if op.integer("dtype", 1) not in (1, 11):
-        raise op.op_error("it draws numbers that are no float32")
+        raise op.op_error("it draws numbers that are not float32")
 
 
 def _normal(op: Op, net: Importer) -> str:

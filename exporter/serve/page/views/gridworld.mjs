@@ -21,7 +21,7 @@ const view = {
   observed: (observation) => observation,
   actions: ({ model }) => model,
   score: { good: "goals reached", bad: "episodes without a goal" },
-  status: (env, tally) => `goals reached ${tally.good} · pit, or no goal in 50 steps ${tally.bad}`,
+  status: (env, tally) => `goals reached ${tally.good} · failed ${tally.bad}`,
   describe(env, tally, chosen) {
     const cell = ([column, row]) => `column ${column + 1}, row ${row + 1}`;
     return (

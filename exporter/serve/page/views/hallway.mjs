@@ -25,7 +25,7 @@ const view = {
   observed: (observation) => observation,
   actions: ({ model }) => model,
   score: { good: "right doors", bad: "wrong doors, or none" },
-  status: (env, tally) => `right doors ${tally.good} · wrong doors, or none in 40 steps ${tally.bad}`,
+  status: (env, tally) => `correct ${tally.good} · wrong or timed out ${tally.bad}`,
   describe(env, tally, chosen) {
     const side = env.door[chosen] === LEFT ? "left" : "right";
     return (
