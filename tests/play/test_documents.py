@@ -107,4 +107,4 @@ def test_the_command_writes_them(bundles: Path, tmp_path: Path) -> None:
     ran = export_model("play", *where, *options)
     assert ran.status == 0, ran.err
     assert all(file.read_bytes() for file in files.values())
-    is_refused(export_model("play", *where, "--json", "--markdown", "-"), "both want stdout")
+    is_refused(export_model("play", *where, "--junit", files["html"], "--html", files["html"]), "named for two reports")
