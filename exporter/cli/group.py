@@ -38,7 +38,7 @@ GROUPS = {
         *("normaliser", "trust_source"),
     ),
     "What Unity would say": ("releases", "actions", "brain_parameters"),
-    "How to play": ("env", "episodes", "likeliest", "margin", "strict", "partner"),
+    "How to play": ("env", "episodes", "most", "likeliest", "margin", "strict", "partner"),
     "How to verify": (
         *("runtimes", "allow_unverified", "samples", "seed", "steps", "atol", "rtol", "tolerances", "golden", "sizes"),
         "required",

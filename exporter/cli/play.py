@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 @click.argument("candidates", nargs=-1, type=PATH, metavar="[CANDIDATE]...")
 @click.option("--env", required=True, metavar="ENV", help="3DBall and others of ours, a Gymnasium id, or module:make.")
 @click.option("--episodes", type=int, default=200, metavar="N", help="Episodes that each plays.")
+@click.option("--most", type=int, default=1600, metavar="N", help="Play up to N others where these do not decide.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Seed of the episodes and of drawn actions.")
 @click.option("--margin", default="1%", metavar="SIZE", help="How far mean returns may be apart: 1%, or a number.")
 @click.option(
@@ -56,6 +57,7 @@ def play_command(
     candidates: tuple[Path, ...],
     env: str,
     episodes: int,
+    most: int,
     seed: int,
     margin: str,
     likeliest: bool,
@@ -78,7 +80,7 @@ def play_command(
     from exporter.verify.options import VerifyOptions
 
     console.prepare()
-    options = PlayOptions(episodes, seed, margin, likeliest)
+    options = PlayOptions(episodes, seed, margin, likeliest, most)
     with console.progress() as progress:
         report = play_policy(
             reference,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RuntimeInfo
 from exporter.acting.policy import LoadedPolicy
-from exporter.play.episodes import Episodes, play_episodes
+from exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
 from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, Equivalence, equivalence
 from exporter.play.options import PlayOptions
 from exporter.play.recording import Recorder
@@ -32,6 +33,8 @@ from signatures.errors import ExportModelError
 from signatures.records import dataclass
 
 Progress = Callable[[str], None]
+#: The turn that no first episodes reach: its seed is that of all others.
+_MORE = 1 << 31
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Played:
     runtime: str
     episodes: Episodes
     compared: Equivalence
+    #: the reference's episodes that begin like these
+    reference: Episodes
 
     @property
     def where(self) -> str:
@@ -77,6 +82,9 @@ class Match:
         self.world_name = ""
         #: steps that were kept for the replay
         self.recorded = 0
+        #: plays as the reference; its episodes by how many more were asked for
+        self._actor_of_reference: LoadedPolicy | None = None
+        self._more: dict[int, Episodes] = {}
         self._progress: Progress = lambda text: None
 
     def understood(self, policy: Policy) -> None:
@@ -117,13 +125,15 @@ class Match:
         recorder = Recorder(tested.signature)
         actor = self._actor(_run_of(reference), reference.name)
         actor = self._actor(recorder.recording(self._acting(actor, _run_of(reference))), reference.name)
-        episodes = self._episodes(actor, f"the reference, {reference.name}", recorder.watch)
+        episodes = self._episodes(actor, f"the reference, {reference.name}", watch=recorder.watch)
         if tested.graph is self.policy.graph:
             self.reference, self.reference_name = episodes, reference.name
+            self._actor_of_reference, self._more = actor, {}
         elif self.reference is None:  # rounded weights are held against themselves by numbers, by returns against these
             graph = runnable(self.policy.graph)
             whole = self._actor(lambda feeds, fetch: run_graph(graph, feeds, fetch), "numpy")
             self.reference, self.reference_name = self._episodes(whole, "the reference, numpy"), "numpy"
+            self._actor_of_reference = whole
         inputs = recorder.inputs()
         self.recorded = max(self.recorded, len(inputs.cases))
         return inputs
@@ -145,16 +155,33 @@ class Match:
             return
         actor = self._actor(self._acting(actor, run), participant.runtime)
         try:
-            episodes = self._episodes(actor, f"{participant.name} in {participant.runtime}")
+            self.played.append(self._beside_reference(actor, participant))
         except RunFailedError:
             raise
         except ExportModelError as error:  # what it decided is not an action
             raise RunFailedError(
                 "stopped playing", why=f"{error.what}: {error.why}" if error.why else error.what
             ) from error
-        compared = equivalence(self.reference.returns, episodes.returns, self.margin)
-        self.played.append(Played(participant.name, participant.runtime, episodes, compared))
         yield from ()
+
+    def _beside_reference(self, actor: LoadedPolicy, participant: Participant) -> Played:
+        """Return what came of the episodes. Where they do not decide, as many others are played as would, if no more
+        than ``most``; those are judged by themselves, so that a player at the margin passes one in forty times in each.
+        """
+        assert self.reference is not None
+        options, name, runtime = self._options, participant.name, participant.runtime
+        who, own = f"{name} in {runtime}", self.reference
+        episodes = self._episodes(actor, who)
+        compared = equivalence(own.returns, episodes.returns, self.margin)
+        doubled = (options.episodes << k for k in range(1, 21))
+        more = next((n for n in doubled if n >= (compared.needed or n + 1)), None)
+        if compared.needed is None or more is None or more > options.most:
+            return Played(name, runtime, episodes, compared, own)
+        if more not in self._more:
+            assert self._actor_of_reference is not None
+            self._more[more] = self._episodes(self._actor_of_reference, f"the reference, {self.reference_name}", more)
+        own, episodes = self._more[more], self._episodes(actor, who, more)
+        return Played(name, runtime, episodes, equivalence(own.returns, episodes.returns, self.margin), own)
 
     def _actor(self, run: Run, runtime: str) -> LoadedPolicy:
         assert self.policy is not None
@@ -168,22 +195,21 @@ class Match:
         return lambda feeds, fetch: run(feeds, names)
 
     def _episodes(
-        self,
-        actor: LoadedPolicy,
-        who: str,
-        watch: Callable[[int, np.ndarray], None] = lambda step, playing: None,
+        self, actor: LoadedPolicy, who: str, more: int = 0, watch: Watch = lambda step, playing: None
     ) -> Episodes:
-        options = self._options
-        self._progress(f"{who} plays {options.episodes} episodes")
+        """Play the first episodes, or ``more`` others."""
+        options, begun = self._options, time.monotonic()
+        self._progress(f"{who} plays {more or options.episodes} episodes")
 
         def advance(ended: int, count: int, rate: float) -> None:
-            self._progress(f"{who}: {ended} of {count} episodes, {rate:,.0f} decisions/s")
+            left = (time.monotonic() - begun) * (count - ended) / ended
+            self._progress(f"{who}: {ended} of {count} episodes, {rate:,.0f} decisions/s, {left:.0f} s left")
 
         return play_episodes(
             self._world,
             actor,
-            options.episodes,
-            options.seed,
+            more or options.episodes,
+            turn_seed(options.seed, _MORE) if more else options.seed,
             deterministic=options.deterministic,
             watch=watch,
             advance=advance,

@@ -20,10 +20,13 @@ class PlayOptions:
     margin: str = "1%"
     #: Take the likeliest action and the mean, in place of draws.
     deterministic: bool = False
+    #: Where the episodes do not decide, as many others as would are played, up to this number.
+    most: int = 1600
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "episodes", whole("episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
         object.__setattr__(self, "seed", whole("seed", self.seed, 0, MAX_SEED))
+        object.__setattr__(self, "most", whole("most", self.most, 0, MOST_EPISODES))
         parse_margin(self.margin)
 
     @property

@@ -121,6 +121,7 @@ class PlayReport:
             "episodes": self.options.episodes,
             "seed": self.options.seed,
             "deterministic": self.options.deterministic,
+            "most": self.options.most,
             "confidence": CONFIDENCE,
             "margin": {
                 "asked": self.options.margin,
@@ -145,6 +146,8 @@ def _entry(played: Played) -> dict[str, Any]:
         "deviation": c.deviation,
         "equal_episodes": c.equal,
         "episodes_needed": c.needed,
+        "episodes": c.episodes,
+        "reference_mean_return": float(played.reference.returns.mean()),
         **_summary(played.episodes),
     }
 

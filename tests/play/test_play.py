@@ -171,6 +171,22 @@ def test_what_more_episodes_would_decide_is_not_decided(bundles: Path, play: Pla
     assert f"about {played.compared.needed:,} episodes would decide" in "\n".join(report.lines())
 
 
+def test_others_are_played_where_the_first_episodes_do_not_decide(bundles: Path, play: Play) -> None:
+    make = world_maker("Hallway", bundles / "Hallway")
+    found = {}
+    for most in (0, 1600):
+        options = PlayOptions(most=most)
+        report = play(bundles / "Hallway", lambda signature: noisy(make(signature), 0.02), options=options, judging=ONE)
+        (found[most],) = report.played
+    assert (found[0].compared.verdict, found[0].compared.episodes) == (NOT_DECIDED, 200)
+    assert found[0].compared.needed is not None
+    assert found[1600].compared.verdict == EQUIVALENT
+    assert found[0].compared.needed <= found[1600].compared.episodes <= 1600
+    assert len(found[1600].episodes.returns) == len(found[1600].reference.returns) == found[1600].compared.episodes
+    # They are others: none begins as one of the first does.
+    assert found[1600].reference.lengths[:200].tolist() != found[0].reference.lengths.tolist()
+
+
 def test_not_decided_is_a_failure_only_with_strict(bundles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = world_maker("Hallway", bundles / "Hallway")
     monkeypatch.setattr("exporter.play.play.world_maker", lambda *_: lambda signature: noisy(make(signature), 0.1))
