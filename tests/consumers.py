@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from converters.consumers.published import published
+from converters.consumers.published import consumer_tables
 from tests.commands import ROOT
 
 PAGE = ROOT / "docs" / "consumers.md"
@@ -32,7 +32,7 @@ it imports and runs, and gives other numbers or another shape, without an error.
 
 def page() -> str:
     """Return the page in Markdown."""
-    tables = published()
+    tables = consumer_tables()
     return "\n".join((HEAD, *_importers(tables), *_readings(tables["readings"]))) + "\n"
 
 

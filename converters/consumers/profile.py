@@ -46,6 +46,6 @@ class Profile:
         return WriteOptions(contract, self.opset, self.name, misread=misread)
 
 
-def refused(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:
+def raise_profile_error(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:
     """Raise the ProfileError of a policy that a profile cannot hold."""
     raise ProfileError(f"{policy.name!r} cannot be made for {profile}: {what}", why=why, fix=fix)

@@ -15,7 +15,7 @@ from converters.consumers.unity.readings import RULES, Reading, Rule
 _THROWN = (Reading.REFUSED, Reading.FAILS)
 
 
-def published() -> dict[str, Any]:
+def consumer_tables() -> dict[str, Any]:
     """Return the tables: importers, releases, profiles, readings (importer × construct) and what players do."""
     return {
         "schema": 1,
@@ -43,7 +43,7 @@ def published() -> dict[str, Any]:
             for p in PROFILES
         ],
         "readings": [reading for rule in RULES for reading in _readings(rule)],
-        "players": list(_played()),
+        "players": list(_player_records()),
     }
 
 
@@ -65,7 +65,7 @@ def _readings(rule: Rule) -> Iterator[dict[str, Any]]:
         }
 
 
-def _played() -> Iterator[dict[str, Any]]:
+def _player_records() -> Iterator[dict[str, Any]]:
     """A record for each form of an input or output, with the releases in which it comes to the same."""
     rows: dict[int, tuple[Row, str, list[str]]] = {}
     for player in PLAYERS.values():

@@ -17,10 +17,10 @@ def consumers_command(importer: str | None, as_json: bool) -> None:
     With --json all tables: importers, releases of ML-Agents, profiles, readings by importer and construct with the
     exception and the evidence, and what the players make of inputs and outputs.
     """
-    from converters.consumers.published import published
+    from converters.consumers.published import consumer_tables
     from exporter.tables import table
 
-    tables = published()
+    tables = consumer_tables()
     names = [i["name"] for i in tables["importers"]]
     if importer is not None and importer not in names:
         raise UsageError(

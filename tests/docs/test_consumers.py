@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from converters.consumers.published import published
+from converters.consumers.published import consumer_tables
 from converters.consumers.unity.importers import IMPORTERS
 from tests import consumers
 from tests.commands import export_model, is_refused
@@ -15,7 +15,7 @@ def test_the_page_is_that_of_the_tables() -> None:
 
 
 def test_the_program_prints_the_tables() -> None:
-    assert json.loads(export_model("consumers", "--json").out) == json.loads(json.dumps(published()))
+    assert json.loads(export_model("consumers", "--json").out) == json.loads(json.dumps(consumer_tables()))
 
 
 def test_each_importer_has_its_own_list() -> None:
@@ -26,7 +26,7 @@ def test_each_importer_has_its_own_list() -> None:
 
 
 def test_whatever_is_thrown_has_its_words_and_whatever_is_not_has_none() -> None:
-    for reading in published()["readings"]:
+    for reading in consumer_tables()["readings"]:
         thrown = reading["reading"] in ("refused", "fails")
         recorded = reading["evidence"] != "beside the 352" and not reading["evidence"].startswith("cases/")
         assert bool(reading["exception"]) == (thrown and recorded), reading

@@ -17,7 +17,7 @@ from converters.compiler.passes.naming import name_tensors
 from converters.compiler.passes.signature import LIFTED
 from converters.compiler.passes.simplify import collapse_views, drop_identities
 from converters.compiler.passes.transposes import cancel_transposes
-from converters.consumers.profile import refused
+from converters.consumers.profile import raise_profile_error
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref
 from converters.graph.types import FLOAT32, static_shape
@@ -52,7 +52,7 @@ class Dressing:
 
     def refuse(self, what: str, *, why: str, fix: str) -> NoReturn:
         """Raise the ProfileError of what this profile cannot hold."""
-        refused(self.policy, self.profile, what, why=why, fix=fix)
+        raise_profile_error(self.policy, self.profile, what, why=why, fix=fix)
 
     # ------------------------------------------------------------------ in front of the graph
 
@@ -96,16 +96,16 @@ class Dressing:
             self._keep(node)
 
     def _keep(self, node: Node) -> None:
-        self.builder.append(node.with_inputs(self.moved(r) for r in node.inputs))
+        self.builder.append(node.with_inputs(self.current_reference(r) for r in node.inputs))
 
-    def moved(self, reference: str) -> str:
+    def current_reference(self, reference: str) -> str:
         """Where a tensor of the policy's graph is now."""
         name, index = split_ref(reference)
         return self.tensors.get(ref(name, index), reference)
 
     def own(self, output: str) -> str:
         """The tensor that is the policy's output of this name."""
-        return self.moved(self.policy.fetches[output])
+        return self.current_reference(self.policy.fetches[output])
 
     # ------------------------------------------------------------------ behind it
 
@@ -116,7 +116,7 @@ class Dressing:
         self.fetches[name] = pinned
         self.outputs.append(TensorSpec(name, role, kind.dtype.name, static_shape(kind.shape) or (None,), source))
 
-    def finished(self, memory: Memory | None, beside: Sequence[Node] = ()) -> Policy:
+    def finish(self, memory: Memory | None, beside: Sequence[Node] = ()) -> Policy:
         """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up."""
         graph = self.builder.graph().prune(self.fetches.values())
         work, fetches = drop_identities(fold(graph).prune(self.fetches.values()), self.fetches)

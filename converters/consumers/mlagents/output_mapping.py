@@ -79,7 +79,7 @@ def branches(dressing: Dressing, spec: TensorSpec, masks: str | None, *, masked:
     if masks is None and masked:
         masks = supply_masks(dressing, sum(sizes))
         own = zip(scores, _starts(sizes), sizes, strict=True)
-        scores = tuple(_masked(dressing, score, masks, at, size) for score, at, size in own)
+        scores = tuple(_mask_scores(dressing, score, masks, at, size) for score, at, size in own)
     else:
         known = {s.name for s in signature.outputs}
         samples = dressing.own(spec.name) if spec.role in (Role.SAMPLED, Role.DETERMINISTIC) else None
@@ -116,13 +116,13 @@ def log_probabilities(dressing: Dressing, spec: TensorSpec, found: Branches) -> 
     """
     builder = dressing.builder
     if spec.role is Role.DETERMINISTIC:
-        return builder.concat([_settled(dressing, s) for s in found.scores], 1)
+        return builder.concat([_scores_of_best(dressing, s) for s in found.scores], 1)
     if spec.role is Role.SAMPLED:
         return builder.concat([builder.add("LogSoftmax", [s], "log_probabilities") for s in found.scores], 1)
     return builder.concat(list(found.scores), 1)
 
 
-def _settled(dressing: Dressing, score: str) -> str:
+def _scores_of_best(dressing: Dressing, score: str) -> str:
     """0 for the best, far below it for the others."""
     builder = dressing.builder
     best = builder.add("Equal", [score, builder.reduce("Max", score, [1], keep=True)], "is_best")
@@ -144,7 +144,7 @@ def _starts(sizes: Sequence[int]) -> list[int]:
     return [sum(sizes[:i]) for i in range(len(sizes))]
 
 
-def _masked(dressing: Dressing, score: str, masks: str, at: int, size: int) -> str:
+def _mask_scores(dressing: Dressing, score: str, masks: str, at: int, size: int) -> str:
     """Scores of which those of forbidden actions are far below all others; nothing is changed where all are allowed."""
     builder = dressing.builder
     own = builder.slice(masks, 1, at, at + size)
@@ -171,7 +171,7 @@ def _scores(dressing: Dressing, spec: TensorSpec) -> tuple[tuple[str, ...], tupl
     """(scores per branch, sizes) of the discrete action, as they are in the policy."""
     builder, policy = dressing.builder, dressing.policy
     meaning = action_meaning(policy.graph, policy.fetches[spec.name], np.dtype(spec.dtype), has_masks=True)
-    found = tuple(dressing.moved(b) for b in meaning.branches)
+    found = tuple(dressing.current_reference(b) for b in meaning.branches)
     widths = [builder.shape(b)[-1] for b in found]
     sizes = policy.signature.branches
     if not found or any(not isinstance(w, int) for w in widths):

@@ -67,7 +67,7 @@ def dress(policy: Policy, generation: Generation) -> Policy:
         )
     width = _give_action(dressing, generation, found, masks)
     memory = give_memory(dressing, state, _rows)
-    return dressing.finished(memory, _beside(generation, found, width, state.size))
+    return dressing.finish(memory, _lookup_nodes(generation, found, width, state.size))
 
 
 def _rows(size: int) -> tuple[int | None, ...]:
@@ -143,7 +143,7 @@ def _give_action(dressing: Dressing, generation: Generation, found: Heads, masks
     return sum(scores.sizes)
 
 
-def _beside(generation: Generation, found: Heads, width: int, size: int) -> list[Node]:
+def _lookup_nodes(generation: Generation, found: Heads, width: int, size: int) -> list[Node]:
     """Nodes that the C# side looks up and that no other node reads."""
     constants: dict[str, int] = {}
     if size and generation.memory_constant:

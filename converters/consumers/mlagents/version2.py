@@ -42,7 +42,7 @@ def dress(policy: Policy, profile: str) -> Policy:
     dressing.constants["version_number"] = np.array([_VERSION], np.float32)
     dressing.constants["memory_size"] = np.array([0], np.float32)
     _give_actions(dressing, heads(dressing), masks)
-    return dressing.finished(None)
+    return dressing.finish(None)
 
 
 def _take_observations(dressing: Dressing) -> None:

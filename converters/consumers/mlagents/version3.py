@@ -56,7 +56,7 @@ def dress(policy: Policy, profile: str, *, feeds_previous: bool = True, transpos
         plain.append(("discrete_actions", best))
     for name, without in plain:  # behind the actions, which a signature has first
         dressing.give(f"{_DETERMINISTIC}{name}", without, Role.DETERMINISTIC)
-    return dressing.finished(give_memory(dressing, state, _rows))
+    return dressing.finish(give_memory(dressing, state, _rows))
 
 
 def _rows(size: int) -> tuple[int | None, ...]:

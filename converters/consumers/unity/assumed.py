@@ -14,7 +14,7 @@ from converters.consumers.unity.model import (
     VERSION,
     CheckedModel,
     InputView,
-    truncated,
+    truncate,
 )
 from converters.consumers.unity.onnx_file import OnnxFile
 from converters.consumers.unity.rules import EPSILON, MASKS, PREVIOUS, SEQUENCE, VECTOR
@@ -75,8 +75,8 @@ def _actions(model: CheckedModel, previous: int) -> tuple[int, tuple[int, ...]]:
     with contextlib.suppress(UnityThrows):
         together = max(model.discrete_size, 0)
     version, branches = model.constant(VERSION), model.constant(DISCRETE_SHAPE)
-    single = version is not None and bool(version.size) and truncated(version[0]) == FIRST_VERSION
+    single = version is not None and bool(version.size) and truncate(version[0]) == FIRST_VERSION
     if not single and branches is not None:
-        return continuous, tuple(max(truncated(n), 0) for n in branches)
+        return continuous, tuple(max(truncate(n), 0) for n in branches)
     each, left = divmod(together, max(previous, 1))
     return continuous, tuple(each + (i < left) for i in range(max(previous, 1))) if together >= previous else ()

@@ -24,7 +24,7 @@ from converters.consumers.unity.model import (
     VERSION,
     CheckedModel,
     InputView,
-    truncated,
+    truncate,
 )
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from converters.formats.barracuda.format import NnModel, four_axes
@@ -61,7 +61,7 @@ class BarracudaModel(CheckedModel):
                     f"give {name} a value; it is empty",
                 )
             )
-        return truncated(found[0])
+        return truncate(found[0])
 
     _deprecated = _first_of_shape = _first
     _shape = constant
@@ -76,10 +76,10 @@ class BarracudaModel(CheckedModel):
         """The memory's size; a NullReferenceException where the file has none."""
         return self._first(MEMORY_SIZE)
 
-    def fetched(self, deterministic: bool) -> tuple[str, ...]:
+    def fetched_outputs(self, deterministic: bool) -> tuple[str, ...]:
         """The outputs that a player fetches; finding them reads the version too."""
         self._first(VERSION)
-        return super().fetched(deterministic)
+        return super().fetched_outputs(deterministic)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class EarlierModel(BarracudaModel):
         """Whether actions come under names of their kind, which the first releases do not know."""
         return not self.action_alone and super().names_kinds
 
-    def fetched(self, deterministic: bool) -> tuple[str, ...]:
+    def fetched_outputs(self, deterministic: bool) -> tuple[str, ...]:
         """``action``, or the actions by their kinds, and the memories."""
         memory = self.kept if self.memory_size > 0 else ()
         if self.action_alone:
@@ -119,8 +119,8 @@ def of_onnx(file: OnnxFile, consumer: Consumer) -> BarracudaModel:
     kept = _keeps_all_nhwc(file) if not consumer.reads_version else None
     inputs = [_input(file, i.name, i.dims or (), kept) for i in file.inputs if i.name not in taken]
     found = {name: file.value(name) for name in file.outputs}
-    constants = {trimmed(n): v.astype(np.float64).ravel() for n, v in found.items() if v is not None}
-    outputs = tuple(trimmed(n) for n in file.outputs)
+    constants = {trim_index(n): v.astype(np.float64).ravel() for n, v in found.items() if v is not None}
+    outputs = tuple(trim_index(n) for n in file.outputs)
     if consumer.reads_version:
         return BarracudaModel(tuple(inputs), outputs, memories, constants)
     return EarlierModel(tuple(inputs), outputs, memories, constants, (), consumer.fetches_action_alone)
@@ -145,7 +145,7 @@ def of_nn(model: NnModel, consumer: Consumer) -> BarracudaModel:
     return EarlierModel(tuple(inputs), outputs, memories, constants, kept, consumer.fetches_action_alone)
 
 
-def trimmed(name: str) -> str:
+def trim_index(name: str) -> str:
     """A name without the ``:0`` that TensorFlow's exporters leave."""
     return name.removesuffix(":0")
 
@@ -160,7 +160,7 @@ def _input(file: OnnxFile, name: str, dims: Dims, keeps_nhwc: bool | None) -> In
         channels = lengths[1]
         width = lengths[-1] if len(lengths) > 2 else 1
         height = lengths[-2] if len(lengths) > 3 else 1
-    return InputView(trimmed(name), height, width, channels, channels)
+    return InputView(trim_index(name), height, width, channels, channels)
 
 
 def _kept_nhwc(file: OnnxFile, name: str) -> bool:
@@ -211,7 +211,7 @@ def _memories(file: OnnxFile) -> tuple[tuple[str, ...], set[str]]:
         source = _cut_from(file, node.input[_INITIAL_H])
         if source in declared:
             taken.add(source)
-            base = trimmed(source)
+            base = trim_index(source)
             found += [f"{base}_c", f"{base}_h"]
         else:
             found += [f"{node.output[0]}_wm_h", f"{node.output[0]}_wm_c"]

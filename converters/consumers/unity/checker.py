@@ -172,7 +172,7 @@ def check_onnx(file: OnnxFile, path: Path, consumer: Consumer, brain: Brain | No
         model = barracuda_model.of_onnx(file, consumer)
     else:
         model = sentis_model.of_onnx(file, consumer)
-    return _imported(path, consumer, brain, model, onnx_ranks(file, model), file, wrong)
+    return _verdict_on_import(path, consumer, brain, model, onnx_ranks(file, model), file, wrong)
 
 
 def _check_nn_file(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:
@@ -192,10 +192,12 @@ def _check_nn_file(path: Path, consumer: Consumer, brain: Brain | None) -> Unity
 
 def check_nn(parsed: nn_format.NnModel, path: Path, consumer: Consumer, brain: Brain | None = None) -> UnityVerdict:
     """The same of a ``.nn`` that is parsed already, by a release on Barracuda."""
-    return _imported(path, consumer, brain, barracuda_model.of_nn(parsed, consumer), nn_ranks(parsed), nn=parsed)
+    return _verdict_on_import(
+        path, consumer, brain, barracuda_model.of_nn(parsed, consumer), nn_ranks(parsed), nn=parsed
+    )
 
 
-def _imported(
+def _verdict_on_import(
     path: Path,
     consumer: Consumer,
     brain: Brain | None,
@@ -212,7 +214,7 @@ def _imported(
     modes = {}
     for name in modes_of(consumer):
         judged = _mode(model, consumer, agent, MODES[name], file)
-        modes[name] = replace(judged, played=_played(judged, consumer, model, agent, file, nn))
+        modes[name] = replace(judged, played=_play(judged, consumer, model, agent, file, nn))
     return UnityVerdict(path, consumer, agent, None, modes, wrong, brain is None)
 
 
@@ -220,12 +222,12 @@ def _mode(
     model: CheckedModel, consumer: Consumer, brain: Brain, deterministic: bool, file: OnnxFile | None
 ) -> ModeVerdict:
     if isinstance(model, sentis_model.SentisModel) and file is not None:
-        thrown = sentis_model.failure(file, consumer) or _tried(lambda: model.load(deterministic))
+        thrown = sentis_model.failure(file, consumer) or _try(lambda: model.load(deterministic))
         if thrown is not None:
             return ModeVerdict(thrown, (), thrown, thrown)
-    checks = _tried(lambda: rules.check(model, brain, deterministic, consumer))
-    fetched = _tried(lambda: model.fetched(deterministic))
-    load = _tried(lambda: rules.version_error(model, consumer.profile)) if consumer.reads_version else None
+    checks = _try(lambda: rules.check(model, brain, deterministic, consumer))
+    fetched = _try(lambda: model.fetched_outputs(deterministic))
+    load = _try(lambda: rules.version_error(model, consumer.profile)) if consumer.reads_version else None
     if isinstance(load, Finding):
         load = Thrown("UnityAgentsException", load.message, load.where, load.fix)
     if isinstance(checks, Thrown):
@@ -233,7 +235,7 @@ def _mode(
     return ModeVerdict(load, tuple(checks), None, fetched)
 
 
-def _played(
+def _play(
     judged: ModeVerdict,
     consumer: Consumer,
     model: CheckedModel,
@@ -248,7 +250,7 @@ def _played(
     return play(Scene(consumer, model, brain, judged.fetched, file, nn))
 
 
-def _tried(step: Callable[[], _Result]) -> _Result | Thrown:
+def _try(step: Callable[[], _Result]) -> _Result | Thrown:
     """What a step gives, or what it throws."""
     try:
         return step()

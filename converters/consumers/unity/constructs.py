@@ -48,7 +48,7 @@ class Operand:
         return None if self.shape is None else len(self.shape)
 
     @property
-    def fixed(self) -> bool:
+    def is_constant(self) -> bool:
         """Whether it is a constant, turned or not."""
         return self.source in (Source.CONSTANT, Source.TURNED)
 

@@ -10,7 +10,7 @@ from converters.consumers.unity.model import ACTION, CONTINUOUS
 from converters.consumers.unity.scene import Port, Scene
 
 
-def sensed(port: Port) -> int:
+def sensor_size(port: Port) -> int:
     """The numbers that the sensor gives."""
     return math.prod(port.sensor)
 
@@ -55,7 +55,7 @@ def turned_picture(port: Port, scene: Scene) -> bool:
 def _last_place(port: Port) -> int:
     assert port.view is not None
     if len(port.sensor) < 3:
-        return sensed(port) - 1
+        return sensor_size(port) - 1
     channels, height, width = port.sensor
     return ((height - 1) * port.view.width + width - 1) * port.view.channels + channels - 1
 
@@ -65,7 +65,7 @@ def reads_entities_transposed(port: Port, scene: Scene) -> bool:
     return len(port.sensor) == 2 and min(port.sensor) > 1 and not reads_flat(port.name, scene.file, scene.nn)
 
 
-def wanted(port: Port, scene: Scene) -> int:
+def action_width(port: Port, scene: Scene) -> int:
     """The columns that the agent takes of an action."""
     brain = scene.brain
     if port.name.endswith(CONTINUOUS) or (port.name == ACTION and brain.continuous):
@@ -75,17 +75,17 @@ def wanted(port: Port, scene: Scene) -> int:
 
 def gives_too_few(port: Port, scene: Scene) -> bool:
     """Whether actions have fewer columns than the agent takes."""
-    return port.dims is not None and len(port.dims) > 1 and port.size < wanted(port, scene)
+    return port.dims is not None and len(port.dims) > 1 and port.size < action_width(port, scene)
 
 
 def gives_too_many(port: Port, scene: Scene) -> bool:
     """Whether actions have more columns than the agent takes, and it takes some."""
-    return port.dims is not None and len(port.dims) > 1 and port.size > wanted(port, scene) > 0
+    return port.dims is not None and len(port.dims) > 1 and port.size > action_width(port, scene) > 0
 
 
 def given_off_channels(port: Port, scene: Scene) -> bool:
     """Whether actions lie on other axes than the second."""
-    if port.dims is None or wanted(port, scene) < 2:
+    if port.dims is None or action_width(port, scene) < 2:
         return False
     return len(port.dims) < 2 or port.size != port.lengths[0]
 
@@ -104,7 +104,7 @@ def fields(port: Port, scene: Scene) -> Mapping[str, object]:
         "sensor_lengths": ", ".join(map(str, port.sensor)),
         "declare": f"[{', '.join(map(str, ('N', *port.sensor)))}]",
         "axes": len(port.sensor) + 1,
-        "wanted": sensed(port) if port.sensor else _columns(port, scene),
+        "wanted": sensor_size(port) if port.sensor else _columns(port, scene),
         "batch": free,
         "expected": f"({', '.join('d0' if d is None else str(d) for d in declared)})",
         "received": f"({', '.join(map(str, ('N', *lengths)))})",
@@ -115,4 +115,4 @@ def fields(port: Port, scene: Scene) -> Mapping[str, object]:
 
 
 def _columns(port: Port, scene: Scene) -> int:
-    return sum(scene.brain.branches) if port.view is not None else wanted(port, scene)
+    return sum(scene.brain.branches) if port.view is not None else action_width(port, scene)

@@ -87,7 +87,7 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
                 f"node {layer} (Flatten)",
                 "write a Reshape; --for barracuda-3 does",
             )
-        why = _refused(file, node, layer)
+        why = _refusal_of(file, node, layer)
         if why is not None:
             yield Thrown(
                 "OnnxImportException",
@@ -115,7 +115,7 @@ def _loses_rank(file: OnnxFile, name: str) -> bool:
     return False
 
 
-def _refused(file: OnnxFile, node: Any, layer: str) -> str | None:
+def _refusal_of(file: OnnxFile, node: Any, layer: str) -> str | None:
     """What is said to an operator in a form that is not taken; None to every other."""
     held, given = attributes(node), dict(enumerate(node.input))
     match node.op_type:

@@ -59,7 +59,7 @@ class CheckedModel(ABC):
         """The memory's size, 0 for none."""
 
     @abstractmethod
-    def _deprecated(self, name: str) -> int:
+    def _deprecated_number(self, name: str) -> int:
         """The number of one of the deprecated pair; throws where it is not there."""
 
     @abstractmethod
@@ -73,29 +73,29 @@ class CheckedModel(ABC):
     def has_continuous(self, deterministic: bool) -> bool:
         """Whether there are continuous actions to fetch: by output and shape, or by ``is_continuous_control``."""
         if not self.names_kinds:
-            return self._deprecated(IS_CONTINUOUS) > 0
+            return self._deprecated_number(IS_CONTINUOUS) > 0
         return self.has_output(action_output(CONTINUOUS, deterministic)) and self._first_of_shape(CONTINUOUS_SHAPE) > 0
 
     def has_discrete(self, deterministic: bool) -> bool:
         """Whether there are discrete actions to fetch: by output and shape, or by ``is_continuous_control``."""
         if not self.names_kinds:
-            return self._deprecated(IS_CONTINUOUS) == 0
+            return self._deprecated_number(IS_CONTINUOUS) == 0
         return self.has_output(action_output(DISCRETE, deterministic)) and self.discrete_size > 0
 
     @property
     def continuous_size(self) -> int:
         """The number of continuous actions that the model says it has."""
         if not self.names_kinds:
-            return self._deprecated(ACTION_SHAPE) if self._deprecated(IS_CONTINUOUS) > 0 else 0
+            return self._deprecated_number(ACTION_SHAPE) if self._deprecated_number(IS_CONTINUOUS) > 0 else 0
         return 0 if self._shape(CONTINUOUS_SHAPE) is None else self._first_of_shape(CONTINUOUS_SHAPE)
 
     @property
     def discrete_size(self) -> int:
         """The sum of the branches that the model says it has."""
         if not self.names_kinds:
-            return 0 if self._deprecated(IS_CONTINUOUS) > 0 else self._deprecated(ACTION_SHAPE)
+            return 0 if self._deprecated_number(IS_CONTINUOUS) > 0 else self._deprecated_number(ACTION_SHAPE)
         shape = self._shape(DISCRETE_SHAPE)
-        return 0 if shape is None else sum(map(truncated, shape))
+        return 0 if shape is None else sum(map(truncate, shape))
 
     def has_output(self, name: str) -> bool:
         """Whether an output is found under this name."""
@@ -113,7 +113,7 @@ class CheckedModel(ABC):
         """Inputs and the memories that the runtime manages."""
         return (*(i.name for i in self.inputs), *self.memories)
 
-    def fetched(self, deterministic: bool) -> tuple[str, ...]:
+    def fetched_outputs(self, deterministic: bool) -> tuple[str, ...]:
         """The outputs that a player fetches."""
         kinds = ((CONTINUOUS, self.has_continuous(deterministic)), (DISCRETE, self.has_discrete(deterministic)))
         names = [action_output(name, deterministic) for name, there in kinds if there]
@@ -127,7 +127,7 @@ def action_output(name: str, deterministic: bool) -> str:
     return DETERMINISTIC + name if deterministic else name
 
 
-def truncated(value: float) -> int:
+def truncate(value: float) -> int:
     """A float as C# casts it to int: towards zero; what does not fit becomes the most negative one."""
     number = float(value)
     return int(number) if abs(number) < -_MOST_NEGATIVE else _MOST_NEGATIVE

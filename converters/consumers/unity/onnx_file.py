@@ -80,7 +80,7 @@ class OnnxFile:
         return {name: node for node in self.model.graph.node for name in node.output if name}
 
     @cached_property
-    def fed(self) -> frozenset[str]:
+    def fed_values(self) -> frozenset[str]:
         """Values that hang on an input or on a draw: all that is no constant."""
         found = {i.name for i in self.inputs}
         for node in self.model.graph.node:
@@ -99,7 +99,7 @@ class OnnxFile:
 
     def is_constant(self, name: str) -> bool:
         """Whether a value is the same whatever is fed."""
-        return name not in self.fed and (name in self.initializers or name in self.producers)
+        return name not in self.fed_values and (name in self.initializers or name in self.producers)
 
     def is_stored(self, name: str) -> bool:
         """Whether Barracuda has a value when it imports: it looks through Identity and Transpose, and computes none."""
@@ -133,10 +133,10 @@ class OnnxFile:
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int | None, ...]]:
         """Value → shape, of a run in which every free length of an input is 1."""
-        return self._inferred[0]
+        return self._inferred_shapes[0]
 
     @cached_property
-    def _inferred(self) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
+    def _inferred_shapes(self) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
         return inferred_shapes(self)
 
     @property
@@ -145,7 +145,7 @@ class OnnxFile:
         graph = self.model.graph
         declared = (*graph.input, *graph.output, *graph.value_info)
         said = any(d.dim_value < 0 for value in declared for d in value.type.tensor_type.shape.dim)
-        return said or self._inferred[1]
+        return said or self._inferred_shapes[1]
 
 
 def parsed_onnx(data: bytes) -> OnnxFile:
@@ -215,15 +215,18 @@ def value_of(file: OnnxFile, name: str, fed: Mapping[str, np.ndarray]) -> np.nda
     values: dict[str, np.ndarray | None] = dict(fed)
     for node in file.model.graph.node:
         if id(node) in needed:
-            inputs = [_stored(file, n) if n in file.initializers else values.get(n) if n else None for n in node.input]
-            made = _computed(node, inputs, file.opset)
+            inputs = [
+                _read_initializer(file, n) if n in file.initializers else values.get(n) if n else None
+                for n in node.input
+            ]
+            made = _compute(node, inputs, file.opset)
             if made is None:
                 return None
             values.update(zip(node.output, made, strict=False))
-    return _stored(file, name) if name in file.initializers else values.get(name)
+    return _read_initializer(file, name) if name in file.initializers else values.get(name)
 
 
-def _stored(file: OnnxFile, name: str) -> np.ndarray | None:
+def _read_initializer(file: OnnxFile, name: str) -> np.ndarray | None:
     return _read(file.initializers[name])
 
 
@@ -243,7 +246,7 @@ def _narrow(tensor: Any) -> np.ndarray:
     return np.asarray(onnx.numpy_helper.to_array(tensor)).astype(np.float32)
 
 
-def _computed(node: Any, inputs: list[np.ndarray | None], opset: int) -> list[np.ndarray] | None:
+def _compute(node: Any, inputs: list[np.ndarray | None], opset: int) -> list[np.ndarray] | None:
     """A node's results, None where it is not computed."""
     if any(value is None and name for value, name in zip(inputs, node.input, strict=True)):
         return None
@@ -292,7 +295,7 @@ _SAYING = {**dict.fromkeys(_SECOND.split(), (1,)), "ConstantOfShape": (0,), "Sli
 
 def inferred_shapes(file: OnnxFile) -> tuple[Mapping[str, tuple[int | None, ...]], bool]:
     """(value → shape, of inputs, initializers and results; whether a length came out negative)."""
-    types, negative = _given(file), False
+    types, negative = _given_types(file), False
     for node in file.model.graph.node:
         if any(name and name not in types for name in node.input) or any(a.HasField("g") for a in node.attribute):
             continue
@@ -304,7 +307,7 @@ def inferred_shapes(file: OnnxFile) -> tuple[Mapping[str, tuple[int | None, ...]
     return {name: dims for name, kind in types.items() if (dims := _dims(kind)) is not None}, negative
 
 
-def _given(file: OnnxFile) -> dict[str, Any]:
+def _given_types(file: OnnxFile) -> dict[str, Any]:
     import onnx
 
     types = {}

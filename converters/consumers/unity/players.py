@@ -168,7 +168,7 @@ _SENTIS_INPUTS = (
         (OBSERVATION,),
         "narrower than the sensor",
         Outcome.WARNS,
-        lambda port, scene: port.size < forms.sensed(port),
+        lambda port, scene: port.size < forms.sensor_size(port),
         "{name} holds {size} numbers and the sensor gives {wanted}: what is too much is written behind the agent's "
         "row, for the last agent behind the tensor",
         "set the sensor to what the file was trained with",

@@ -68,7 +68,7 @@ def play(scene: Scene) -> tuple[Played, ...]:
 
 
 def _inputs(scene: Scene, player: Player) -> Iterator[Played]:
-    known = {*scene.sensed, *FED, *scene.model.memories}
+    known = {*scene.sensor_shapes, *FED, *scene.model.memories}
     for port in sorted(scene.inputs(), key=lambda p: culture_key(p.name)):
         if port.name not in known:
             yield Played(
@@ -83,15 +83,15 @@ def _inputs(scene: Scene, player: Player) -> Iterator[Played]:
         groups = {port.name}
         groups |= {OBSERVATION} if port.sensor else set()
         groups |= set() if port.name in ONE_NUMBER else {ANY}
-        yield from _told(player.inputs, groups, port, scene, "input")
+        yield from _matching_rows(player.inputs, groups, port, scene, "input")
 
 
 def _outputs(scene: Scene, player: Player) -> Iterator[Played]:
     for port in scene.outputs():
-        yield from _told(player.outputs, {port.name}, port, scene, "output")
+        yield from _matching_rows(player.outputs, {port.name}, port, scene, "output")
 
 
-def _told(rows: Sequence[Row], groups: set[str], port: Port, scene: Scene, kind: str) -> Iterator[Played]:
+def _matching_rows(rows: Sequence[Row], groups: set[str], port: Port, scene: Scene, kind: str) -> Iterator[Played]:
     for row in rows:
         if groups.intersection(row.of) and row.when(port, scene):
             words = fields(port, scene)

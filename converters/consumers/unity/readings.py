@@ -77,12 +77,12 @@ def misread_ops(importers: Sequence[str]) -> frozenset[str]:
 # ------------------------------------------------------------------ forms
 
 
-def _computed(index: int) -> Callable[[Construct], bool]:
+def _is_computed(index: int) -> Callable[[Construct], bool]:
     """There is an operand at ``index``, and it is no constant."""
     return lambda c: c.operand(index).source in (Source.COMPUTED, Source.INPUT, Source.COPIED)
 
 
-def _given(index: int) -> Callable[[Construct], bool]:
+def _is_given(index: int) -> Callable[[Construct], bool]:
     return lambda c: c.operand(index).source is not Source.ABSENT
 
 
@@ -134,7 +134,7 @@ def _bias_of_one(c: Construct) -> bool:
     return weights[0 if c.attribute("transB", 0) else 1] != 1
 
 
-def _scaled(c: Construct) -> bool:
+def _is_scaled(c: Construct) -> bool:
     return float(c.attribute("alpha", 1.0)) != 1.0 or float(c.attribute("beta", 1.0)) != 1.0
 
 
@@ -279,7 +279,7 @@ def _dropped_batch(c: Construct) -> bool:
     return _rank(c.operand(0)) == 4 and list(axes) == [0, 1]
 
 
-def _seen(c: Construct) -> bool:
+def _reaches_output(c: Construct) -> bool:
     """A Shape that ends in an output."""
     stack, seen = list(c.readers()), set()
     while stack:
@@ -316,9 +316,9 @@ def _rules() -> Iterator[Rule]:
     sums = ("ReduceSum", "ReduceMean")
     reductions = (*sums, "ReduceMax", "ReduceMin", "ReduceProd")
     yield Rule(
-        reductions, wrong, old, "axes as an operand are not read: it reduces the batch", "ReduceSum_10", _given(1)
+        reductions, wrong, old, "axes as an operand are not read: it reduces the batch", "ReduceSum_10", _is_given(1)
     )
-    yield Rule(reductions, refused, FIRST, "axes as an operand are not read", "ReduceSum_10", _given(1))
+    yield Rule(reductions, refused, FIRST, "axes as an operand are not read", "ReduceSum_10", _is_given(1))
     yield Rule(reductions, wrong, LATER, "without axes it reduces the batch alone", "ReduceSum_05", _without_axes)
     yield Rule(reductions, refused, FIRST, "without axes", "ReduceSum_05", _without_axes)
     yield Rule(reductions, fails, FIRST, "over the last axis of rank 3 or 4", "ReduceSum_06", _deep_last_axis)
@@ -338,27 +338,29 @@ def _rules() -> Iterator[Rule]:
     sizes = "the sizes are read from the attribute alone"
     yield Rule(("Split",), refused, LATER, sizes, "Split_04", lambda c: c.attribute("split") is None)
     axes = "axes as an operand are read from 2.3.1 on"
-    yield Rule(("Squeeze", "Unsqueeze"), refused, BEFORE_2_3, axes, "Squeeze_04", _given(1))
+    yield Rule(("Squeeze", "Unsqueeze"), refused, BEFORE_2_3, axes, "Squeeze_04", _is_given(1))
     yield Rule(("Squeeze",), wrong, LATER, "two leading axes at once, batch above 1", "LSTM_01", _dropped_batch)
-    yield Rule(("Reshape",), fails, LATER, "a computed shape, batch above 1", "Reshape_08", _computed(1))
+    yield Rule(("Reshape",), fails, LATER, "a computed shape, batch above 1", "Reshape_08", _is_computed(1))
     flat = "the elements come in another order"
     yield Rule(("Reshape", "Flatten"), wrong, FIRST, flat, "Reshape_01", _flat_in_first)
     yield Rule(("Concat",), refused, FIRST, "a flattened image cannot be joined", "Conv_21", _joined_after_flattening)
     yield Rule(("Flatten",), wrong, FROM_1_4_TO_2_0, f"of a convolution: {flat}", "Conv_18", _flattened_conv)
 
-    yield Rule(("Gemm",), wrong, BARRACUDA, "alpha and beta are not read", "Gemm_04", _scaled)
-    yield Rule(("Gemm",), refused, FROM_2_3, "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).fixed))
+    yield Rule(("Gemm",), wrong, BARRACUDA, "alpha and beta are not read", "Gemm_04", _is_scaled)
+    yield Rule(
+        ("Gemm",), refused, FROM_2_3, "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).is_constant)
+    )
     yield Rule(("Gemm",), fails, BARRACUDA, "C of one element is not spread", "Gemm_07", _bias_of_one)
     yield Rule(("Gemm",), wrong, BARRACUDA, "C of shape [1, n] is dropped", "Gemm_08", _bias_is_row)
-    yield Rule(("Gemm",), wrong, BARRACUDA, "a computed C is dropped", "Gemm_12", _computed(2))
-    yield Rule(("Gemm",), refused, FROM_1_4_TO_2_0, "B is computed", "Gemm_10", _computed(1))
-    matrix = _all(_computed(1), lambda c: c.operand(1).source is not Source.COPIED)
+    yield Rule(("Gemm",), wrong, BARRACUDA, "a computed C is dropped", "Gemm_12", _is_computed(2))
+    yield Rule(("Gemm",), refused, FROM_1_4_TO_2_0, "B is computed", "Gemm_10", _is_computed(1))
+    matrix = _all(_is_computed(1), lambda c: c.operand(1).source is not Source.COPIED)
     yield Rule(("Gemm",), refused, FIRST, "B is computed", "Gemm_10", matrix)
-    dropped = _all(_computed(1), _given(2))
+    dropped = _all(_is_computed(1), _is_given(2))
     yield Rule(("Gemm",), wrong, FROM_2_3, "C is dropped where B is computed", "Gemm_10", dropped)
-    constant = _all(_many_dims, lambda c: c.operand(1).fixed)
+    constant = _all(_many_dims, lambda c: c.operand(1).is_constant)
     yield Rule(("MatMul",), refused, FIRST, "of rank 3 by a constant", "MatMul_05", constant)
-    computed = _all(_many_dims, lambda c: not c.operand(1).fixed)
+    computed = _all(_many_dims, lambda c: not c.operand(1).is_constant)
     yield Rule(("MatMul",), fails, FIRST, "of rank 3 and above", "MatMul_06", computed)
 
     last = _all(lambda c: bool(c.attribute("select_last_index", 0)))
@@ -366,7 +368,7 @@ def _rules() -> Iterator[Rule]:
     truncated = _all(_cast_to("i"), lambda c: _fraction(c.operand(0), c))
     yield Rule(("Cast",), wrong, BARRACUDA, "to an integer: fractions are kept", "Cast_01", truncated)
     yield Rule(("Cast",), wrong, EVERY, "to bool: the value is kept", "Cast_03", _not_zero_or_one)
-    bounds = _all(lambda c: _computed(1)(c) or _computed(2)(c))
+    bounds = _all(lambda c: _is_computed(1)(c) or _is_computed(2)(c))
     yield Rule(("Clip",), wrong, LATER, "a computed bound is not read", "Clip_07", bounds)
     yield Rule(("Clip",), refused, FIRST, "a computed bound is not read", "Clip_07", bounds)
 
@@ -391,13 +393,13 @@ def _rules() -> Iterator[Rule]:
     yield Rule(("Transpose",), fails, FIRST, "of an NHWC input", "Conv_15", hidden)
     unknown = "Barracuda 1.4 and later"
     says = f"to a constant shape, batch above 1; {unknown} do"
-    yield Rule(("Expand",), fails, FIRST, says, "Expand_01", lambda c: c.operand(1).fixed)
-    yield Rule(("Shape",), wrong, LATER, "as an output: the batch is that of the import", "Shape_01", _seen)
+    yield Rule(("Expand",), fails, FIRST, says, "Expand_01", lambda c: c.operand(1).is_constant)
+    yield Rule(("Shape",), wrong, LATER, "as an output: the batch is that of the import", "Shape_01", _reaches_output)
     yield Rule(("TopK",), fails, FIRST, f"{unknown} run it", "TopK_01")
     yield Rule(("ScatterND",), wrong, FROM_2_3, "other values", "ScatterND_01")
 
     yield Rule(("Conv",), fails, BARRACUDA, "groups of several channels", "Conv_11", _groups)
-    yield Rule(("Conv",), refused, BARRACUDA, "computed weights", "Conv_14", _computed(1))
+    yield Rule(("Conv",), refused, BARRACUDA, "computed weights", "Conv_14", _is_computed(1))
     uneven_by = "lengths that differ by axis: heights are taken for widths"
     played = "cases/rank2_barracuda-3"
     yield Rule(("Conv",), fails, BARRACUDA, f"strides of {uneven_by}", played, _uneven("strides"))
@@ -407,7 +409,7 @@ def _rules() -> Iterator[Rule]:
     yield Rule(("MaxPool", "AveragePool"), wrong, EVERY, "ceil_mode is not read", "MaxPool_04", ceiling)
     padded = _all(lambda c: bool(c.attribute("count_include_pad", 0)))
     yield Rule(("AveragePool",), wrong, EVERY, "count_include_pad is not read", "AveragePool_03", padded)
-    yield Rule(("Pad",), wrong, FIRST, "pads as an operand are not read", "Pad_02", _given(1))
+    yield Rule(("Pad",), wrong, FIRST, "pads as an operand are not read", "Pad_02", _is_given(1))
     yield Rule(("Softmax", "LogSoftmax"), wrong, EVERY, "read as of opset 13", "Softmax_08", _old_softmax)
     soft = _all(lambda c: _rank(c.operand(0)) > 2, lambda c: not _old_softmax(c))
     yield Rule(("Softmax", "LogSoftmax"), wrong, FIRST, "of rank 3", "Softmax_06", soft)
@@ -416,7 +418,7 @@ def _rules() -> Iterator[Rule]:
     yield Rule(("LSTM",), refused, BARRACUDA, "without B", "LSTM_03", _missing(3))
     both = _all(lambda c: c.attribute("direction", b"forward") != b"forward")
     yield Rule(("LSTM",), refused, BARRACUDA, "only forward", "LSTM_06", both)
-    yield Rule(("LSTM",), fails, FIRST, "its memory is not found", "LSTM_01", _all(_given(3), _given(5)))
+    yield Rule(("LSTM",), fails, FIRST, "its memory is not found", "LSTM_01", _all(_is_given(3), _is_given(5)))
     yield Rule(("LSTM",), refused, FIRST, "without a first state", "LSTM_02", _missing(5))
 
     yield Rule(("Sub", "Div"), wrong, FIRST, "a constant first operand: they are swapped", "Sub_01", _constant_first)

@@ -27,7 +27,7 @@ from converters.consumers.unity.model import (
     CheckedModel,
     InputView,
     action_output,
-    truncated,
+    truncate,
 )
 from converters.consumers.unity.settings import Brain, Sensor
 
@@ -52,7 +52,7 @@ def check(model: CheckedModel, brain: Brain, deterministic: bool, consumer: Cons
 
 
 def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str, known: Checks) -> Findings:
-    missing = next(_expected(model, deterministic, profile, known), None)
+    missing = next(_missing_constants(model, deterministic, profile, known), None)
     if missing is not None:
         yield missing
         return
@@ -126,7 +126,7 @@ def _another_version(version: int, profile: str) -> Finding:
     return Finding(Severity.ERROR, text, f"constant {VERSION}", f"no retraining is needed: use --for {profile}")
 
 
-def _expected(model: CheckedModel, deterministic: bool, profile: str, known: Checks) -> Findings:
+def _missing_constants(model: CheckedModel, deterministic: bool, profile: str, known: Checks) -> Findings:
     """Each would end the check; the first does."""
     for name in (VERSION, MEMORY_SIZE):
         if model.constant(name) is None:
@@ -361,7 +361,7 @@ def _actions(model: CheckedModel, brain: Brain) -> Findings:
         yield _branches(f"{sum(brain.branches)}", f"{model.discrete_size}", "the branch sizes together")
     elif model.version == LAST_VERSION:
         found = model.constant(DISCRETE_SHAPE)
-        held = () if found is None else tuple(truncated(n) for n in found)
+        held = () if found is None else tuple(truncate(n) for n in found)
         if len(held) != len(brain.branches):
             yield _branches(f"{len(brain.branches)} branches", f"{len(held)}", f"Branch Sizes to {list(held)}, which")
         else:

@@ -59,8 +59,8 @@ class Scene:
 
     def inputs(self) -> Iterator[Port]:
         """The inputs that the player fills."""
-        sensed = self.sensed
-        declared = {} if self.file is None else {self.named(i.name): i for i in self.file.inputs}
+        sensed = self.sensor_shapes
+        declared = {} if self.file is None else {self.imported_name(i.name): i for i in self.file.inputs}
         for index, view in enumerate(self.model.inputs):
             given = declared.get(view.name)
             dims, whole = (None, False) if given is None else (given.dims or (), not given.is_float)
@@ -71,13 +71,13 @@ class Scene:
         if self.file is None:
             yield from (Port(name, 0, None) for name in self.fetched if name in self.model.outputs)
             return
-        shapes = {self.named(name): shape for name, shape in self.file.shapes.items()}
+        shapes = {self.imported_name(name): shape for name, shape in self.file.shapes.items()}
         for value in self.file.model.graph.output:
-            name = self.named(value.name)
+            name = self.imported_name(value.name)
             if name in self.fetched:
                 yield Port(name, 0, shapes.get(name), value.type.tensor_type.elem_type in _INTEGERS)
 
-    def named(self, name: str) -> str:
+    def imported_name(self, name: str) -> str:
         """A name as the importer keeps it."""
         return name.removesuffix(":0") if self.consumer.strips_zero else name
 
@@ -87,7 +87,7 @@ class Scene:
         return not self.consumer.reads_version or self.model.version == FIRST_VERSION
 
     @property
-    def sensed(self) -> Mapping[str, tuple[int, ...]]:
+    def sensor_shapes(self) -> Mapping[str, tuple[int, ...]]:
         """Name of each observation that the agent has → the shape of its sensor; vectors go together in version 2."""
         sensors = [sensor.shape for sensor in self.brain.sensors]
         if not self.old_names:

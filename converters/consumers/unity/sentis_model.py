@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from converters.consumers.unity.barracuda_model import trimmed
+from converters.consumers.unity.barracuda_model import trim_index
 from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
 from converters.consumers.unity.model import (
@@ -30,7 +30,7 @@ from converters.consumers.unity.model import (
     VERSION,
     CheckedModel,
     InputView,
-    truncated,
+    truncate,
 )
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from signatures.records import dataclass
@@ -91,13 +91,13 @@ class SentisModel(CheckedModel):
     def _first_of_shape(self, name: str) -> int:
         """0 where it is not there."""
         found = self._shape(name)
-        return 0 if found is None or not found.size else truncated(found[0])
+        return 0 if found is None or not found.size else truncate(found[0])
 
-    def _deprecated(self, name: str) -> int:
+    def _deprecated_number(self, name: str) -> int:
         found = self._read(name, _INT32)
         if found is None:
             raise UnityThrows(null_reference(f"constant {name}", f"name the actions {CONTINUOUS} or {DISCRETE}"))
-        return truncated(found[0]) if found.size else 0
+        return truncate(found[0]) if found.size else 0
 
     @cached_property
     def version(self) -> int:
@@ -115,7 +115,7 @@ def of_onnx(file: OnnxFile, consumer: Consumer) -> SentisModel:
     """The model that the importer makes; ``importing.refusal`` has said before that it takes the file."""
 
     def name_of(name: str) -> str:
-        return trimmed(name) if consumer.strips_zero else name
+        return trim_index(name) if consumer.strips_zero else name
 
     read = (VERSION, MEMORY_SIZE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, ACTION_SHAPE)
     values = {name_of(n): file.trial_value(n) for n in file.outputs if name_of(n) in read}
