@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from converters.compiler.options import CompileOptions
-from converters.formats.barracuda.answers import NnPolicy, answered, contract_of
+from converters.formats.barracuda.answers import NnPolicy, answered_outputs, contract_of
 from converters.formats.barracuda.format import parse
 from converters.formats.barracuda.writer import encode
 from converters.formats.format import WriteOptions
@@ -45,7 +45,7 @@ def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str
         (data,) = WRITTEN["nn"].artifact(policy, contract).files.values()
         nn = NnPolicy(data.to_bytes())
         assert nn.signature.to_dict() == signature.to_dict()
-        names = answered(signature)
+        names = answered_outputs(signature)
         assert names == [s.name for s in signature.outputs if s.role is not Role.SAMPLED]
         for rows in (1, 3):
             feeds = some(policy, rows)
@@ -65,7 +65,7 @@ def test_what_a_nn_has_no_name_for_is_not_answered_by_its_action(role: Role) -> 
     signature = replace(signature, outputs=(*signature.outputs, extra))
     more = replace(policy, signature=signature, fetches={**policy.fetches, "extra": policy.fetches["value_estimate"]})
     (data,) = WRITTEN["nn"].artifact(more, WriteOptions(json.dumps(signature.to_dict()))).files.values()
-    names = answered(signature)
+    names = answered_outputs(signature)
     assert names == [s.name for s in policy.signature.outputs]
     feeds = some(policy, 3)
     assert NnPolicy(data.to_bytes()).run(feeds, names).keys() == run_graph(policy.graph, feeds, names).keys()

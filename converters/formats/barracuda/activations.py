@@ -42,7 +42,7 @@ def activate(b: LayerBuilder, number: int, x: Value, *, axis: int = -1, fused: b
     if number == Activation.NONE:
         return x
     if fused and number in (*_PARAMETRIC, Activation.PRELU):
-        raise b.unsupported(
+        raise b.unsupported_error(
             f"{activation_label(number)} is fused into it",
             "Unity drops the parameters of a fused activation, so what it computed is not known",
         )
@@ -56,14 +56,14 @@ def activate(b: LayerBuilder, number: int, x: Value, *, axis: int = -1, fused: b
         return Value(_FUNCTIONS[number](b, x.reference), x.shape)
     if number in _PARAMETRIC:
         return Value(_PARAMETRIC[number](b, x.reference, b.layer.alpha, b.layer.beta), x.shape)
-    raise b.unsupported(f"its activation is {activation_label(number)}", "no formula of it is known")
+    raise b.unsupported_error(f"its activation is {activation_label(number)}", "no formula of it is known")
 
 
 def prelu(b: LayerBuilder, x: Value, slope: Value) -> Value:
     """max(0, x) + slope·min(0, x)."""
     (data, factor), shape = b.operands([x, slope])
     if shape != x.shape:
-        raise b.damaged(
+        raise b.damaged_error(
             f"slopes of shape {list(slope.shape)} for {list(x.shape)}", "there are more slopes than numbers"
         )
     return Value(nn.prelu(b, data, factor), shape)
@@ -77,11 +77,11 @@ def _over_rows(b: LayerBuilder, kind: Activation, x: Value, axis: int) -> Value:
     along_channels = axis in (-1, 7)
     if x.rank == 4 and b.version > 16:
         if not along_channels or b.version == 17:
-            raise b.unsupported(
+            raise b.unsupported_error(
                 f"{activation_label(kind)} of a tensor of shape {list(x.shape)}, axis {axis}",
                 "Barracuda 1.x took the whole row, later versions an axis; only an axis of channels is known for sure",
             )
         return Value(_ROWS[kind](b, x.reference), x.shape)
     if b.version > 16 and not along_channels:
-        raise b.unsupported(f"{activation_label(kind)} along axis {axis}", "that axis is not the channels'")
+        raise b.unsupported_error(f"{activation_label(kind)} along axis {axis}", "that axis is not the channels'")
     return b.rows(_ROWS[kind](b, b.as_matrix(x)), x.shape[0], x.size)

@@ -46,7 +46,7 @@ def contract_of(model: NnModel) -> PolicySignature:
 _UNWRITTEN = (Role.OTHER, Role.Q_VALUES, Role.LOG_PROB, Role.STD, Role.LOG_STD)
 
 
-def answered(signature: PolicySignature) -> list[str]:
+def answered_outputs(signature: PolicySignature) -> list[str]:
     """The outputs of a policy that its ``.nn`` answers.
 
     A drawn class has no place in one of API version 2: ML-Agents draws it from the log-probabilities. Nor has the
@@ -76,7 +76,7 @@ class NnPolicy:
 
     def run(self, feeds: Arrays, fetch: Sequence[str], jitter: Jitter | None = None) -> dict[str, Array]:
         """Outputs by their names in the contract."""
-        placed = self._placed(feeds)
+        placed = self._place_feeds(feeds)
         specs = [self.signature.output(name) for name in fetch]
         quiet = [s for s in specs if self._is_quiet(s)]
         names = {self._tensor(s) for s in specs if s not in quiet}
@@ -93,18 +93,18 @@ class NnPolicy:
 
     # ------------------------------------------------------------------ inputs
 
-    def _placed(self, feeds: Arrays) -> dict[str, Array]:
+    def _place_feeds(self, feeds: Arrays) -> dict[str, Array]:
         signature = self.signature
         rows = signature.rows(feeds)
         if self._dressed:
-            laid = {s.name: self._laid(s, feeds[s.name]) for s in signature.inputs if s.name in self._places}
+            laid = {s.name: self._channels_last(s, feeds[s.name]) for s in signature.inputs if s.name in self._places}
             return {n: a.astype(self._places[n].attrs["dtype"]) for n, a in laid.items()}
         found: dict[str, Array] = {}
         vectors = [feeds[s.name].reshape(rows, -1) for s in signature.inputs if s.role is Role.VECTOR]
         if vectors:
             found["vector_observation"] = np.concatenate(vectors, axis=1)
         for number, spec in enumerate(s for s in signature.inputs if s.role is Role.VISUAL):
-            found[f"visual_observation_{number}"] = self._laid(spec, feeds[spec.name])
+            found[f"visual_observation_{number}"] = self._channels_last(spec, feeds[spec.name])
         for role, name in INPUT_NAMES.items():
             for number, spec in enumerate(s for s in signature.inputs if s.role is role):
                 given = name if number == 0 else self._samplers[number - 1]
@@ -118,7 +118,7 @@ class NnPolicy:
         kept = {n: a.astype(self._places[n].attrs["dtype"]) for n, a in found.items() if n in self._places}
         return kept | {n: a.astype(np.float32) for n, a in found.items() if n in self._samplers}
 
-    def _laid(self, spec: TensorSpec, array: Array) -> Array:
+    def _channels_last(self, spec: TensorSpec, array: Array) -> Array:
         """An input as the file has it: images with their colours last."""
         if spec.role is Role.VISUAL and self.signature.preprocess.get(spec.name, {}).get("layout") == "NCHW":
             return array.transpose(0, 2, 3, 1)

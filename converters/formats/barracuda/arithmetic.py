@@ -34,7 +34,7 @@ _REDUCED: Mapping[int, reduction.Reduction] = {
 }
 
 
-def folded(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def fold_inputs(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The inputs combined from left to right: ((a − b) − c) …; the mean divides the sum by their number."""
     kind, total = LayerType(b.layer.type), args[0]
     for value in args[1:]:
@@ -45,7 +45,7 @@ def folded(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return total
 
 
-def compared(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def compare_operands(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """1 where the comparison holds, else 0."""
     operands, shape = b.operands(args)
     return _as_float(b, b.add(COMPARISONS[b.layer.type], operands), shape)
@@ -84,18 +84,18 @@ def _as_float(b: LayerBuilder, truth: str, shape: Shape) -> Value:
     return Value(b.add("Cast", [truth], DstT=FLOAT32), shape)
 
 
-def reduced(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def reduce_axis(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """One number per row along an axis, which stays with length 1. A second input names the axis and is ignored."""
     x = args[0]
     axis = axis_of(b, b.layer.axis)
     if axis == N:
-        raise b.unsupported("it reduces over the batch", "an agent's action would depend on the other agents")
+        raise b.unsupported_error("it reduces over the batch", "an agent's action would depend on the other agents")
     small = x.shape[1:3] == (1, 1)
     data, along = (b.as_matrix(x), 1) if small and axis == C else (b.as_image(x), axis)
     shape = with_length(x.shape, axis, 1)
     kind = LayerType(b.layer.type)
     if kind in (LayerType.ARG_MAX, LayerType.ARG_MIN):
         best = b.add("ArgMax" if kind is LayerType.ARG_MAX else "ArgMin", [data, b.ints(along, "axis")])
-        return b.shaped(b.add("Cast", [best], DstT=FLOAT32), shape, best if small else None)
+        return b.as_shape(b.add("Cast", [best], DstT=FLOAT32), shape, best if small else None)
     result = _REDUCED[kind](b, data, [along], True)
-    return b.rows(result, shape[0], shape[3]) if small and axis == C else b.shaped(result, shape)
+    return b.rows(result, shape[0], shape[3]) if small and axis == C else b.as_shape(result, shape)

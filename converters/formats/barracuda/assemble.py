@@ -16,7 +16,7 @@ from signatures.errors import UnsupportedOpError
 VERSION = 16
 
 
-def assembled(
+def assemble(
     b: NnBuilder,
     inputs: Sequence[NnInput],
     outputs: Sequence[str],
@@ -27,10 +27,10 @@ def assembled(
     for name, numbers in constants.items():
         b.constant(np.asarray(numbers, np.float32).reshape(1, 1, 1, -1), name)
     ends = {*outputs, *(m.output for m in memories)}
-    drafts = _needed(b.drafts, ends | set(constants))
+    drafts = _needed_layers(b.drafts, ends | set(constants))
     drafts = _reshape_flattened(b, drafts)
     _check_memories(drafts, memories)
-    drafts = _renamed(drafts, ends)
+    drafts = _rename_ends(drafts, ends)
     drafts.sort(key=lambda d: d.type != LayerType.LOAD)  # constants first; sorting keeps the order otherwise
     layers, weights, offset = [], [], 0
     for draft in drafts:
@@ -55,7 +55,7 @@ def assembled(
     )
 
 
-def _needed(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
+def _needed_layers(drafts: Sequence[Draft], roots: set[str]) -> list[Draft]:
     """The layers that something in ``roots`` depends on, in their order."""
     needed = set(roots)
     kept = []
@@ -105,7 +105,7 @@ def _check_memories(drafts: Sequence[Draft], memories: Sequence[NnMemory]) -> No
             )
 
 
-def _renamed(drafts: Sequence[Draft], ends: set[str]) -> list[Draft]:
+def _rename_ends(drafts: Sequence[Draft], ends: set[str]) -> list[Draft]:
     """Linear activations at the end give their name to the layer before them, where nothing else reads that."""
     readers: dict[str, int] = {}
     for draft in drafts:

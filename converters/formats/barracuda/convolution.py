@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from converters.formats.barracuda.dense import biased
+from converters.formats.barracuda.dense import add_bias
 from converters.formats.barracuda.layer_builder import LayerBuilder, Value
 from converters.formats.barracuda.vocabulary import LayerType
 from converters.graph.nn import convolution as nn
@@ -27,7 +27,7 @@ _TINY = float(np.finfo(np.float32).tiny)
 def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[int]) -> nn.Window:
     """The window of the current layer over an image; ``size`` is (height, width). Raises GraphError."""
     if len(stride) != 2 or min(stride) < 1 or min(size) < 1:
-        raise b.damaged(f"a window of {list(size)} with strides {list(stride)}", "both have two numbers above 0")
+        raise b.damaged_error(f"a window of {list(size)} with strides {list(stride)}", "both have two numbers above 0")
     if stride[0] != stride[1]:
         b.note(
             f"layer {b.layer.name} has the strides {list(stride)}: read as [width, height], as Unity does; "
@@ -42,10 +42,10 @@ def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[i
     elif len(pad) == 4 and min(pad) >= 0:
         window = replace(window, pads=((pad[1], pad[3]), (pad[0], pad[2])))
     else:
-        raise b.unsupported(f"the pads are {list(pad)}", "four lengths from 0 on, −1 (SAME) and −2 are known")
-    b.sized(*(length + sum(pair) for length, pair in zip(x.shape[1:3], window.pads, strict=True)), x.c)
+        raise b.unsupported_error(f"the pads are {list(pad)}", "four lengths from 0 on, −1 (SAME) and −2 are known")
+    b.check_size(*(length + sum(pair) for length, pair in zip(x.shape[1:3], window.pads, strict=True)), x.c)
     if min(window.lengths(x.shape[1:3])) < 1:
-        raise b.damaged(f"a window of {list(size)} over {list(x.shape)}", "the window is larger than the image")
+        raise b.damaged_error(f"a window of {list(size)} over {list(x.shape)}", "the window is larger than the image")
     return window
 
 
@@ -60,7 +60,7 @@ def conv2d(b: LayerBuilder, args: Sequence[Value]) -> Value:
         raise _channels(b, x, kernel, bias)
     window = _window(b, x, array.shape[:2], b.layer.stride)
     product = nn.conv2d(b, b.as_image(x), b.as_image(kernel), window)
-    return _image_of(b, x, window, biased(b, product, bias), array.shape[3])
+    return _image_of(b, x, window, add_bias(b, product, bias), array.shape[3])
 
 
 def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -68,12 +68,12 @@ def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x, kernel, bias = args
     array = _kernel(b, kernel)
     if array.shape[2] != 1:
-        raise b.unsupported(f"a kernel of shape {list(array.shape)}", "Unity knows one result per channel")
+        raise b.unsupported_error(f"a kernel of shape {list(array.shape)}", "Unity knows one result per channel")
     if array.shape[3] != x.c or bias.size != array.shape[3]:
         raise _channels(b, x, kernel, bias)
     window = _window(b, x, array.shape[:2], b.layer.stride)
     product = nn.conv2d(b, b.as_image(x), array, window, x.c)
-    return _image_of(b, x, window, biased(b, product, bias), array.shape[3])
+    return _image_of(b, x, window, add_bias(b, product, bias), array.shape[3])
 
 
 def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -84,7 +84,7 @@ def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x, kernel, bias = args
     array = _kernel(b, kernel)
     if array.shape[2] != x.c:
-        raise b.unsupported(
+        raise b.unsupported_error(
             f"a kernel of shape {list(array.shape)} for {x.c} channels",
             "the converters of ML-Agents 0.7 and 0.8 wrote [height, width, out, in], which Unity cannot run",
         )
@@ -92,32 +92,32 @@ def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
         raise _channels(b, x, kernel, bias)
     stride, adjust = b.layer.stride, tuple(b.layer.pool)
     if len(stride) != 2 or min(stride) < 1 or stride[0] != stride[1]:
-        raise b.unsupported(f"the strides {list(stride)}", "Unity takes the width's stride for both axes")
+        raise b.unsupported_error(f"the strides {list(stride)}", "Unity takes the width's stride for both axes")
     window = replace(_window(b, x, array.shape[:2], stride), same=False)
     if any(before != after for before, after in window.pads):
-        raise b.unsupported(f"the pads {list(b.layer.pad)}", "Unity runs pads that are equal on both sides alone")
+        raise b.unsupported_error(f"the pads {list(b.layer.pad)}", "Unity runs pads that are equal on both sides alone")
     step, extra, lengths = stride[0], [], []
     for axis, length in enumerate(x.shape[1:3]):
         around = sum(window.pads[axis]) - window.size[axis]
         extra.append(adjust[1 - axis] if len(adjust) == 2 else (length + around) % step)
         lengths.append((length - 1) * step - around + extra[axis])
     if min(lengths) < 1:
-        raise b.damaged(f"a result of {lengths}", "pads and adjustment leave nothing of the image")
-    b.sized(*(step * length + 2 * size for length, size in zip(x.shape[1:3], window.size, strict=True)), x.c)
-    b.sized(*lengths, array.shape[3])
-    product = biased(b, nn.conv2d_transposed(b, b.as_image(x), array, window, (extra[0], extra[1])), bias)
+        raise b.damaged_error(f"a result of {lengths}", "pads and adjustment leave nothing of the image")
+    b.check_size(*(step * length + 2 * size for length, size in zip(x.shape[1:3], window.size, strict=True)), x.c)
+    b.check_size(*lengths, array.shape[3])
+    product = add_bias(b, nn.conv2d_transposed(b, b.as_image(x), array, window, (extra[0], extra[1])), bias)
     shape = (x.n, lengths[0], lengths[1], int(array.shape[3]))
-    return b.shaped(product, shape) if shape[1:3] == (1, 1) else Value(product, shape)
+    return b.as_shape(product, shape) if shape[1:3] == (1, 1) else Value(product, shape)
 
 
 def _kernel(b: LayerBuilder, kernel: Value) -> np.ndarray:
     if kernel.constant is None:
-        raise b.unsupported("its kernel is computed", "kernels are constants in every target")
+        raise b.unsupported_error("its kernel is computed", "kernels are constants in every target")
     return kernel.constant
 
 
 def _channels(b: LayerBuilder, x: Value, kernel: Value, bias: Value) -> Exception:
-    return b.damaged(
+    return b.damaged_error(
         f"{x.c} channels, a kernel of shape {list(kernel.shape)}, a bias of {bias.size}",
         "the kernel [height, width, in, out] does not fit to them",
     )
@@ -125,7 +125,7 @@ def _channels(b: LayerBuilder, x: Value, kernel: Value, bias: Value) -> Exceptio
 
 def _image_of(b: LayerBuilder, x: Value, window: nn.Window, reference: str, channels: int) -> Value:
     shape = (x.n, *window.lengths(x.shape[1:3]), channels)
-    return b.shaped(reference, shape) if shape[1:3] == (1, 1) else Value(reference, shape)
+    return b.as_shape(reference, shape) if shape[1:3] == (1, 1) else Value(reference, shape)
 
 
 # ------------------------------------------------------------------ pools
@@ -135,7 +135,7 @@ def pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The maximum or the mean of each window; what is padded does not count."""
     (x,) = args
     if len(b.layer.pool) != 2:
-        raise b.damaged(f"the window is {list(b.layer.pool)}", "it must be [width, height]")
+        raise b.damaged_error(f"the window is {list(b.layer.pool)}", "it must be [width, height]")
     window = _window(b, x, (b.layer.pool[1], b.layer.pool[0]), b.layer.stride)
     image = b.as_image(x)
     if b.layer.type == LayerType.MAX_POOL2D:
@@ -163,25 +163,25 @@ def border(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if len(pad) == 4:
         pad = (pad[0], pad[1], 0, pad[2], pad[3], 0)
     if len(pad) != 6:
-        raise b.damaged(f"the border is {list(b.layer.pad)}", "it has four or six lengths")
+        raise b.damaged_error(f"the border is {list(b.layer.pad)}", "it has four or six lengths")
     pairs = [(0, 0), (pad[1], pad[4]), (pad[0], pad[3]), (pad[2], pad[5])]
     n, *lengths = x.shape
     h, w, c = (length + low + high for length, (low, high) in zip(lengths, pairs[1:], strict=True))
     if min(h, w, c) < 1:
-        raise b.damaged(f"a border of {list(pad)} around {list(x.shape)}", "nothing is left of the image")
-    b.sized(h, w, c)
+        raise b.damaged_error(f"a border of {list(pad)} around {list(x.shape)}", "nothing is left of the image")
+    b.check_size(h, w, c)
     if b.layer.type == LayerType.BORDER2D:
-        return b.shaped(b.pad(b.as_image(x), pairs, b.layer.beta), (n, h, w, c))
+        return b.as_shape(b.pad(b.as_image(x), pairs, b.layer.beta), (n, h, w, c))
     data = b.as_image(x)
     for axis, (low, high) in enumerate(pairs):
         if (low, high) == (0, 0):
             continue
         index = np.arange(-low, lengths[axis - 1] + high)
-        data = b.take(data, _mirrored(b.layer.type, index, lengths[axis - 1]).tolist(), axis)
-    return b.shaped(data, (n, h, w, c))
+        data = b.take(data, _mirror_index(b.layer.type, index, lengths[axis - 1]).tolist(), axis)
+    return b.as_shape(data, (n, h, w, c))
 
 
-def _mirrored(kind: int, index: np.ndarray, length: int) -> np.ndarray:
+def _mirror_index(kind: int, index: np.ndarray, length: int) -> np.ndarray:
     """Which pixel stands at ``index`` of an axis, in front of 0 and behind the last."""
     last = length - 1
     if kind == LayerType.PAD2D_REFLECT:
@@ -198,29 +198,29 @@ def upsample(b: LayerBuilder, args: Sequence[Value]) -> Value:
         _, down, across, _ = b.whole(args[1].constant)
         factors = (across, down)
     if len(factors) != 2 or min(factors) < 1:
-        raise b.unsupported(
+        raise b.unsupported_error(
             f"the factors are {list(factors)}",
             "ML-Agents' converter made an Upsample2D of every Resize and wrote no factors; Unity cannot run it either",
         )
     if b.layer.axis > 0:
-        raise b.unsupported("it interpolates between pixels", "only the nearest pixel is translated")
+        raise b.unsupported_error("it interpolates between pixels", "only the nearest pixel is translated")
     x = args[0]
     n, h, w, c = x.shape
-    b.sized(h, factors[1], w, factors[0], c)
+    b.check_size(h, factors[1], w, factors[0], c)
     data = b.as_image(x)
     for axis, (length, factor) in enumerate(((h, factors[1]), (w, factors[0])), start=1):
         if factor > 1:
             data = b.take(data, np.arange(length).repeat(factor).tolist(), axis)
-    return b.shaped(data, (n, h * factors[1], w * factors[0], c))
+    return b.as_shape(data, (n, h * factors[1], w * factors[0], c))
 
 
 def normalization(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Instance normalisation: (x − mean) / √(variance + beta)·S + B, mean and variance over each channel's pixels."""
     x, scale, bias = args
     if b.layer.axis not in (-1, 3, 7):
-        raise b.unsupported(f"the axis is {b.layer.axis}", "only the channels' axis is known")
+        raise b.unsupported_error(f"the axis is {b.layer.axis}", "only the channels' axis is known")
     if scale.size != x.c or bias.size != x.c:
-        raise b.damaged(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
+        raise b.damaged_error(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
     epsilon = b.layer.beta or _TINY
     made = normalisation.instance(b, b.as_image(x), b.as_vector(scale), b.as_vector(bias), epsilon, channels=3)
-    return b.shaped(made, x.shape)
+    return b.as_shape(made, x.shape)

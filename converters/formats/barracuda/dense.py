@@ -18,15 +18,15 @@ def dense(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x, kernel, bias = args
     rows, columns = kernel.n, kernel.size
     if rows is None or x.size != rows or bias.size != columns:
-        raise b.damaged(
+        raise b.damaged_error(
             f"a row of {x.size} numbers, a kernel of shape {list(kernel.shape)}, a bias of {bias.size}",
             "the kernel's rows must be the input's numbers, its columns the bias's",
         )
     product = b.add("MatMul", [b.as_matrix(x), b.as_matrix(kernel)])
-    return b.rows(biased(b, product, bias), x.n, columns)
+    return b.rows(add_bias(b, product, bias), x.n, columns)
 
 
-def biased(b: LayerBuilder, product: str, bias: Value) -> str:
+def add_bias(b: LayerBuilder, product: str, bias: Value) -> str:
     """``product`` plus a bias along its last axis; the zeros that ML-Agents' converter makes up are left out."""
     if _all(bias, 0):
         return product
@@ -47,9 +47,11 @@ def matmul(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x, y = args
     ranks = tuple(b.layer.pool) or (2, 2)
     if len(ranks) != 2 or any(r not in (2, 3, 4) for r in ranks) or (ranks[1] != 2 and ranks[0] != ranks[1]):
-        raise b.unsupported(f"the ranks {list(ranks)}", "products that broadcast over further axes are not translated")
+        raise b.unsupported_error(
+            f"the ranks {list(ranks)}", "products that broadcast over further axes are not translated"
+        )
     if ranks[1] == 2 and y.n is None:
-        raise b.unsupported("its second input has a row per agent", "the batch cannot be summed over")
+        raise b.unsupported_error("its second input has a row per agent", "the batch cannot be summed over")
     return _times(b, x, y, ranks[0], ranks[1])
 
 
@@ -57,12 +59,12 @@ def dense3(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The product of a rank-3 X [N, 1, W, C] with K [W, 1, 1, M], over W, plus a bias of M: [N, 1, M, C]."""
     x, kernel, bias = args
     if kernel.n is None or bias.constant is None:
-        raise b.unsupported("its kernel or bias is computed", "they are constants in every model known")
+        raise b.unsupported_error("its kernel or bias is computed", "they are constants in every model known")
     if bias.size != kernel.size:
-        raise b.damaged(f"a kernel of {kernel.size} columns, a bias of {bias.size}", "they must be equal")
+        raise b.damaged_error(f"a kernel of {kernel.size} columns, a bias of {bias.size}", "they must be equal")
     product = _times(b, x, kernel, 3, 2)
     column = b.floats(bias.constant.reshape(1, 1, -1, 1), "bias")
-    return b.shaped(b.add("Add", [b.as_image(product), column]), product.shape)
+    return b.as_shape(b.add("Add", [b.as_image(product), column]), product.shape)
 
 
 def _times(b: LayerBuilder, x: Value, y: Value, left: int, right: int) -> Value:
@@ -70,14 +72,14 @@ def _times(b: LayerBuilder, x: Value, y: Value, left: int, right: int) -> Value:
     inner = x.size if left == 2 else x.w
     rows, columns = {2: (y.n, y.size), 3: (y.c, y.w), 4: (y.h, y.w)}[right]
     if inner != rows:
-        raise b.damaged(f"{list(x.shape)} times {list(y.shape)}", f"{inner} numbers meet {rows}")
+        raise b.damaged_error(f"{list(x.shape)} times {list(y.shape)}", f"{inner} numbers meet {rows}")
     product = linear.matmul(b, _onnx_order(b, x, left), _onnx_order(b, y, right))
     if left == 2:
         return b.rows(product, x.n, columns)
     n = x.n if right == 2 or y.n == 1 else y.n
     image = product if left == 4 else b.expand_dims(product, 2)
     turned = b.transpose(image, (0, 2, 3, 1))
-    return b.shaped(turned, (n, x.h, columns, x.c))
+    return b.as_shape(turned, (n, x.h, columns, x.c))
 
 
 def _onnx_order(b: LayerBuilder, x: Value, rank: int) -> str:
@@ -85,7 +87,7 @@ def _onnx_order(b: LayerBuilder, x: Value, rank: int) -> str:
     if rank == 2:
         return b.as_matrix(x)
     if rank == 3 and x.h != 1:
-        raise b.damaged(f"{list(x.shape)} as a tensor of rank 3", "its height is not 1")
+        raise b.damaged_error(f"{list(x.shape)} as a tensor of rank 3", "its height is not 1")
     turned = b.transpose(b.as_image(x), (0, 3, 1, 2))
     return turned if rank == 4 else b.squeeze(turned, [2])
 
@@ -94,13 +96,13 @@ def scale_bias(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """x·S + B along the channels; S of ones is what ML-Agents' converter makes of a bias alone."""
     x, scale, bias = args
     if scale.size != x.c or bias.size != x.c:
-        raise b.damaged(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
+        raise b.damaged_error(f"{x.c} channels, {scale.size} scales, {bias.size} biases", "they must be equal")
     result = x.reference
     if not _all(scale, 1):
         result = b.add("Mul", [result, b.as_vector(scale)])
     if x.rank == 1:
         return Value(b.add("Add", [result, b.as_vector(bias)]), x.shape)
-    return Value(biased(b, result, bias), x.shape)
+    return Value(add_bias(b, result, bias), x.shape)
 
 
 # ------------------------------------------------------------------ chance
@@ -112,8 +114,8 @@ def random(b: LayerBuilder, args: Sequence[Value]) -> Value:
         shape: Shape = b.four(b.layer.pool)
         n, h, w, c = shape
         if n in (None, 0, -1) or min(h, w, c) < 1:
-            raise b.damaged(f"it draws a tensor of shape {list(b.layer.pool)}", "the shape must be plain numbers")
-        b.sized(n or 1, h, w, c)
+            raise b.damaged_error(f"it draws a tensor of shape {list(b.layer.pool)}", "the shape must be plain numbers")
+        b.check_size(n or 1, h, w, c)
         lengths = [c] if shape[:3] == (1, 1, 1) else [n, c] if (h, w) == (1, 1) else [n, h, w, c]
         if n == 1 and (h, w) == (1, 1):
             b.note(f"the noise of {b.layer.name} is one row for all agents, as in the .nn")
@@ -122,7 +124,7 @@ def random(b: LayerBuilder, args: Sequence[Value]) -> Value:
         shape = args[0].shape
         size = b.add("Shape", [args[0].reference], out_type=INT32)
     else:
-        raise b.damaged("it has neither a shape nor an input", "the shape of what it draws is not known")
+        raise b.damaged_error("it has neither a shape nor an input", "the shape of what it draws is not known")
     if b.layer.type == LayerType.RANDOM_NORMAL:
         drawn = b.add("RandomStandardNormal", [size], origin=b.layer.name, dtype=FLOAT32)
     else:
@@ -134,7 +136,7 @@ def multinomial(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """``pool[0]`` classes per row, drawn from the row's log-probabilities; a ``.nn`` holds them as floats."""
     (x,) = args
     if len(b.layer.pool) != 1 or b.layer.pool[0] < 1:
-        raise b.damaged(f"it draws {list(b.layer.pool)} times", "the number of draws is one number above 0")
+        raise b.damaged_error(f"it draws {list(b.layer.pool)} times", "the number of draws is one number above 0")
     count = b.layer.pool[0]
     drawn = b.add("Multinomial", [b.as_matrix(x), b.ints(count, "count")], output_dtype=INT64)
     return b.rows(b.add("Cast", [drawn], DstT=FLOAT32), x.n, count, drawn)
@@ -148,9 +150,9 @@ def one_hot(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """
     (x,) = args
     if len(b.layer.pool) != 1 or b.layer.pool[0] < 1:
-        raise b.damaged(f"its depth is {list(b.layer.pool)}", "it must be one number above 0")
+        raise b.damaged_error(f"its depth is {list(b.layer.pool)}", "it must be one number above 0")
     depth, count, n = b.layer.pool[0], x.size, x.n
-    b.sized(count, depth)
+    b.check_size(count, depth)
     index = x.integer
     if index is None:
         index = b.add("Cast", [b.as_matrix(x)], DstT=INT32)
@@ -160,13 +162,13 @@ def one_hot(b: LayerBuilder, args: Sequence[Value]) -> Value:
         axis=-1,
     )
     if count == 1 and (b.version <= 16 or b.layer.axis < 2):
-        return b.shaped(hot, (n, 1, 1, depth))
+        return b.as_shape(hot, (n, 1, 1, depth))
     if b.version <= 16:
-        return b.shaped(hot, (n, 1, count, depth))
+        return b.as_shape(hot, (n, 1, count, depth))
     if b.layer.axis == 2 and x.rank != 4:
         turned = b.add("Transpose", [hot, b.ints([0, 2, 1], "before")])
-        return b.shaped(turned, (n, 1, depth, count))
-    raise b.unsupported(
+        return b.as_shape(turned, (n, 1, depth, count))
+    raise b.unsupported_error(
         f"indices of shape {list(x.shape)}, rank {b.layer.axis}",
         "where the new axis stands was changed between versions of Barracuda; ranks 1 and 2 are known for sure",
     )

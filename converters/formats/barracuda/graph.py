@@ -117,7 +117,7 @@ class _Reader:
                 fix="export the frozen_graph_def.pb from the same run",
             )
         self.builder.start(Layer(given.name, LayerType.NOP), self.nodes[given.name])
-        self.builder.sized(h, w, c)
+        self.builder.check_size(h, w, c)
         shape = (None, h, w, c)
         name = self.nodes[given.name]
         sensor = (self.draws or self.model.version >= EIGHT_AXES) and re.fullmatch(r"obs_\d+", given.name)
@@ -128,7 +128,7 @@ class _Reader:
         dims = (None, 1, w) if state else (None, c) if (h, w) == (1, 1) else shape
         self.builder.named_input(name, INT32 if integer else FLOAT32, dims, given.name)
         if state:
-            return self.builder.shaped(name, shape)
+            return self.builder.as_shape(name, shape)
         if not integer:
             return Value(name, shape)
         return Value(self.builder.add("Cast", [name], name="float", DstT=FLOAT32), shape, integer=name)
@@ -138,7 +138,7 @@ class _Reader:
         b, name = self.builder, self.nodes[given.name]
         b.named_input(name, FLOAT32, (None, size, count), given.name)
         turned = b.add("Transpose", [name, b.ints([0, 2, 1], "order")])
-        return b.shaped(turned, (None, 1, count, size))
+        return b.as_shape(turned, (None, 1, count, size))
 
     # ------------------------------------------------------------------ memories
 
@@ -154,7 +154,7 @@ class _Reader:
                 why=f"a memory has at least one, and all together have at most {MAX_ELEMENTS}",
                 fix="copy or download the .nn again",
             )
-        self.builder.named_input(MEMORY_IN, FLOAT32, (None, sum(sizes)), _joined([m.input for m in memories]))
+        self.builder.named_input(MEMORY_IN, FLOAT32, (None, sum(sizes)), _name_or_names([m.input for m in memories]))
         start = 0
         for memory, (h, w, c), size in zip(memories, shapes, sizes, strict=True):
             part, name = MEMORY_IN, self.nodes[memory.input]
@@ -164,7 +164,7 @@ class _Reader:
                 part = self.builder.finish(part, begun, name, memory.input)
             start += size
             value = Value(part, (None, 1, 1, size))
-            self.values[memory.input] = value if (h, w) == (1, 1) else self.builder.shaped(part, (None, h, w, c))
+            self.values[memory.input] = value if (h, w) == (1, 1) else self.builder.as_shape(part, (None, h, w, c))
 
     def _memory_out(self) -> None:
         memories = self.model.memories
@@ -183,7 +183,7 @@ class _Reader:
                 )
             parts.append(b.as_matrix(value))
         joined = parts[0] if len(parts) == 1 else b.add("ConcatV2", [*parts, b.ints(1, "axis")])
-        b.finish(joined, begun, MEMORY_OUT, _joined([m.output for m in memories]))
+        b.finish(joined, begun, MEMORY_OUT, _name_or_names([m.output for m in memories]))
 
     # ------------------------------------------------------------------ layers
 
@@ -227,7 +227,7 @@ class _Reader:
         return replace(result, reference=b.finish(result.reference, begun, name, layer.name))
 
 
-def _joined(names: list[str]) -> str | tuple[str, ...]:
+def _name_or_names(names: list[str]) -> str | tuple[str, ...]:
     return names[0] if len(names) == 1 else tuple(names)
 
 

@@ -152,7 +152,7 @@ class LayerBuilder(Builder):
             return self.floats(value.constant.reshape(-1), "vector")
         return self.add("Reshape", [value.reference, self.ints([-1], "vector")], name="list")
 
-    def shaped(self, reference: str, shape: Shape, integer: str | None = None) -> Value:
+    def as_shape(self, reference: str, shape: Shape, integer: str | None = None) -> Value:
         """A tensor that has ``shape``'s elements in order, brought to the form that ``shape`` asks for."""
         n, *rest = shape
         rows = [] if shape[:3] == (1, 1, 1) else [-1 if n is None else n]
@@ -163,7 +163,7 @@ class LayerBuilder(Builder):
     def rows(self, matrix: str, n: int | None, width: int, integer: str | None = None) -> Value:
         """A matrix [N, width] as a tensor."""
         shape = (n, 1, 1, width)
-        return self.shaped(matrix, shape, integer) if n == 1 else Value(matrix, shape, integer=integer)
+        return self.as_shape(matrix, shape, integer) if n == 1 else Value(matrix, shape, integer=integer)
 
     def operands(self, values: Sequence[Value]) -> tuple[list[str], Shape]:
         """References that broadcast against each other as the ``.nn`` means it, and the shape of the result."""
@@ -182,7 +182,7 @@ class LayerBuilder(Builder):
                     continue
                 if dims[axis] != 1:
                     shapes = ", ".join(str(list(v.shape)) for v in values)
-                    raise self.damaged(f"its inputs have the shapes {shapes}", "they do not broadcast")
+                    raise self.damaged_error(f"its inputs have the shapes {shapes}", "they do not broadcast")
                 dims[axis] = length
         n, h, w, c = dims
         return n, int(h or 0), int(w or 0), int(c or 0)
@@ -193,27 +193,29 @@ class LayerBuilder(Builder):
         """A shape among the layer's fields as N, H, W, C."""
         if len(values) in (4, 8):
             return four_axes(tuple(values), self.location)
-        raise self.damaged(f"it holds {list(values)}", "a shape must have four or eight axes")
+        raise self.damaged_error(f"it holds {list(values)}", "a shape must have four or eight axes")
 
     def whole(self, array: npt.NDArray[np.float32]) -> list[int]:
         """Numbers that stand for lengths or indices, in order; a ``.nn`` holds them as floats."""
         with np.errstate(invalid="ignore"):
             fit = bool(np.all(np.abs(array) < MAX_ELEMENTS))
         if not fit:
-            raise self.damaged(f"an index or length in it is beyond {MAX_ELEMENTS}", "its dataset is damaged")
+            raise self.damaged_error(f"an index or length in it is beyond {MAX_ELEMENTS}", "its dataset is damaged")
         return [int(v) for v in array.reshape(-1)]
 
-    def sized(self, *lengths: int) -> None:
+    def check_size(self, *lengths: int) -> None:
         """Refuse a tensor of more elements per row than any policy has, before anything is made for it."""
         if math.prod(lengths) > MAX_ELEMENTS:
-            raise self.unsupported(f"a tensor of {list(lengths)}", f"more than {MAX_ELEMENTS} numbers are not read")
+            raise self.unsupported_error(
+                f"a tensor of {list(lengths)}", f"more than {MAX_ELEMENTS} numbers are not read"
+            )
 
     @property
     def location(self) -> str:
         """The layer that is being read."""
         return f"layer {self.layer.name!r} ({layer_label(self.layer.type)})"
 
-    def damaged(self, what: str, why: str) -> GraphError:
+    def damaged_error(self, what: str, why: str) -> GraphError:
         """The error for a layer that contradicts itself."""
         return GraphError(
             f"{self.location}: {what}",
@@ -221,7 +223,7 @@ class LayerBuilder(Builder):
             fix="convert the model again: the frozen_graph_def.pb beside the .nn is exported in its place",
         )
 
-    def unsupported(self, what: str, why: str) -> UnsupportedOpError:
+    def unsupported_error(self, what: str, why: str) -> UnsupportedOpError:
         """The error for a layer, or a variant of one, that is not translated."""
         return UnsupportedOpError(
             f"{self.location}: {what}",

@@ -22,10 +22,10 @@ def _same(b: LayerBuilder, args: Sequence[Value]) -> Value:
 def _activation(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if b.layer.activation == Activation.PRELU:
         if len(args) != 2:
-            raise b.damaged(f"it has {len(args)} inputs", "a PRelu takes a tensor and its slopes")
+            raise b.damaged_error(f"it has {len(args)} inputs", "a PRelu takes a tensor and its slopes")
         return activations.prelu(b, args[0], args[1])
     if len(args) != 1:
-        raise b.damaged(f"it has {len(args)} inputs", "an activation takes one")
+        raise b.damaged_error(f"it has {len(args)} inputs", "an activation takes one")
     return activations.activate(b, b.layer.activation, args[0], axis=b.layer.axis)
 
 
@@ -67,12 +67,12 @@ _LAYERS: Mapping[int, tuple[int, int, Translate]] = {
         (LayerType.BORDER2D, LayerType.PAD2D_REFLECT, LayerType.PAD2D_SYMMETRIC, LayerType.PAD2D_EDGE),
         (1, 1, convolution.border),
     ),
-    **dict.fromkeys(range(LayerType.ADD, LayerType.POW + 1), (1, _ANY, arithmetic.folded)),
-    **dict.fromkeys(range(LayerType.MIN, LayerType.MEAN + 1), (1, _ANY, arithmetic.folded)),
-    **dict.fromkeys(range(LayerType.GREATER, LayerType.EQUAL + 1), (2, 2, arithmetic.compared)),
+    **dict.fromkeys(range(LayerType.ADD, LayerType.POW + 1), (1, _ANY, arithmetic.fold_inputs)),
+    **dict.fromkeys(range(LayerType.MIN, LayerType.MEAN + 1), (1, _ANY, arithmetic.fold_inputs)),
+    **dict.fromkeys(range(LayerType.GREATER, LayerType.EQUAL + 1), (2, 2, arithmetic.compare_operands)),
     **dict.fromkeys((LayerType.LOGICAL_OR, LayerType.LOGICAL_AND, LayerType.LOGICAL_XOR), (2, 2, arithmetic.logical)),
-    **dict.fromkeys(range(LayerType.REDUCE_L1, LayerType.REDUCE_SUM_SQUARE + 1), (1, 2, arithmetic.reduced)),
-    **dict.fromkeys((LayerType.ARG_MAX, LayerType.ARG_MIN), (1, 2, arithmetic.reduced)),
+    **dict.fromkeys(range(LayerType.REDUCE_L1, LayerType.REDUCE_SUM_SQUARE + 1), (1, 2, arithmetic.reduce_axis)),
+    **dict.fromkeys((LayerType.ARG_MAX, LayerType.ARG_MIN), (1, 2, arithmetic.reduce_axis)),
 }
 
 _WHY: Mapping[LayerType, str] = {
@@ -92,18 +92,18 @@ def translate(b: LayerBuilder, layer: Layer, args: Sequence[Value]) -> Value:
         why = "no translation of it is known"
         if layer.type in LayerType._value2member_map_:
             why = _WHY.get(LayerType(layer.type), "no model of ML-Agents has it, and no translation of it is known")
-        raise b.unsupported("it cannot be converted", why)
+        raise b.unsupported_error("it cannot be converted", why)
     fewest, most, function = entry
     if not fewest <= len(args) <= most:
         wanted = fewest if fewest == most else f"{fewest} to {most}" if most < _ANY else f"{fewest} or more"
-        raise b.damaged(f"it has {len(args)} inputs and datasets", f"it takes {wanted}")
+        raise b.damaged_error(f"it has {len(args)} inputs and datasets", f"it takes {wanted}")
     try:
         result = function(b, args)
     except UnsupportedOpError as error:
         if error.issues:
             raise
-        raise b.unsupported(error.what, error.why or "a policy's tensors have another form") from error
-    b.sized(*result.shape[1:])
+        raise b.unsupported_error(error.what, error.why or "a policy's tensors have another form") from error
+    b.check_size(*result.shape[1:])
     if layer.type != LayerType.ACTIVATION and layer.activation != Activation.NONE:
         result = activations.activate(b, layer.activation, result, fused=True)
     return result

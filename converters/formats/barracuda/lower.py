@@ -24,9 +24,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.compiler.targets import BARRACUDA, prepare
-from converters.formats.barracuda.assemble import assembled
+from converters.formats.barracuda.assemble import assemble
 from converters.formats.barracuda.format import NnInput, NnMemory, NnModel
-from converters.formats.barracuda.lower_arrays import as_row, joined, reshaped
+from converters.formats.barracuda.lower_arrays import as_row, join_along, reshape_value
 from converters.formats.barracuda.lower_base import NnBuilder
 from converters.formats.barracuda.lower_linear import FORBIDDEN, best_score, noise
 from converters.formats.barracuda.lower_table import lower_graph
@@ -92,7 +92,7 @@ class _Lowering:
         self.outputs: list[str] = []
 
     def model(self) -> NnModel:
-        given = self._given()
+        given = self._input_values()
         results = {spec.name: self._result(spec) for spec in self.signature.outputs}
         wanted = [r for r in results.values() if r is not None]
         memory = self.signature.memory
@@ -108,11 +108,11 @@ class _Lowering:
                 self._output(_EXTRA.get(spec.role, base_name(spec)), as_row(self.b, values[reference]))
         if memory is not None and memory.output is not None:
             self._memories_out(as_row(self.b, values[self.policy.fetches[memory.output]]))
-        return self._assembled()
+        return self._assemble()
 
     # ------------------------------------------------------------------ inputs
 
-    def _given(self) -> dict[str, Value]:
+    def _input_values(self) -> dict[str, Value]:
         """Placeholder → the input of the file that it is, or is a part of."""
         given: dict[str, Value] = {}
         self._vectors(given)
@@ -139,7 +139,7 @@ class _Lowering:
         for spec, width in zip(vectors, widths, strict=True):
             shape = self._shape(spec)
             part = self.b.cut(whole, start, start + width, (BATCH, width))
-            given[self._feed(spec)] = reshaped(self.b, part, shape)
+            given[self._feed(spec)] = reshape_value(self.b, part, shape)
             start += width
 
     def _camera(self, given: dict[str, Value], number: int, spec: TensorSpec) -> None:
@@ -148,12 +148,12 @@ class _Lowering:
         dims = Value(shape, axes).dims
         name = f"visual_observation_{number}"
         self._input(name, dims)
-        given[self._feed(spec)] = self.b.made(name, shape, axes)
+        given[self._feed(spec)] = self.b.layer_value(name, shape, axes)
 
     def _input(self, name: str, dims: Dims) -> Value:
         """An input of the file as a tensor [B, …] whose axes lie as they do in the file."""
         self.inputs.append(NnInput(name, dims))
-        self.b.given(name, dims)
+        self.b.note_input(name, dims)
         return Value((BATCH, dims[C]), (N, C), (Piece(name, dims[C], 0, dims[C]),))
 
     def _feed(self, spec: TensorSpec) -> str:
@@ -162,7 +162,7 @@ class _Lowering:
     def _shape(self, spec: TensorSpec) -> tuple[Dim, ...]:
         shape: list[Dim] = [BATCH if d is None and i == 0 else d or 0 for i, d in enumerate(spec.shape)]
         if not shape or shape[0] != BATCH or 0 in shape:
-            raise self._refused(
+            raise self._input_error(
                 spec, f"it has the shape {list(spec.shape)}", "an input has a row per agent, of a known length"
             )
         return tuple(shape)
@@ -170,7 +170,7 @@ class _Lowering:
     def _width(self, spec: TensorSpec) -> int:
         return Value(self._shape(spec)).size
 
-    def _refused(self, spec: TensorSpec, what: str, why: str) -> SignatureError:
+    def _input_error(self, spec: TensorSpec, what: str, why: str) -> SignatureError:
         return SignatureError(
             f"{spec.name!r} ({spec.role.value}) cannot be written to a .nn: {what}",
             why=why,
@@ -217,17 +217,17 @@ class _Lowering:
             return
         pieces = []
         for part in self.parts:
-            self.b.given(part.taken, (FREE, 1, 1, part.size))
+            self.b.note_input(part.taken, (FREE, 1, 1, part.size))
             pieces.append(Piece(part.taken, part.size, 0, part.size))
         spec = self.signature.input(memory.input)
         whole = Value((BATCH, memory.size), (N, C), tuple(pieces))
-        given[self._feed(spec)] = reshaped(self.b, whole, self._shape(spec))
+        given[self._feed(spec)] = reshape_value(self.b, whole, self._shape(spec))
 
     def _memories_out(self, state: Value) -> None:
         start = 0
         for part in self.parts:
             piece = self.b.cut(state, start, start + part.size, (BATCH, part.size))
-            self.b.named(part.given, self.b.stored(piece))
+            self.b.name_tensor(part.given, self.b.stored_name(piece))
             start += part.size
 
     # ------------------------------------------------------------------ outputs
@@ -265,20 +265,20 @@ class _Lowering:
             self._output(base_name(spec), rows[0])
             return
         if spec.role is Role.DETERMINISTIC:
-            best = [best_score(b, b.stored(r), r.size, f"branch_{i}") for i, r in enumerate(rows)]
-            rows = [b.made(name, r.shape, r.axes) for name, r in zip(best, rows, strict=True)]
+            best = [best_score(b, b.stored_name(r), r.size, f"branch_{i}") for i, r in enumerate(rows)]
+            rows = [b.layer_value(name, r.shape, r.axes) for name, r in zip(best, rows, strict=True)]
         width = sum(r.size for r in rows)
-        row = joined(b, rows, 1, (BATCH, width))
+        row = join_along(b, rows, 1, (BATCH, width))
         if spec.role is Role.PROBS:
-            row = b.made(b.activation(Activation.LOG, b.stored(row), label="log"), row.shape, row.axes)
+            row = b.layer_value(b.activation(Activation.LOG, b.stored_name(row), label="log"), row.shape, row.axes)
         if not any(s.role is Role.MASKS for s in self.signature.inputs):
-            masks = b.stored(self._input("action_masks", (FREE, 1, 1, width)))
-            forbidden = b.scaled(b.shifted(masks, -1, "masks/forbidden"), -FORBIDDEN, "masks/scores")
-            row = b.made(b.two(LayerType.ADD, b.stored(row), forbidden, "masked"), row.shape, row.axes)
+            masks = b.stored_name(self._input("action_masks", (FREE, 1, 1, width)))
+            forbidden = b.scale(b.shift(masks, -1, "masks/forbidden"), -FORBIDDEN, "masks/scores")
+            row = b.layer_value(b.two(LayerType.ADD, b.stored_name(row), forbidden, "masked"), row.shape, row.axes)
         self._output(base_name(spec), row)
 
     def _output(self, name: str, row: Value) -> None:
-        self.b.named(name, self.b.stored(row))
+        self.b.name_tensor(name, self.b.stored_name(row))
         self.outputs.append(name)
 
     # ------------------------------------------------------------------ the file
@@ -302,10 +302,10 @@ class _Lowering:
         draft = next(d for d in self.b.drafts if d.name == base_name(spec))
         return self.b.dims_of(draft.inputs[0])[C]
 
-    def _assembled(self) -> NnModel:
+    def _assemble(self) -> NnModel:
         constants = {n: np.array([number], np.float32) for n, number in self._constants().items()}
         memories = [NnMemory((1, 1, 1, p.size), p.taken, p.given) for p in self.parts]
-        return assembled(self.b, self.inputs, self.outputs, constants, memories)
+        return assemble(self.b, self.inputs, self.outputs, constants, memories)
 
 
 def _scores_behind(graph: Graph, reference: str, b: NnBuilder) -> list[str]:
@@ -323,7 +323,7 @@ def _scores_behind(graph: Graph, reference: str, b: NnBuilder) -> list[str]:
     if node.op == "ArgMax" and len(b.type_of(node.inputs[0]).shape or ()) == 2:
         return [node.inputs[0]]
     b.node = node
-    raise b.refused(
+    raise b.nn_error(
         "the action is a class, and is not the largest of some scores",
         "ML-Agents of these years takes a score for every class and chooses by itself",
     )
@@ -358,11 +358,11 @@ def dressed_model(policy: Policy) -> NnModel:
     for spec in signature.outputs:
         b.node = Node(spec.name, "Identity")
         row = as_row(b, values[policy.fetches[spec.name]])
-        name = b.stored(row)
+        name = b.stored_name(row)
         if spec.role is Role.MEMORY_OUT:
             name = b.layer(LayerType.TRANSPOSE, [name], (FREE, 1, row.size, 1), pool=_SWAP_W_AND_C, label="rows")
-        b.named(spec.name, name)
-    return assembled(b, inputs, [s.name for s in signature.outputs], constants)
+        b.name_tensor(spec.name, name)
+    return assemble(b, inputs, [s.name for s in signature.outputs], constants)
 
 
 def _as_fed(spec: TensorSpec) -> Value:
@@ -375,9 +375,9 @@ def _as_fed(spec: TensorSpec) -> Value:
 def _input(b: NnBuilder, spec: TensorSpec) -> Value:
     """An input as the graph takes it: a memory along C, where it is cut as it was before there was a W."""
     value = _as_fed(spec)
-    b.given(spec.name, value.dims)
+    b.note_input(spec.name, value.dims)
     if spec.role is not Role.MEMORY_IN:
-        return b.made(spec.name, value.shape, value.axes)
+        return b.layer_value(spec.name, value.shape, value.axes)
     b.node = Node(spec.name, "Placeholder")
     flat = b.layer(LayerType.TRANSPOSE, [spec.name], (FREE, 1, 1, value.size), pool=_SWAP_W_AND_C, label="row")
-    return b.made(flat, value.shape, (N, None, C))
+    return b.layer_value(flat, value.shape, (N, None, C))

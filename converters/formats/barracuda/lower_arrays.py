@@ -34,10 +34,10 @@ def same(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 def reshape(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Reshape, Squeeze and ExpandDims: the elements in their order in another shape."""
-    return reshaped(b, b.settled(args[0]), b.shape_of(b.node.name))
+    return reshape_value(b, b.flatten_if_due(args[0]), b.shape_of(b.node.name))
 
 
-def reshaped(b: NnBuilder, value: Value, shape: tuple[Dim, ...]) -> Value:
+def reshape_value(b: NnBuilder, value: Value, shape: tuple[Dim, ...]) -> Value:
     """``value``'s elements in order in ``shape``."""
     if [d for d in value.shape if d != 1] == [d for d in shape if d != 1]:
         places = iter(a for a, d in zip(value.axes, value.shape, strict=True) if d != 1)
@@ -45,39 +45,39 @@ def reshaped(b: NnBuilder, value: Value, shape: tuple[Dim, ...]) -> Value:
     axes = _usual(b, shape)
     mixed = not (value.by_rows and rows_first(shape)) or (BATCH in value.shape) != (BATCH in shape)
     if mixed or value.size != math.prod(d for d in shape if isinstance(d, int)):
-        raise b.refused(f"{list(value.shape)} to {list(shape)}", _MIXED)
+        raise b.nn_error(f"{list(value.shape)} to {list(shape)}", _MIXED)
     if not value.in_order and len(shape) == 2 and shape[0] == BATCH:
         return Value(shape, axes, flat_of=value)
     value = b.in_usual_place(value)
     wanted = Value(shape, axes)
     if wanted.dims == value.dims:
         return replace(value, shape=shape, axes=axes)
-    name = b.stored(value)
+    name = b.stored_name(value)
     if wanted.dims[H] == wanted.dims[W] == 1:
-        return b.made(b.layer(LayerType.FLATTEN, [name], wanted.dims), shape, axes)
-    return b.made(b.layer(LayerType.RESHAPE, [name], wanted.dims, pool=wanted.dims), shape, axes)
+        return b.layer_value(b.layer(LayerType.FLATTEN, [name], wanted.dims), shape, axes)
+    return b.layer_value(b.layer(LayerType.RESHAPE, [name], wanted.dims, pool=wanted.dims), shape, axes)
 
 
 def as_row(b: NnBuilder, value: Value) -> Value:
     """A tensor as [B, size]."""
     if value.array is not None:
         shape: tuple[Dim, ...] = (BATCH, value.size)
-        return written(b, Value(shape, array=value.array.reshape(1, -1)), (N, C))
-    value = b.settled(value)
-    flat = reshaped(b, value, (BATCH, value.size)) if value.shape != (BATCH, value.size) else value
-    return b.settled(flat)
+        return write_constant(b, Value(shape, array=value.array.reshape(1, -1)), (N, C))
+    value = b.flatten_if_due(value)
+    flat = reshape_value(b, value, (BATCH, value.size)) if value.shape != (BATCH, value.size) else value
+    return b.flatten_if_due(flat)
 
 
 def _usual(b: NnBuilder, shape: tuple[Dim, ...]) -> Axes:
     axes = usual_axes(shape)
     if axes is None:
-        raise b.refused(f"a tensor of shape {list(shape)}", "the batch comes first in a .nn, and three axes more")
+        raise b.nn_error(f"a tensor of shape {list(shape)}", "the batch comes first in a .nn, and three axes more")
     return axes
 
 
 def transpose(b: NnBuilder, args: Sequence[Value]) -> Value:
     """The axes stay where they lie; the graph counts them in another order."""
-    value = b.settled(args[0])
+    value = b.flatten_if_due(args[0])
     order = [int(i) for i in b.known(1, "the order of the axes")]
     return replace(value, shape=tuple(value.shape[i] for i in order), axes=tuple(value.axes[i] for i in order))
 
@@ -88,7 +88,7 @@ def transpose(b: NnBuilder, args: Sequence[Value]) -> Value:
 def concat(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Tensors one after the other."""
     axis = int(b.known(len(b.node.inputs) - 1, "the axis"))
-    return joined(b, args, axis, b.shape_of(b.node.name))
+    return join_along(b, args, axis, b.shape_of(b.node.name))
 
 
 def pack(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -96,10 +96,10 @@ def pack(b: NnBuilder, args: Sequence[Value]) -> Value:
     shape = b.shape_of(b.node.name)
     axis = int(b.node.attrs["axis"]) % len(shape)
     one = tuple(1 if i == axis else d for i, d in enumerate(shape))
-    return joined(b, [_inserted(v, axis, one) for v in args], axis, shape)
+    return join_along(b, [_insert_axis(v, axis, one) for v in args], axis, shape)
 
 
-def _inserted(value: Value, axis: int, shape: tuple[Dim, ...]) -> Value:
+def _insert_axis(value: Value, axis: int, shape: tuple[Dim, ...]) -> Value:
     if value.array is not None:
         return Value(shape, array=np.expand_dims(value.array, axis))
     axes = list(value.axes)
@@ -107,35 +107,35 @@ def _inserted(value: Value, axis: int, shape: tuple[Dim, ...]) -> Value:
     return replace(value, shape=shape, axes=tuple(axes))
 
 
-def joined(b: NnBuilder, values: Sequence[Value], axis: int, shape: tuple[Dim, ...]) -> Value:
+def join_along(b: NnBuilder, values: Sequence[Value], axis: int, shape: tuple[Dim, ...]) -> Value:
     """``values`` along ``axis`` of the graph."""
     axis %= len(shape)
-    values = [b.settled(v) for v in values if 0 not in v.shape]
+    values = [b.flatten_if_due(v) for v in values if 0 not in v.shape]
     if len(values) == 1:
         return values[0]
     if any(v.shape[axis] == BATCH for v in values):
-        raise b.refused("it joins along the batch", _MIXED)
+        raise b.nn_error("it joins along the batch", _MIXED)
     axes = _join_axes(values, axis, shape) or _usual(b, shape)
     place = axes[axis]
     parts = []
     for value in values:
         own = tuple(axes[i] if i == axis or d != 1 else None for i, d in enumerate(value.shape))
         if value.array is not None:
-            value = written(b, value, own)
-        parts.append(_replaced(b, value, own))
+            value = write_constant(b, value, own)
+        parts.append(_move_axes(b, value, own))
     result = Value(shape, axes)
     if place == C and all(p.dims[:3] == result.dims[:3] for p in parts):
         return b.join([replace(p, axes=axes) for p in parts], shape)
     if any(_off_axis(p.dims, place) != _off_axis(result.dims, place) for p in parts) or place is None:
-        raise b.refused(f"tensors of shapes {[list(v.shape) for v in values]}", "their other axes differ")
-    name = b.layer(LayerType.CONCAT, [b.stored(p) for p in parts], result.dims, axis=place)
-    return b.made(name, shape, axes)
+        raise b.nn_error(f"tensors of shapes {[list(v.shape) for v in values]}", "their other axes differ")
+    name = b.layer(LayerType.CONCAT, [b.stored_name(p) for p in parts], result.dims, axis=place)
+    return b.layer_value(name, shape, axes)
 
 
-def _replaced(b: NnBuilder, value: Value, axes: Axes) -> Value:
+def _move_axes(b: NnBuilder, value: Value, axes: Axes) -> Value:
     """The same tensor under ``axes`` that lie in the same places; moved where they do not."""
     long = [(a, w) for a, w, d in zip(value.axes, axes, value.shape, strict=True) if d != 1]
-    return replace(value, axes=axes) if all(a == w for a, w in long) else b.laid(value, axes)
+    return replace(value, axes=axes) if all(a == w for a, w in long) else b.with_axes(value, axes)
 
 
 def _off_axis(dims: Sequence[int], place: int | None) -> list[int]:
@@ -159,50 +159,50 @@ def _join_axes(values: Sequence[Value], axis: int, shape: tuple[Dim, ...]) -> Ax
     return tuple(axes) if fit else None
 
 
-def written(b: NnBuilder, value: Value, axes: Axes) -> Value:
+def write_constant(b: NnBuilder, value: Value, axes: Axes) -> Value:
     """A constant that has a row per agent as a tensor: a layer whose weights are 0 and whose bias it is."""
     assert value.array is not None
     if BATCH not in value.shape:
-        name = b.constant(b.placed(value.array, axes))
-        return b.made(name, value.shape, axes)
+        name = b.constant(b.place_constant(value.array, axes))
+        return b.layer_value(name, value.shape, axes)
     wanted = Value(value.shape, axes)
-    flat = b.placed(value.array, axes).reshape(-1)
+    flat = b.place_constant(value.array, axes).reshape(-1)
     name = b.constant_rows(flat, "rows")
     if wanted.dims != b.dims_of(name):
         name = b.layer(LayerType.RESHAPE, [name], wanted.dims, pool=wanted.dims, label="shaped")
-    return b.made(name, value.shape, axes)
+    return b.layer_value(name, value.shape, axes)
 
 
 def split(b: NnBuilder, args: Sequence[Value]) -> tuple[Value, ...]:
     """Split and SplitV: pieces one after the other along an axis."""
     axis_at = 0 if b.node.op == "Split" else 2
-    value = b.settled(args[0])
+    value = b.flatten_if_due(args[0])
     axis = int(b.known(axis_at, "the axis")) % len(value.shape)
     start, results = 0, []
     for index in range(int(b.node.attrs["num_split"])):
         length = b.shape_of(ref(b.node.name, index))[axis]
         assert isinstance(length, int)
-        results.append(taken(b, value, axis, start, start + length))
+        results.append(take_range(b, value, axis, start, start + length))
         start += length
     return tuple(results)
 
 
 def unpack(b: NnBuilder, args: Sequence[Value]) -> tuple[Value, ...]:
     """One tensor for each element of an axis, which is gone."""
-    value = b.settled(args[0])
+    value = b.flatten_if_due(args[0])
     axis = int(b.node.attrs["axis"]) % len(value.shape)
-    parts = [taken(b, value, axis, i, i + 1) for i in range(int(b.node.attrs["num"]))]
-    return tuple(_dropped(p, [axis]) for p in parts)
+    parts = [take_range(b, value, axis, i, i + 1) for i in range(int(b.node.attrs["num"]))]
+    return tuple(_drop_axes(p, [axis]) for p in parts)
 
 
-def taken(b: NnBuilder, value: Value, axis: int, start: int, stop: int) -> Value:
+def take_range(b: NnBuilder, value: Value, axis: int, start: int, stop: int) -> Value:
     """Elements ``start`` to ``stop`` of an axis."""
     length = value.shape[axis]
     shape = tuple(stop - start if i == axis else d for i, d in enumerate(value.shape))
     if (start, stop) == (0, length):
         return value
     if length == BATCH:
-        raise b.refused(*_CUTS_AGENTS)
+        raise b.nn_error(*_CUTS_AGENTS)
     place = value.axes[axis]
     assert place is not None
     axes = tuple(None if i == axis and stop - start == 1 else a for i, a in enumerate(value.axes))
@@ -214,13 +214,13 @@ def taken(b: NnBuilder, value: Value, axis: int, start: int, stop: int) -> Value
     dims[place] = stop - start
     n, h, w, c = dims
     name = b.layer(
-        LayerType.STRIDED_SLICE, [b.stored(value)], (n, h, w, c),
+        LayerType.STRIDED_SLICE, [b.stored_name(value)], (n, h, w, c),
         pad=tuple(pad), pool=tuple(pool), stride=(1, 1, 1, 1), label="part",
     )  # fmt: skip
-    return b.made(name, shape, axes)
+    return b.layer_value(name, shape, axes)
 
 
-def _dropped(value: Value, axes: Sequence[int]) -> Value:
+def _drop_axes(value: Value, axes: Sequence[int]) -> Value:
     """Without axes of length 1."""
     keep = [i for i in range(len(value.shape)) if i not in axes]
     return replace(value, shape=tuple(value.shape[i] for i in keep), axes=tuple(value.axes[i] for i in keep))
@@ -228,21 +228,21 @@ def _dropped(value: Value, axes: Sequence[int]) -> Value:
 
 def slice_(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Slice: a beginning and a size for each axis."""
-    value = b.settled(args[0])
+    value = b.flatten_if_due(args[0])
     begin, size = (b.known(i, "the bounds of a slice").tolist() for i in (1, 2))
     for axis, (first, count) in enumerate(zip(begin, size, strict=True)):
         length = value.shape[axis]
         if isinstance(length, str):
             if first != 0 or count != -1:
-                raise b.refused(*_CUTS_AGENTS)
+                raise b.nn_error(*_CUTS_AGENTS)
             continue
-        value = taken(b, value, axis, int(first), length if count == -1 else int(first) + int(count))
+        value = take_range(b, value, axis, int(first), length if count == -1 else int(first) + int(count))
     return value
 
 
 def strided_slice(b: NnBuilder, args: Sequence[Value]) -> Value:
     """StridedSlice: bounds, new axes and axes that are dropped; steps other than 1 take element by element."""
-    value = b.settled(args[0])
+    value = b.flatten_if_due(args[0])
     operands = [b.known(i, "the bounds of a slice").tolist() for i in (1, 2, 3)]
     axis, gone = 0, []
     for step in strided_steps(b.node, len(value.shape), *operands):
@@ -254,29 +254,29 @@ def strided_slice(b: NnBuilder, args: Sequence[Value]) -> Value:
         length = value.shape[axis]
         if step[0] == "take":
             if isinstance(length, str):
-                raise b.refused(*_CUTS_AGENTS)
+                raise b.nn_error(*_CUTS_AGENTS)
             index = int(step[1]) % length
-            value = taken(b, value, axis, index, index + 1)
+            value = take_range(b, value, axis, index, index + 1)
             gone.append(axis)
         elif isinstance(length, str):
             if step[1] not in (None, 0) or step[2] is not None or step[3] != 1:
-                raise b.refused(*_CUTS_AGENTS)
+                raise b.nn_error(*_CUTS_AGENTS)
         else:
             indices = list(range(*slice(step[1], step[2], step[3]).indices(length)))
-            value = chosen(b, value, axis, indices)
+            value = take_indices(b, value, axis, indices)
         axis += 1
-    return _dropped(value, gone)
+    return _drop_axes(value, gone)
 
 
-def chosen(b: NnBuilder, value: Value, axis: int, indices: Sequence[int]) -> Value:
+def take_indices(b: NnBuilder, value: Value, axis: int, indices: Sequence[int]) -> Value:
     """Elements of an axis in the order given."""
     if not indices:
-        raise b.refused("it cuts nothing out", "a tensor of a .nn has at least one number per agent")
+        raise b.nn_error("it cuts nothing out", "a tensor of a .nn has at least one number per agent")
     if list(indices) == list(range(indices[0], indices[-1] + 1)):
-        return taken(b, value, axis, indices[0], indices[-1] + 1)
-    parts = [taken(b, value, axis, i, i + 1) for i in indices]
+        return take_range(b, value, axis, indices[0], indices[-1] + 1)
+    parts = [take_range(b, value, axis, i, i + 1) for i in indices]
     shape = tuple(len(indices) if i == axis else d for i, d in enumerate(value.shape))
-    return joined(b, parts, axis, shape)
+    return join_along(b, parts, axis, shape)
 
 
 # ------------------------------------------------------------------ looking up
@@ -287,15 +287,15 @@ def gather(b: NnBuilder, args: Sequence[Value]) -> Value:
     value, indices = args
     axis = 0 if len(b.node.inputs) < 3 else int(b.known(2, "the axis"))
     if indices.array is not None and value.array is None:
-        value = b.settled(value)
+        value = b.flatten_if_due(value)
         axis %= len(value.shape)
         length = value.shape[axis]
         if indices.array.ndim > 1 or isinstance(length, str):
-            raise b.refused(f"indices of shape {list(indices.array.shape)}", "a list of indices can be written")
+            raise b.nn_error(f"indices of shape {list(indices.array.shape)}", "a list of indices can be written")
         flat = [int(i) % length for i in indices.array.reshape(-1)]
-        result = chosen(b, value, axis, flat)
-        return _dropped(result, [axis]) if indices.array.ndim == 0 else result
-    raise b.refused("its indices are computed", "rows of a constant table by one number per agent can be written")
+        result = take_indices(b, value, axis, flat)
+        return _drop_axes(result, [axis]) if indices.array.ndim == 0 else result
+    raise b.nn_error("its indices are computed", "rows of a constant table by one number per agent can be written")
 
 
 # ------------------------------------------------------------------ repeating, filling
@@ -303,26 +303,26 @@ def gather(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 def tile(b: NnBuilder, args: Sequence[Value]) -> Value:
     """The tensor several times along its axes."""
-    value, shape = b.settled(args[0]), b.shape_of(b.node.name)
+    value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
     if value.array is not None:
-        return _tiled(b, value.array, shape)
+        return _tile(b, value.array, shape)
     times = b.known(1, "the numbers of repetitions").tolist()
     for axis, count in enumerate(times):
         if count == 1:
             continue
         if value.shape[axis] == BATCH:
-            raise b.refused("it repeats agents", "a policy answers once for every agent")
+            raise b.nn_error("it repeats agents", "a policy answers once for every agent")
         longer = tuple(d * count if i == axis and isinstance(d, int) else d for i, d in enumerate(value.shape))
-        value = joined(b, [value] * count, axis, longer)
+        value = join_along(b, [value] * count, axis, longer)
     assert value.shape == shape
     return value
 
 
-def _tiled(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
+def _tile(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
     """A constant several times; once for every agent."""
     lengths = [(1 if isinstance(d, str) else d, n) for d, n in zip(shape, array.shape, strict=True)]
     if any(wanted % length for wanted, length in lengths):
-        raise b.refused(f"a constant of shape {list(array.shape)} to {list(shape)}", _MIXED)
+        raise b.nn_error(f"a constant of shape {list(array.shape)} to {list(shape)}", _MIXED)
     b.made_up(math.prod(wanted for wanted, _ in lengths))
     return Value(shape, array=np.tile(array, [wanted // length for wanted, length in lengths]))
 
@@ -332,20 +332,20 @@ def broadcast_to(b: NnBuilder, args: Sequence[Value]) -> Value:
     value, shape = args[0], b.shape_of(b.node.name)
     if value.array is not None:
         return constant_of(b, value.array, shape)
-    value = b.settled(value)
+    value = b.flatten_if_due(value)
     lead = len(shape) - len(value.shape)
     value = replace(value, shape=(*[1] * lead, *value.shape), axes=(*[None] * lead, *value.axes))
     for axis, (length, wanted) in enumerate(zip(value.shape, shape, strict=True)):
         if length == wanted:
             continue
         if not isinstance(wanted, int):
-            raise b.refused("it repeats a row for every agent", "only a constant can be repeated so")
+            raise b.nn_error("it repeats a row for every agent", "only a constant can be repeated so")
         longer = tuple(wanted if i == axis else d for i, d in enumerate(value.shape))
-        value = joined(b, [value] * wanted, axis, longer)
+        value = join_along(b, [value] * wanted, axis, longer)
     return value
 
 
-def filled(b: NnBuilder, args: Sequence[Value]) -> Value:
+def fill_constant(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Fill, ZerosLike, OnesLike: a constant with a row per agent."""
     shape = b.shape_of(b.node.name)
     if b.node.op == "Fill":
@@ -364,7 +364,7 @@ def constant_of(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Valu
 
 def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A border around the image; numbers in front of or behind the channels are joined on."""
-    value, shape = b.settled(args[0]), b.shape_of(b.node.name)
+    value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
     pairs = [(int(x), int(y)) for x, y in b.known(1, "the widths of the border").tolist()]
     fill = 0.0 if b.node.op == "Pad" else float(b.known(2, "the number that it fills with").reshape(()))
     edges = dict.fromkeys((H, W), (0, 0))
@@ -373,7 +373,7 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
         if (low, high) == (0, 0):
             continue
         if min(low, high) < 0 or value.shape[axis] == BATCH:
-            raise b.refused(f"a border of {low} and {high} on axis {axis}", "borders lie around the image")
+            raise b.nn_error(f"a border of {low} and {high} on axis {axis}", "borders lie around the image")
         if place in (H, W) and len(shape) == 4:
             edges[place] = (low, high)
             continue
@@ -383,11 +383,11 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
                 lengths = tuple(count if i == axis else d for i, d in enumerate(value.shape))
                 parts.insert(at, constant_of(b, np.array(fill, np.float32), lengths))
         longer = tuple(d + low + high if i == axis and isinstance(d, int) else d for i, d in enumerate(value.shape))
-        value = joined(b, parts, axis, longer)
+        value = join_along(b, parts, axis, longer)
     if all(pair == (0, 0) for pair in edges.values()):
         return value
     n, h, w, c = value.dims
     (top, bottom), (left, right) = edges[H], edges[W]
     dims = (n, h + top + bottom, w + left + right, c)
-    name = b.layer(LayerType.BORDER2D, [b.stored(value)], dims, pad=(left, top, right, bottom), beta=fill)
-    return b.made(name, shape, value.axes)
+    name = b.layer(LayerType.BORDER2D, [b.stored_name(value)], dims, pad=(left, top, right, bottom), beta=fill)
+    return b.layer_value(name, shape, value.axes)

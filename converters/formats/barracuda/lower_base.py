@@ -79,7 +79,7 @@ class NnBuilder:
         """The shape of a tensor of the graph; raises UnsupportedOpError where it is not known but for the batch."""
         shape = self.types[reference].shape
         if shape is None or any(isinstance(d, str) and d != BATCH for d in shape) or list(shape).count(BATCH) > 1:
-            raise self.refused(
+            raise self.nn_error(
                 f"the shape of {reference!r} is {'unknown' if shape is None else list(shape)}",
                 "the layers of a .nn have lengths that are known, all but the batch",
             )
@@ -89,10 +89,10 @@ class NnBuilder:
         """The constant operand of the current node, or UnsupportedOpError."""
         value = self.types[self.node.inputs[position]].constant
         if value is None:
-            raise self.refused(f"{meaning} is computed while the graph runs", "a .nn holds it as plain numbers")
+            raise self.nn_error(f"{meaning} is computed while the graph runs", "a .nn holds it as plain numbers")
         return value
 
-    def refused(self, what: str, why: str, fix: str | None = None) -> UnsupportedOpError:
+    def nn_error(self, what: str, why: str, fix: str | None = None) -> UnsupportedOpError:
         """The error for what a ``.nn`` cannot hold."""
         return UnsupportedOpError(
             f"node {self.node.name!r} ({self.node.op}) cannot be written to a .nn: {what}",
@@ -104,7 +104,7 @@ class NnBuilder:
     def made_up(self, elements: int) -> None:
         """Count numbers that are about to be made, beside those of the graph; raises UnsupportedOpError."""
         if not self._allowance.take(elements):
-            raise self.refused(
+            raise self.nn_error(
                 f"its constants unfold to {elements} numbers more",
                 "a .nn holds each as a plain number, and no policy has so many",
             )
@@ -112,7 +112,7 @@ class NnBuilder:
     def table(self, rows: int, columns: int) -> tuple[int, int]:
         """The shape of a matrix that is about to be made; raises UnsupportedOpError where it is too large."""
         if rows * columns > MAX_TABLE:
-            raise self.refused(
+            raise self.nn_error(
                 f"a table of {rows}×{columns} numbers",
                 f"it is computed by comparing each with each, and no more than {MAX_TABLE} pairs are",
             )
@@ -156,7 +156,7 @@ class NnBuilder:
             LayerType.ACTIVATION, [x], self.dims_of(x), activation=kind, label=label, alpha=alpha, beta=beta
         )
 
-    def given(self, name: str, dims: Dims) -> None:
+    def note_input(self, name: str, dims: Dims) -> None:
         """Note an input of the model (or of its memories)."""
         self._inputs.append(name)
         self._dims[name] = dims
@@ -212,11 +212,11 @@ class NnBuilder:
         dims = self.dims_of(a)
         return self.layer(kind, [a, b], dims, label=label)
 
-    def scaled(self, x: str, factor: float, label: str = "scaled") -> str:
+    def scale(self, x: str, factor: float, label: str = "scaled") -> str:
         """``x`` times a number."""
         return self.two(LayerType.MUL, x, self.number(factor), label)
 
-    def shifted(self, x: str, offset: float, label: str = "shifted") -> str:
+    def shift(self, x: str, offset: float, label: str = "shifted") -> str:
         """``x`` plus a number."""
         return self.two(LayerType.ADD, x, self.number(offset), label)
 
@@ -236,13 +236,13 @@ class NnBuilder:
             self._spread[key] = self.dense(x, np.ones((1, width)), np.zeros(width), "spread")
         return self._spread[key]
 
-    def named(self, name: str, tensor: str) -> None:
+    def name_tensor(self, name: str, tensor: str) -> None:
         """A linear activation called ``name``, as the trainers' converter ends an output."""
         self.drafts.append(Draft(name, LayerType.ACTIVATION, (tensor,)))
 
     # ------------------------------------------------------------------ values
 
-    def made(self, name: str, shape: tuple[Dim, ...], axes: Axes) -> Value:
+    def layer_value(self, name: str, shape: tuple[Dim, ...], axes: Axes) -> Value:
         """The tensor that a layer gives."""
         width = self.dims_of(name)[C]
         value = Value(shape, axes, (Piece(name, width, 0, width),))
@@ -254,19 +254,21 @@ class NnBuilder:
         shape = self.shape_of(self.node.name if index == 0 else f"{self.node.name}:{index}")
         axes = usual_axes(shape)
         assert axes is not None
-        return self.made(name, shape, axes)
+        return self.layer_value(name, shape, axes)
 
-    def settled(self, value: Value) -> Value:
+    def flatten_if_due(self, value: Value) -> Value:
         """``value`` with pieces: an image that was to be flattened is turned to the graph's order and flattened."""
         if value.flat_of is None:
             return value
-        name = self.stored(self.in_usual_place(value.flat_of))
-        return self.made(self.layer(LayerType.FLATTEN, [name], value.dims, label="flat"), value.shape, value.axes)
+        name = self.stored_name(self.in_usual_place(value.flat_of))
+        return self.layer_value(
+            self.layer(LayerType.FLATTEN, [name], value.dims, label="flat"), value.shape, value.axes
+        )
 
-    def stored(self, value: Value) -> str:
+    def stored_name(self, value: Value) -> str:
         """The one tensor of the file that ``value`` is: its pieces cut and joined, if there are several."""
         assert value.array is None
-        value = self.settled(value)
+        value = self.flatten_if_due(value)
         if len(value.pieces) == 1 and value.pieces[0].whole:
             return value.pieces[0].name
         if value.pieces not in self._joined:
@@ -307,13 +309,13 @@ class NnBuilder:
             first, last = max(start - at, 0), min(stop, self._ends[index]) - at
             if first < last:
                 pieces.append(replace(piece, start=piece.start + first, stop=piece.start + last))
-        return Value(shape, value.axes, self._merged(pieces))
+        return Value(shape, value.axes, self._merge_pieces(pieces))
 
     def join(self, values: Sequence[Value], shape: tuple[Dim, ...]) -> Value:
         """Tensors one after the other along C."""
-        return Value(shape, values[0].axes, self._merged([p for v in values for p in v.pieces]))
+        return Value(shape, values[0].axes, self._merge_pieces([p for v in values for p in v.pieces]))
 
-    def _merged(self, pieces: Sequence[Piece]) -> tuple[Piece, ...]:
+    def _merge_pieces(self, pieces: Sequence[Piece]) -> tuple[Piece, ...]:
         """Pieces, those that follow each other in one tensor as one."""
         merged: list[Piece] = []
         for piece in pieces:
@@ -322,12 +324,12 @@ class NnBuilder:
             else:
                 merged.append(piece)
         if len(merged) > MAX_PIECES:
-            raise self.refused(
+            raise self.nn_error(
                 f"{len(merged)} tensors are joined", f"no more than {MAX_PIECES} are; a policy has a few"
             )
         return tuple(merged)
 
-    def placed(self, array: npt.NDArray[np.generic], axes: Axes) -> Array:
+    def place_constant(self, array: npt.NDArray[np.generic], axes: Axes) -> Array:
         """A constant of the graph as [N, H, W, C], its axes (aligned at the end, as they broadcast) at ``axes``."""
         wide = array.reshape((1,) * (len(axes) - array.ndim) + array.shape)
         order = sorted((i for i in range(len(axes)) if wide.shape[i] != 1), key=lambda i: axes[i] or 0)
@@ -339,7 +341,7 @@ class NnBuilder:
         rest = [i for i in range(len(axes)) if i not in order]
         return np.ascontiguousarray(wide.transpose([*rest, *order]).reshape(lengths), np.float32)
 
-    def laid(self, value: Value, axes: Axes) -> Value:
+    def with_axes(self, value: Value, axes: Axes) -> Value:
         """``value`` with its axes at ``axes``: as it is, or moved by a Transpose or Reshape layer."""
         wanted = replace(value, axes=axes)
         if wanted.dims == value.dims and all(
@@ -348,8 +350,8 @@ class NnBuilder:
             return wanted
         long = [i for i, d in enumerate(value.shape) if d != 1]
         if sorted(long, key=lambda i: value.axes[i] or 0) == sorted(long, key=lambda i: axes[i] or 0):
-            name = self.layer(LayerType.RESHAPE, [self.stored(value)], wanted.dims, pool=wanted.dims, label="laid")
-            return self.made(name, value.shape, axes)
+            name = self.layer(LayerType.RESHAPE, [self.stored_name(value)], wanted.dims, pool=wanted.dims, label="laid")
+            return self.layer_value(name, value.shape, axes)
         # The axes that the graph counts, each where it shall be; those of length 1 fill the other places.
         order: list[int | None] = [None] * 4
         for i in long:
@@ -358,19 +360,21 @@ class NnBuilder:
             order[place] = value.axes[i]
         left = [a for a in range(4) if a not in order]
         filled = [left.pop(0) if o is None else o for o in order]
-        name = self.layer(LayerType.TRANSPOSE, [self.stored(value)], wanted.dims, pool=tuple(filled), label="turned")
-        return self.made(name, value.shape, axes)
+        name = self.layer(
+            LayerType.TRANSPOSE, [self.stored_name(value)], wanted.dims, pool=tuple(filled), label="turned"
+        )
+        return self.layer_value(name, value.shape, axes)
 
     def in_usual_place(self, value: Value) -> Value:
         """``value`` with its axes where they usually lie; raises UnsupportedOpError where they cannot."""
         axes = usual_axes(value.shape)
         if axes is None:
-            raise self.refused(
+            raise self.nn_error(
                 f"a tensor of shape {list(value.shape)}",
                 "a tensor of a .nn has the batch first and three axes more",
             )
-        return self.laid(value, axes)
+        return self.with_axes(value, axes)
 
     def rows(self, value: Value) -> str:
         """The tensor of a value [B, …], flattened in the graph's order: a name of [N, …] whose rows are the rows."""
-        return self.stored(self.in_usual_place(value))
+        return self.stored_name(self.in_usual_place(value))

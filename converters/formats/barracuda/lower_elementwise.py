@@ -50,17 +50,17 @@ _MIRRORED: Mapping[LayerType, LayerType] = {
 
 def activation(b: NnBuilder, args: Sequence[Value]) -> Value:
     """An op that every Barracuda has as an activation."""
-    return _mapped(b, args[0], lambda x: b.activation(_ACTIVATIONS[b.node.op], x))
+    return _map_numbers(b, args[0], lambda x: b.activation(_ACTIVATIONS[b.node.op], x))
 
 
-def applied(b: NnBuilder, value: Value, name: str) -> Value:
+def apply_activation(b: NnBuilder, value: Value, name: str) -> Value:
     """The activation that another op has fused into it."""
-    return _mapped(b, value, lambda x: b.activation(_ACTIVATIONS[name], x, label=name))
+    return _map_numbers(b, value, lambda x: b.activation(_ACTIVATIONS[name], x, label=name))
 
 
-def _mapped(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Value:
+def _map_numbers(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Value:
     """A tensor computed number by number from another; its axes stay where they are."""
-    return b.made(make(b.stored(value)), value.shape, value.axes)
+    return b.layer_value(make(b.stored_name(value)), value.shape, value.axes)
 
 
 def _leaky_relu(b: NnBuilder, x: str) -> str:
@@ -68,7 +68,7 @@ def _leaky_relu(b: NnBuilder, x: str) -> str:
     alpha = float(b.node.attrs["alpha"])
     if 0 <= alpha <= 1:
         return b.activation(Activation.LEAKY_RELU, x, alpha=alpha)
-    return b.two(LayerType.ADD, b.at_least(x, 0), b.scaled(b.at_most(x, 0), alpha))
+    return b.two(LayerType.ADD, b.at_least(x, 0), b.scale(b.at_most(x, 0), alpha))
 
 
 _FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
@@ -80,7 +80,7 @@ _FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
 
 def formula(b: NnBuilder, args: Sequence[Value]) -> Value:
     """An op that is spelled out."""
-    return _mapped(b, args[0], lambda x: _FORMULAS[b.node.op](b, x))
+    return _map_numbers(b, args[0], lambda x: _FORMULAS[b.node.op](b, x))
 
 
 # ------------------------------------------------------------------ two operands
@@ -95,13 +95,13 @@ class _Pair:
         if axes is None:
             usual = usual_axes(shape)
             if usual is None:
-                raise b.refused(f"a result of shape {list(shape)}", "the batch comes first, and three axes more")
-            args = [v if v.array is not None else b.laid(v, _own(usual, v)) for v in args]
+                raise b.nn_error(f"a result of shape {list(shape)}", "the batch comes first, and three axes more")
+            args = [v if v.array is not None else b.with_axes(v, _own(usual, v)) for v in args]
             axes = usual
         self.axes: Axes = axes
         self.dims = Value(shape, axes).dims
-        self.arrays = [None if v.array is None else b.placed(v.array, axes) for v in args]
-        self.names = [b.stored(v) if a is None else b.constant(a) for v, a in zip(args, self.arrays, strict=True)]
+        self.arrays = [None if v.array is None else b.place_constant(v.array, axes) for v in args]
+        self.names = [b.stored_name(v) if a is None else b.constant(a) for v, a in zip(args, self.arrays, strict=True)]
         self.names = [self._wide(name, a is not None) for name, a in zip(self.names, self.arrays, strict=True)]
 
     def _wide(self, name: str, constant: bool) -> str:
@@ -115,8 +115,8 @@ class _Pair:
         """Whether an operand has all the lengths of the result."""
         return self.b.dims_of(self.names[position]) == self.dims
 
-    def made(self, name: str) -> Value:
-        return self.b.made(name, self.shape, self.axes)
+    def pair_value(self, name: str) -> Value:
+        return self.b.layer_value(name, self.shape, self.axes)
 
 
 def _own(axes: Axes, value: Value) -> Axes:
@@ -161,7 +161,7 @@ def both(b: NnBuilder, args: Sequence[Value]) -> Value:
     first, second = pair.names
     if not pair.full(0) or (pair.arrays[0] is not None and pair.full(1)):
         first, second = second, first
-    return pair.made(_two(b, pair, _TWO[b.node.op], first, second))
+    return pair.pair_value(_two(b, pair, _TWO[b.node.op], first, second))
 
 
 def _two(b: NnBuilder, pair: _Pair, kind: LayerType, first: str, second: str, label: str = "") -> str:
@@ -170,33 +170,33 @@ def _two(b: NnBuilder, pair: _Pair, kind: LayerType, first: str, second: str, la
 
 def swish(b: NnBuilder, args: Sequence[Value]) -> Value:
     """X·sigmoid(x) as the one activation that it is in every genuine file; ``args`` is x."""
-    return _mapped(b, args[0], lambda x: b.activation(Activation.SWISH, x))
+    return _map_numbers(b, args[0], lambda x: b.activation(Activation.SWISH, x))
 
 
 def subtract(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A − b; −b + a where a is a constant or is repeated."""
-    return _undone(b, args, LayerType.SUB, LayerType.ADD, lambda x: b.scaled(x, -1, "negative"))
+    return _by_inverse(b, args, LayerType.SUB, LayerType.ADD, lambda x: b.scale(x, -1, "negative"))
 
 
 def divide(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A / b; the reciprocal of b times a where a is a constant or is repeated."""
     if b.type_of(b.node.inputs[0]).dtype.kind != "f":
-        raise b.refused("it divides integers", "a .nn knows floats alone")
+        raise b.nn_error("it divides integers", "a .nn knows floats alone")
     reciprocal = partial(b.activation, Activation.RECIPROCAL, label="reciprocal")
-    return _undone(b, args, LayerType.DIV, LayerType.MUL, reciprocal)
+    return _by_inverse(b, args, LayerType.DIV, LayerType.MUL, reciprocal)
 
 
-def _undone(
+def _by_inverse(
     b: NnBuilder, args: Sequence[Value], kind: LayerType, other: LayerType, turned: Callable[[str], str]
 ) -> Value:
     """``kind`` of two operands, or ``other`` of the first and the second ``turned``, which may change places."""
     pair = _pair(b, args)
     first, second = pair.names
     if pair.full(0) and pair.arrays[0] is None:
-        return pair.made(b.two(kind, first, second))
+        return pair.pair_value(b.two(kind, first, second))
     second = turned(second)
     ordered = (second, first) if pair.full(1) else (first, second)
-    return pair.made(_two(b, pair, other, *ordered))
+    return pair.pair_value(_two(b, pair, other, *ordered))
 
 
 def power(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -205,28 +205,28 @@ def power(b: NnBuilder, args: Sequence[Value]) -> Value:
     if exponent is not None and exponent.size == 1 and args[0].shape == b.shape_of(b.node.name):
         number = float(exponent.reshape(()))
         if number == 0.5:
-            return _mapped(b, args[0], lambda x: b.activation(Activation.SQRT, x))
+            return _map_numbers(b, args[0], lambda x: b.activation(Activation.SQRT, x))
         if number == 2:
-            return _mapped(b, args[0], lambda x: b.two(LayerType.MUL, x, x))
+            return _map_numbers(b, args[0], lambda x: b.two(LayerType.MUL, x, x))
     pair = _pair(b, args)
     if pair.full(0) and pair.arrays[0] is None:
-        return pair.made(b.two(LayerType.POW, *pair.names))
-    raise b.refused("its base is a constant or is repeated", "early versions of Barracuda compute another power")
+        return pair.pair_value(b.two(LayerType.POW, *pair.names))
+    raise b.nn_error("its base is a constant or is repeated", "early versions of Barracuda compute another power")
 
 
 def floor_divide(b: NnBuilder, args: Sequence[Value]) -> Value:
     """The whole part of a / b."""
     pair = _pair(b, args)
     if not pair.full(0) or pair.arrays[0] is not None:
-        raise b.refused("its first operand is a constant or is repeated", "early versions of Barracuda swap them")
+        raise b.nn_error("its first operand is a constant or is repeated", "early versions of Barracuda swap them")
     first, second = pair.names
-    return pair.made(b.activation(Activation.FLOOR, b.two(LayerType.DIV, first, second, "quotient")))
+    return pair.pair_value(b.activation(Activation.FLOOR, b.two(LayerType.DIV, first, second, "quotient")))
 
 
 def squared_difference(b: NnBuilder, args: Sequence[Value]) -> Value:
     """(a − b)²."""
     difference = subtract(b, args)
-    return _mapped(b, difference, lambda x: b.two(LayerType.MUL, x, x))
+    return _map_numbers(b, difference, lambda x: b.two(LayerType.MUL, x, x))
 
 
 def compare(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -236,10 +236,10 @@ def compare(b: NnBuilder, args: Sequence[Value]) -> Value:
     if not pair.full(0) or (pair.arrays[0] is not None and pair.full(1)):
         first, second, kind = second, first, _MIRRORED[kind]
     name = _two(b, pair, kind, first, second)
-    return pair.made(b.shifted(b.scaled(name, -1), 1) if b.node.op == "NotEqual" else name)
+    return pair.pair_value(b.shift(b.scale(name, -1), 1) if b.node.op == "NotEqual" else name)
 
 
-def _combined(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape: tuple[Dim, ...]) -> Value:
+def _combine(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape: tuple[Dim, ...]) -> Value:
     """Two values combined inside of an op: constants at once, others by layers."""
     if first.array is not None and second.array is not None:
         functions = {LayerType.MUL: np.multiply, LayerType.ADD: np.add}
@@ -248,7 +248,7 @@ def _combined(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape:
     shape = _broadcast(first, second, shape)
     pair = _Pair(b, [first, second], shape)
     names = pair.names if pair.full(0) and pair.arrays[0] is None else pair.names[::-1]
-    return pair.made(_two(b, pair, kind, names[0], names[1], "chosen"))
+    return pair.pair_value(_two(b, pair, kind, names[0], names[1], "chosen"))
 
 
 def _broadcast(first: Value, second: Value, shape: tuple[Dim, ...]) -> tuple[Dim, ...]:
@@ -269,7 +269,7 @@ def clip(b: NnBuilder, args: Sequence[Value]) -> Value:
     result = x
     for kind, bound in ((LayerType.MIN, high), (LayerType.MAX, low)):
         pair = _Pair(b, [result, bound], shape)
-        result = pair.made(_two(b, pair, kind, *(pair.names if pair.full(0) else pair.names[::-1])))
+        result = pair.pair_value(_two(b, pair, kind, *(pair.names if pair.full(0) else pair.names[::-1])))
     return result
 
 
@@ -277,7 +277,7 @@ def add_n(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A sum of several, two at a time."""
     total = args[0]
     for value in args[1:]:
-        total = _combined(b, LayerType.ADD, total, value, b.shape_of(b.node.name))
+        total = _combine(b, LayerType.ADD, total, value, b.shape_of(b.node.name))
     return total
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.formats.barracuda.lower_base import NnBuilder
-from converters.formats.barracuda.lower_elementwise import applied
+from converters.formats.barracuda.lower_elementwise import apply_activation
 from converters.formats.barracuda.lower_values import Value
 from converters.formats.barracuda.vocabulary import Activation, C, LayerType, N
 from converters.graph.ops.table import traits
@@ -27,11 +27,11 @@ FORBIDDEN = -1e4
 # ------------------------------------------------------------------ products
 
 
-def fused(b: NnBuilder, args: Sequence[Value]) -> Value:
+def fused_layer(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A product or convolution with its bias, and the activations behind it."""
     value = (matmul if b.node.op == "_FusedMatMul" else conv2d)(b, args)
     for name in b.node.attrs["fused_ops"][1:]:
-        value = applied(b, value, name)
+        value = apply_activation(b, value, name)
     return value
 
 
@@ -40,7 +40,7 @@ def matmul(b: NnBuilder, args: Sequence[Value]) -> Value:
     x, kernel = args[0], args[1].array
     attrs = b.node.attrs
     if kernel is None or x.array is not None or attrs.get("transpose_a") or attrs.get("adj_x") or kernel.ndim != 2:
-        raise b.refused(
+        raise b.nn_error(
             "one of its operands has more rows than one per agent, or both are computed",
             "version 16 of the format has products with constant matrices alone (Barracuda has others from 2.0 on)",
         )
@@ -50,18 +50,18 @@ def matmul(b: NnBuilder, args: Sequence[Value]) -> Value:
     if len(x.shape) != 2 or x.shape[0] != BATCH:
         return _last_axis(b, x, kernel, bias)
     if x.flat_of is not None:
-        name, kernel = _flattened(b, x.flat_of, kernel)
+        name, kernel = _flatten_image(b, x.flat_of, kernel)
     else:
         name = b.rows(x)
     return b.result(b.dense(name, kernel, bias))
 
 
-def _flattened(b: NnBuilder, image: Value, kernel: np.ndarray) -> tuple[str, np.ndarray]:
+def _flatten_image(b: NnBuilder, image: Value, kernel: np.ndarray) -> tuple[str, np.ndarray]:
     """An image flattened as it lies in the file, and the matrix with its rows in that order."""
     lengths = [1 if isinstance(d, str) else d for d in image.shape]
     counted = np.arange(image.size, dtype=np.int64).reshape(lengths)
-    places = b.placed(counted, image.axes).reshape(-1).astype(np.int64)
-    name = b.stored(image)
+    places = b.place_constant(counted, image.axes).reshape(-1).astype(np.int64)
+    name = b.stored_name(image)
     flat = b.layer(LayerType.FLATTEN, [name], (b.dims_of(name)[N], 1, 1, image.size), label="flat")
     b.made_up(kernel.size)
     return flat, kernel[places]
@@ -70,19 +70,19 @@ def _flattened(b: NnBuilder, image: Value, kernel: np.ndarray) -> tuple[str, np.
 def _last_axis(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray) -> Value:
     """A product over the last of several axes (torch's Linear on sequences): a convolution by one pixel."""
     if BATCH not in x.shape or not x.in_order:
-        raise b.refused(f"a tensor of shape {list(x.shape)} times a matrix", "a row per agent can be multiplied")
+        raise b.nn_error(f"a tensor of shape {list(x.shape)} times a matrix", "a row per agent can be multiplied")
     value = b.in_usual_place(x)
     n, h, w, c = value.dims
     if c != kernel.shape[0]:
-        raise b.refused(
+        raise b.nn_error(
             f"a tensor of shape {list(x.shape)} times a matrix", "its last axis has length 1 or is the batch"
         )
     name = b.layer(
-        LayerType.CONV2D, [b.stored(value)], (n, h, w, kernel.shape[1]), stride=(1, 1),
+        LayerType.CONV2D, [b.stored_name(value)], (n, h, w, kernel.shape[1]), stride=(1, 1),
         data=[("kernel", kernel.reshape(1, 1, *kernel.shape)), ("bias", bias.reshape(1, 1, 1, -1))],
     )  # fmt: skip
     shape = b.shape_of(b.node.name)
-    return b.made(name, shape, (*value.axes[:-1], None if shape[-1] == 1 else C))
+    return b.layer_value(name, shape, (*value.axes[:-1], None if shape[-1] == 1 else C))
 
 
 # ------------------------------------------------------------------ windows
@@ -91,12 +91,12 @@ def _last_axis(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray) -> 
 def conv2d(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A convolution; a dilated kernel is written with its zeros."""
     kernel = _kernel(b, args[1])
-    return _convolved(b, args[0], kernel, _bias(args, kernel.shape[3]), LayerType.CONV2D)
+    return _convolve(b, args[0], kernel, _bias(args, kernel.shape[3]), LayerType.CONV2D)
 
 
 def _kernel(b: NnBuilder, value: Value) -> np.ndarray:
     if value.array is None:
-        raise b.refused("its kernel is computed", "the kernels of a .nn are constants")
+        raise b.nn_error("its kernel is computed", "the kernels of a .nn are constants")
     return value.array
 
 
@@ -113,15 +113,15 @@ def depthwise(b: NnBuilder, args: Sequence[Value]) -> Value:
     height, width, channels, many = kernel.shape
     bias = np.zeros(channels * many, np.float32)
     if many == 1:
-        return _convolved(b, args[0], kernel.transpose(0, 1, 3, 2), bias, LayerType.DEPTHWISE_CONV2D)
+        return _convolve(b, args[0], kernel.transpose(0, 1, 3, 2), bias, LayerType.DEPTHWISE_CONV2D)
     b.made_up(kernel.size * channels)
     full = np.zeros((height, width, channels, channels * many), np.float32)
     for channel in range(channels):
         full[:, :, channel, channel * many : (channel + 1) * many] = kernel[:, :, channel]
-    return _convolved(b, args[0], full, bias, LayerType.CONV2D)
+    return _convolve(b, args[0], full, bias, LayerType.CONV2D)
 
 
-def _convolved(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray, kind: LayerType) -> Value:
+def _convolve(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray, kind: LayerType) -> Value:
     down, across = b.node.attrs.get("dilations", (1, 1, 1, 1))[1:3]
     if (down, across) != (1, 1):
         height, width, *rest = kernel.shape
@@ -144,15 +144,15 @@ def pool(b: NnBuilder, args: Sequence[Value]) -> Value:
 def _window(
     b: NnBuilder, x: Value, kind: LayerType, data: Sequence[tuple[str, np.ndarray]], pool: tuple[int, ...] = ()
 ) -> Value:
-    image = b.laid(b.settled(x), (0, 1, 2, 3))
+    image = b.with_axes(b.flatten_if_due(x), (0, 1, 2, 3))
     shape = b.shape_of(b.node.name)
     result = Value(shape, (0, 1, 2, 3))
     down, across = (int(s) for s in b.node.attrs["strides"][1:3])
     name = b.layer(
-        kind, [b.stored(image)], result.dims, data=data, stride=(across, down), pool=pool,
+        kind, [b.stored_name(image)], result.dims, data=data, stride=(across, down), pool=pool,
         pad=_SAME if b.node.attrs["padding"] == "SAME" else (0, 0, 0, 0),
     )  # fmt: skip
-    return b.made(name, shape, (0, 1, 2, 3))
+    return b.layer_value(name, shape, (0, 1, 2, 3))
 
 
 # ------------------------------------------------------------------ reductions
@@ -171,19 +171,19 @@ REDUCED = tuple(_REDUCED)
 
 def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Sum, mean, largest, smallest, product: over everything that an agent has, over the channels, or over an image."""
-    value, shape = b.settled(args[0]), b.shape_of(b.node.name)
+    value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
     axes = {int(a) % len(value.shape) for a in np.atleast_1d(b.known(1, "the axes"))}
     long = [i for i in axes if value.shape[i] != 1]
     if any(value.shape[i] == BATCH for i in long):
-        raise b.refused("it reduces over the batch", "an agent's action would depend on the other agents")
+        raise b.nn_error("it reduces over the batch", "an agent's action would depend on the other agents")
     left = [i for i, d in enumerate(value.shape) if d not in (1, BATCH) and i not in axes]
     keep = bool(b.node.attrs["keep_dims"])
     kept = [i for i in range(len(value.shape)) if keep or i not in axes]
     places = tuple(None if i in axes else value.axes[i] for i in kept)
-    name = b.stored(value)
+    name = b.stored_name(value)
     if long:
         name = _reduced(b, value, name, [value.axes[i] for i in long], whole=not left)
-    return b.made(name, shape, places)
+    return b.layer_value(name, shape, places)
 
 
 def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
@@ -198,7 +198,7 @@ def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None]
         return b.dense(name, np.full((width, 1), share), np.zeros(1))
     if summed and pixels:
         pooled = b.layer(LayerType.GLOBAL_AVG_POOL2D, [name], (n, 1, 1, c), label="" if mean else "mean")
-        return pooled if mean else b.scaled(pooled, h * w)
+        return pooled if mean else b.scale(pooled, h * w)
     if summed and places == [C]:
         kernel = np.full((1, 1, c, 1), 1 / c if mean else 1.0)
         data = [("kernel", kernel), ("bias", np.zeros((1, 1, 1, 1)))]
@@ -210,13 +210,13 @@ def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None]
         pooled = b.layer(
             kind, [name], (n, h // down, w // across, c), pool=(across, down), stride=(across, down), label="pooled"
         )
-        return b.scaled(pooled, down * across) if summed and not mean else pooled
+        return b.scale(pooled, down * across) if summed and not mean else pooled
     if op in _REDUCED and whole and len(places) > 1:
         name = b.layer(LayerType.FLATTEN, [name], (n, 1, 1, width), label="flat")
         return b.layer(_REDUCED[op], [name], (n, 1, 1, 1))
     if op in _REDUCED and places == [C]:
         return b.layer(_REDUCED[op], [name], (n, h, w, 1))
-    raise b.refused(f"a {op} of {list(value.shape)} over part of the image", "version 16 reduces over the channels")
+    raise b.nn_error(f"a {op} of {list(value.shape)} over part of the image", "version 16 reduces over the channels")
 
 
 def softmax(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -224,18 +224,18 @@ def softmax(b: NnBuilder, args: Sequence[Value]) -> Value:
     value = args[0]
     kind = Activation.SOFTMAX if b.node.op == "Softmax" else Activation.LOG_SOFTMAX
     if sum(d not in (1, BATCH) for d in value.shape) > 1 or (value.size > 1 and value.shape[-1] == 1):
-        raise b.refused(f"a tensor of shape {list(value.shape)}", "Barracuda up to 1.4 takes a whole row")
-    x = b.settled(value)
-    return b.made(b.activation(kind, b.rows(x)), x.shape, x.axes)
+        raise b.nn_error(f"a tensor of shape {list(value.shape)}", "Barracuda up to 1.4 takes a whole row")
+    x = b.flatten_if_due(value)
+    return b.layer_value(b.activation(kind, b.rows(x)), x.shape, x.axes)
 
 
 def best_score(b: NnBuilder, x: str, width: int, label: str) -> str:
     """0 at the largest number of a row, ``FORBIDDEN`` elsewhere: what a sampler draws from is then sure."""
     if width == 1:
-        return b.scaled(x, 0, label)
+        return b.scale(x, 0, label)
     top = b.layer(LayerType.REDUCE_MAX, [x], (b.dims_of(x)[N], 1, 1, 1), label=f"{label}/largest")
     below = b.two(LayerType.SUB, x, b.spread(top, width), f"{label}/below")
-    return b.two(LayerType.MAX, b.scaled(below, 1e30, f"{label}/steep"), b.number(FORBIDDEN), label)
+    return b.two(LayerType.MAX, b.scale(below, 1e30, f"{label}/steep"), b.number(FORBIDDEN), label)
 
 
 def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -244,11 +244,11 @@ def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
     Of layers that every Barracuda has (ArgMax is one from 1.4 on): the place of the one that is as large as the
     largest, and before which there is no other.
     """
-    value = b.settled(args[0])
+    value = b.flatten_if_due(args[0])
     axis = int(b.known(1, "the axis").reshape(())) % len(value.shape)
     width, row = value.size, [i for i, d in enumerate(value.shape) if d not in (1, BATCH)]
     if BATCH not in value.shape or (width > 1 and row != [axis]):
-        raise b.refused(f"the best of {list(value.shape)} along axis {axis}", "it takes one row of scores per agent")
+        raise b.nn_error(f"the best of {list(value.shape)} along axis {axis}", "it takes one row of scores per agent")
     x = b.rows(value)
     if width == 1:
         return b.result(b.constant_rows(np.zeros(1, np.float32), "only"))
@@ -267,9 +267,9 @@ def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
 def drawn_class(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A class of each row, drawn by its log-probabilities."""
     count = int(b.known(1, "the number of draws").reshape(()))
-    x = b.rows(b.settled(args[0]))
+    x = b.rows(b.flatten_if_due(args[0]))
     name = b.layer(LayerType.MULTINOMIAL, [x], (b.dims_of(x)[N], 1, 1, count), pool=(count,))
-    return b.made(name, b.shape_of(b.node.name), (N, None if count == 1 else C))
+    return b.layer_value(name, b.shape_of(b.node.name), (N, None if count == 1 else C))
 
 
 def random(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -282,9 +282,9 @@ def noise(b: NnBuilder, shape: tuple[int | str, ...], kind: LayerType = LayerTyp
     """A tensor of drawn numbers."""
     flat = (BATCH, math.prod(d for d in shape if isinstance(d, int)))
     if shape[:1] != (BATCH,) or len(shape) != 2:
-        raise b.refused(f"it draws a tensor of shape {list(shape)}", "a row of numbers per agent can be drawn")
+        raise b.nn_error(f"it draws a tensor of shape {list(shape)}", "a row of numbers per agent can be drawn")
     dims = (-1, 1, 1, flat[1])
     like = b.like(dims)
     if like is None:
         like = b.constant_rows(np.zeros(flat[1], np.float32), "like")
-    return b.made(b.layer(kind, [like], dims), shape, (0, None if flat[1] == 1 else C))
+    return b.layer_value(b.layer(kind, [like], dims), shape, (0, None if flat[1] == 1 else C))

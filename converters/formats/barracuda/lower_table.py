@@ -26,7 +26,7 @@ Lower = Callable[[NnBuilder, Sequence[Value]], "Value | tuple[Value, ...]"]
 
 def _layerless(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Raise UnsupportedOpError: an op that is decomposed, in a form that cannot be."""
-    raise _unknown(b, b.node)
+    raise _unknown_error(b, b.node)
 
 
 _FIRST = slice(0, 1)
@@ -63,11 +63,11 @@ _OPS: Mapping[str, tuple[Lower, slice]] = {
     **dict.fromkeys(("Select", "SelectV2"), (_layerless, _ALL)),
     "Tile": (arrays.tile, _FIRST),
     "BroadcastTo": (arrays.broadcast_to, _FIRST),
-    **dict.fromkeys(("Fill", "ZerosLike", "OnesLike"), (arrays.filled, slice(0, 0))),
+    **dict.fromkeys(("Fill", "ZerosLike", "OnesLike"), (arrays.fill_constant, slice(0, 0))),
     **dict.fromkeys(("Pad", "PadV2"), (arrays.pad, _FIRST)),
     **dict.fromkeys(("MatMul", "BatchMatMul"), (linear.matmul, _ALL)),
     "Conv2D": (linear.conv2d, _ALL),
-    **dict.fromkeys(("_FusedMatMul", "_FusedConv2D"), (linear.fused, _ALL)),
+    **dict.fromkeys(("_FusedMatMul", "_FusedConv2D"), (linear.fused_layer, _ALL)),
     "DepthwiseConv2dNative": (linear.depthwise, _ALL),
     **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
     **dict.fromkeys(("Sum", "Mean", *linear.REDUCED), (linear.reduce, _FIRST)),
@@ -91,29 +91,29 @@ def lower_graph(b: NnBuilder, graph: Graph, given: dict[str, Value], wanted: Ite
     """
     wanted = [normal_ref(r) for r in wanted]
     values = dict(given)
-    needed = _needed(b, graph, wanted, given)
+    needed = _needed_nodes(b, graph, wanted, given)
     consumers = graph.consumers()
     for node in graph.nodes:
         if node.name not in needed or node.name in given:
             continue
         b.node = node
-        swish = _swished(graph, node)
+        swish = _swish_input(graph, node)
         if swish is not None:
             results: tuple[Value, ...] = (elementwise.swish(b, [_value(b, values, swish)]),)
         elif (
             node.op == "Sigmoid"
-            and all(_swished(graph, n) is not None for n in consumers[node.name])
+            and all(_swish_input(graph, n) is not None for n in consumers[node.name])
             and (node.name not in wanted and consumers[node.name])
         ):
             continue  # every reader multiplies it with its own input
         else:
-            results = _lowered(b, node, values)
+            results = _lower_node(b, node, values)
         for index, value in enumerate(results):
             values[ref(node.name, index)] = value
     return {r: _value(b, values, r) for r in wanted}
 
 
-def _needed(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict[str, Value]) -> set[str]:
+def _needed_nodes(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict[str, Value]) -> set[str]:
     """The nodes that data comes from; what is known before the graph runs is a constant and ends the search."""
 
     def makers(references: Iterable[str]) -> Iterator[str]:
@@ -125,21 +125,21 @@ def _needed(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict[str, 
         node = graph[name]
         if node.op not in _OPS or (node.op == "Multinomial" and not b.draws):
             b.node = node
-            raise _unknown(b, node)
+            raise _unknown_error(b, node)
         return makers(map(normal_ref, node.inputs[_OPS[node.op][1]]))
 
     return reachable(makers(wanted), ahead)
 
 
-def _unknown(b: NnBuilder, node: Node) -> UnsupportedOpError:
+def _unknown_error(b: NnBuilder, node: Node) -> UnsupportedOpError:
     if node.op == "Placeholder":
-        return b.refused(
+        return b.nn_error(
             "ML-Agents of those years has nothing to feed it with",
             "it feeds vectors, images, masks, the previous action, noise and memories; lists of entities "
             "and other inputs have no place in version 16 of the format",
             "give it a value with --set NAME=VALUE or its role with --input NAME=ROLE, or leave nn out of --to",
         )
-    return b.refused("no layer computes it", _WHY.get(node.op, "no layer that every Barracuda has computes it"))
+    return b.nn_error("no layer computes it", _WHY.get(node.op, "no layer that every Barracuda has computes it"))
 
 
 def _value(b: NnBuilder, values: dict[str, Value], reference: str) -> Value:
@@ -152,22 +152,22 @@ def _value(b: NnBuilder, values: dict[str, Value], reference: str) -> Value:
     return values[reference]
 
 
-def _lowered(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value, ...]:
+def _lower_node(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value, ...]:
     function, data = _OPS[node.op]
     args = [_value(b, values, r) for r in node.inputs[data]]
     # An op that repeats a constant as often as there are agents gives what is only known when the graph runs.
     entry = op_of(node)
     if args and entry.moves != "repeat" and all(a.array is not None for a in args):
-        return _computed(b, node, values)
+        return _compute_constant(b, node, values)
     flattens = entry.layer == "dense" and node.op != "BatchMatMul"
     try:
-        result = function(b, [a if flattens else b.settled(a) for a in args])
+        result = function(b, [a if flattens else b.flatten_if_due(a) for a in args])
     except MISFIT as error:
         raise misfit(node, error) from error
     return result if isinstance(result, tuple) else (result,)
 
 
-def _computed(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value, ...]:
+def _compute_constant(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value, ...]:
     """What depends on no input: one row of it, which is the same for every agent."""
     entry = op_of(node)
     operands = []
@@ -178,7 +178,7 @@ def _computed(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value
             else None
         )
         if value is None or value.array is None or entry.kernel is None:
-            raise b.refused("it repeats a constant by a number that is computed", "lengths are known in a .nn")
+            raise b.nn_error("it repeats a constant by a number that is computed", "lengths are known in a .nn")
         operands.append(np.asarray(value.array))
     made = itertools.takewhile(b.types.__contains__, (ref(node.name, i) for i in itertools.count()))
     shapes = [b.shape_of(r) for r in made]
@@ -186,11 +186,11 @@ def _computed(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value
     arrays_ = run_kernel(entry, node, operands)
     for array, shape in zip(arrays_, shapes, strict=True):
         if [1 if d == BATCH else d for d in shape] != list(array.shape):
-            raise b.refused(f"a constant of shape {list(shape)}", "its rows are not the same for every agent")
+            raise b.nn_error(f"a constant of shape {list(shape)}", "its rows are not the same for every agent")
     return tuple(Value(s, array=a) for s, a in zip(shapes, arrays_, strict=True))
 
 
-def _swished(graph: Graph, node: Node) -> str | None:
+def _swish_input(graph: Graph, node: Node) -> str | None:
     """The x of x·sigmoid(x), None where the node is something else."""
     if node.op != "Mul" or len(node.inputs) != 2:
         return None

@@ -28,7 +28,7 @@ def axis_of(b: LayerBuilder, axis: int) -> int:
         return axis
     if b.version >= EIGHT_AXES and axis in EIGHT:
         return EIGHT.index(axis)
-    raise b.unsupported(f"the axis is {axis}", "the tensors of a policy have the axes N, H, W and C")
+    raise b.unsupported_error(f"the axis is {axis}", "the tensors of a policy have the axes N, H, W and C")
 
 
 def flatten(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -48,20 +48,20 @@ def reshape(b: LayerBuilder, args: Sequence[Value]) -> Value:
     elif len(args) == 2 and b.layer.axis == 1 and args[1].constant is not None:
         numbers = b.whole(args[1].constant)
         if len(numbers) > 4:
-            raise b.unsupported(f"the target is {numbers}", "more than four axes are not translated")
+            raise b.unsupported_error(f"the target is {numbers}", "more than four axes are not translated")
         target = [*numbers, *[1] * (4 - len(numbers))]
     elif len(args) == 2 and b.layer.axis != 1:
         target = [-1 if d is None else d for d in args[1].shape]
     else:
-        raise b.unsupported("its shape is computed", "a shape must be known before the model runs")
-    return b.shaped(x.reference, _reshaped(b, x, target), x.integer)
+        raise b.unsupported_error("its shape is computed", "a shape must be known before the model runs")
+    return b.as_shape(x.reference, _reshaped_shape(b, x, target), x.integer)
 
 
-def _reshaped(b: LayerBuilder, x: Value, target: list[int]) -> Shape:
+def _reshaped_shape(b: LayerBuilder, x: Value, target: list[int]) -> Shape:
     n, *lengths = x.shape
     wanted = [length if t == 0 else t for t, length in zip(target[1:], lengths, strict=True)]
     if [target[0], *wanted].count(-1) > 1 or min(target) < -1:
-        raise b.damaged(f"the target is {target}", "it leaves more than one length open")
+        raise b.damaged_error(f"the target is {target}", "it leaves more than one length open")
     known = math.prod(length for length in wanted if length != -1)
     rows = n if target[0] == 0 else target[0]
     if n is None and target[0] == 1:
@@ -77,7 +77,7 @@ def _reshaped(b: LayerBuilder, x: Value, target: list[int]) -> Shape:
         wanted[wanted.index(-1)] = total // known
     h, w, c = wanted
     if min(wanted) < 1 or h * w * c != total:
-        raise b.unsupported(
+        raise b.unsupported_error(
             f"{list(x.shape)} to {target}", "the numbers of one agent must stay in one row, or agents would be mixed"
         )
     return rows, h, w, c
@@ -87,7 +87,7 @@ def squeeze(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """Squeeze and Unsqueeze: no version of Barracuda runs them; where H and W are 1 nothing could move."""
     x = args[0]
     if x.rank == 4:
-        raise b.unsupported(f"a tensor of shape {list(x.shape)}", "Barracuda never said where its axes go")
+        raise b.unsupported_error(f"a tensor of shape {list(x.shape)}", "Barracuda never said where its axes go")
     return x
 
 
@@ -97,15 +97,17 @@ def transpose(b: LayerBuilder, args: Sequence[Value]) -> Value:
     order = tuple(b.layer.pool)
     if len(order) == 8:
         if any(order[i] != i for i in (0, 1, 3, 4)) or sorted(order) != list(range(8)):
-            raise b.unsupported(f"the order is {list(order)}", "the tensors of a policy have the axes N, H, W and C")
+            raise b.unsupported_error(
+                f"the order is {list(order)}", "the tensors of a policy have the axes N, H, W and C"
+            )
         order = tuple(EIGHT.index(order[i]) for i in EIGHT)
     if sorted(order) != [0, 1, 2, 3]:
-        raise b.unsupported(f"the order is {list(order)}", "only the four axes N, H, W, C can be put in order")
+        raise b.unsupported_error(f"the order is {list(order)}", "only the four axes N, H, W, C can be put in order")
     n, h, w, c = (x.shape[i] for i in order)
     if order[0] != N and x.n is None:
-        raise b.unsupported(f"the order is {list(order)}", "it would turn agents into pixels or channels")
+        raise b.unsupported_error(f"the order is {list(order)}", "it would turn agents into pixels or channels")
     turned = b.add("Transpose", [b.as_image(x), b.ints(list(order), "order")])
-    return b.shaped(turned, (n, int(h or 0), int(w or 0), int(c or 0)))
+    return b.as_shape(turned, (n, int(h or 0), int(w or 0), int(c or 0)))
 
 
 def concat(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -114,10 +116,10 @@ def concat(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if len(args) == 1:
         return args[0]
     if axis == N:
-        raise b.unsupported("it joins along the batch", "the rows of a policy are its agents")
+        raise b.unsupported_error("it joins along the batch", "the rows of a policy are its agents")
     shapes = [list(v.shape) for v in args]
     if any(s[:axis] + s[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :] for s in shapes):
-        raise b.damaged(f"the shapes are {shapes}", f"they may differ in {_NAMES[axis]} alone")
+        raise b.damaged_error(f"the shapes are {shapes}", f"they may differ in {_NAMES[axis]} alone")
     total = sum(int(s[axis] or 0) for s in shapes)
     if axis == C and all(v.shape[1:3] == (1, 1) for v in args):
         join = b.ints(1, "axis")
@@ -125,7 +127,7 @@ def concat(b: LayerBuilder, args: Sequence[Value]) -> Value:
         integer = b.add("ConcatV2", [*integers, join], name="integers") if len(integers) == len(args) else None
         return b.rows(b.add("ConcatV2", [*(b.as_matrix(v) for v in args), join]), args[0].shape[N], total, integer)
     joined = b.add("ConcatV2", [*(b.as_image(v) for v in args), b.ints(axis, "axis")])
-    return b.shaped(joined, with_length(args[0].shape, axis, total))
+    return b.as_shape(joined, with_length(args[0].shape, axis, total))
 
 
 # ------------------------------------------------------------------ cutting
@@ -136,7 +138,7 @@ def strided_slice(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x = args[0]
     starts, ends, steps = (_entries(b, v, d) for v, d in ((b.layer.pad, 0), (b.layer.pool, 0), (b.layer.stride, 1)))
     if (starts[N], ends[N]) not in ((0, 0), (0, _FAR)) or steps[N] != 1:
-        raise b.unsupported(
+        raise b.unsupported_error(
             f"it cuts {starts[N]}:{ends[N]}:{steps[N]} out of the batch", "a policy answers for every agent"
         )
     cuts = [_cut(b, starts[i], ends[i], steps[i], int(x.shape[i] or 0), _NAMES[i]) for i in (H, W, C)]
@@ -145,14 +147,14 @@ def strided_slice(b: LayerBuilder, args: Sequence[Value]) -> Value:
         return x
     shape = (x.n, h, w, c)
     if x.rank == 4:
-        return b.shaped(_sliced(b, x.reference, cuts, "part"), shape)
+        return b.as_shape(_strided_slice(b, x.reference, cuts, "part"), shape)
     if x.rank == 1:
-        return b.shaped(_sliced(b, b.as_matrix(x), cuts[2:], "part"), shape)
-    integer = None if x.integer is None else _sliced(b, x.integer, cuts[2:], "integers")
-    return Value(_sliced(b, x.reference, cuts[2:], "part"), shape, integer=integer)
+        return b.as_shape(_strided_slice(b, b.as_matrix(x), cuts[2:], "part"), shape)
+    integer = None if x.integer is None else _strided_slice(b, x.integer, cuts[2:], "integers")
+    return Value(_strided_slice(b, x.reference, cuts[2:], "part"), shape, integer=integer)
 
 
-def _sliced(b: LayerBuilder, x: str, cuts: Sequence[tuple[int, int, int]], label: str) -> str:
+def _strided_slice(b: LayerBuilder, x: str, cuts: Sequence[tuple[int, int, int]], label: str) -> str:
     """``x`` with its first axis whole and the others cut."""
     columns = [(0, 0, 1), *cuts]
     operands = [b.ints([cut[i] for cut in columns], part) for i, part in enumerate(("begin", "end", "steps"))]
@@ -163,7 +165,7 @@ def _entries(b: LayerBuilder, values: Sequence[int], default: int) -> list[int]:
     if len(values) == 8 and all(values[i] in (0, 1, default) for i in (0, 1, 3, 4)):
         return [values[i] for i in EIGHT]
     if len(values) != 4:
-        raise b.damaged(f"the bounds are {list(values)}", "they have four entries, or eight")
+        raise b.damaged_error(f"the bounds are {list(values)}", "they have four entries, or eight")
     return list(values)
 
 
@@ -176,18 +178,20 @@ def _cut(b: LayerBuilder, start: int, end: int, step: int, length: int, name: st
     last = length if end >= length else end % length if length else 0
     text = f"{start}:{end}:{step} of the {length} elements of {name}"
     if first >= length:
-        raise b.damaged(f"it cuts {text}", "that begins behind the end")
+        raise b.damaged_error(f"it cuts {text}", "that begins behind the end")
     if step == 0:
         return first, first + 1, 1
     if step < 0 or (start == end != 0):
-        raise b.unsupported(f"it cuts {text}", "versions of Barracuda read that differently")
+        raise b.unsupported_error(f"it cuts {text}", "versions of Barracuda read that differently")
     if last == 0:
         last = length
     if last <= first:
-        raise b.unsupported(f"it cuts {text}", "that is empty, or reaches behind the end in old versions of Barracuda")
+        raise b.unsupported_error(
+            f"it cuts {text}", "that is empty, or reaches behind the end in old versions of Barracuda"
+        )
     count, rest = divmod(last - first, step)
     if rest:
-        raise b.unsupported(
+        raise b.unsupported_error(
             f"it cuts {text}", f"the step does not divide the length: {count} or {count + 1} elements, by version"
         )
     return first, last, step
@@ -198,18 +202,20 @@ def gather(b: LayerBuilder, args: Sequence[Value]) -> Value:
     x, index = args
     axis = axis_of(b, b.layer.axis)
     if tuple(b.layer.pool)[1:] not in ((), (0,), (1,)):
-        raise b.unsupported(f"indices of rank {b.layer.pool[1]}", "only a list of indices is translated")
+        raise b.unsupported_error(f"indices of rank {b.layer.pool[1]}", "only a list of indices is translated")
     if index.constant is not None and axis != N:
         chosen = b.whole(index.constant)
         if not chosen or min(chosen) < 0 or max(chosen) >= int(x.shape[axis] or 0):
-            raise b.damaged(f"the indices are {chosen}", f"there are {x.shape[axis]} elements along {_NAMES[axis]}")
-        return b.shaped(b.take(b.as_image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))
+            raise b.damaged_error(
+                f"the indices are {chosen}", f"there are {x.shape[axis]} elements along {_NAMES[axis]}"
+            )
+        return b.as_shape(b.take(b.as_image(x), chosen, axis), with_length(x.shape, axis, len(chosen)))
     if axis == N and x.n is not None and index.size == 1:
         numbers = index.integer or b.add("Cast", [index.reference], DstT=INT32)
         flat = b.add("Reshape", [numbers, b.ints([-1], "list")], name="list")
         found = b.add("GatherV2", [b.as_image(x), flat, b.ints(0, "axis")])
-        return b.shaped(found, (index.n, *x.shape[1:]))
-    raise b.unsupported(
+        return b.as_shape(found, (index.n, *x.shape[1:]))
+    raise b.unsupported_error(
         f"indices of shape {list(index.shape)} along {_NAMES[axis]} of {list(x.shape)}",
         "indices must be constants, or one per agent into the rows of a constant table",
     )
@@ -220,7 +226,7 @@ def gather(b: LayerBuilder, args: Sequence[Value]) -> Value:
 
 def tile(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """The tensor ``pool`` times along each axis."""
-    return _repeated(b, args[0], b.four(b.layer.pool))
+    return _repeat(b, args[0], b.four(b.layer.pool))
 
 
 def expand(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -230,20 +236,20 @@ def expand(b: LayerBuilder, args: Sequence[Value]) -> Value:
     factors = []
     for length, wanted in zip(x.shape, target, strict=True):
         if wanted > 1 and length not in (1, wanted):
-            raise b.damaged(f"{list(x.shape)} to {list(target)}", "only axes of length 1 are expanded")
+            raise b.damaged_error(f"{list(x.shape)} to {list(target)}", "only axes of length 1 are expanded")
         factors.append(wanted if wanted > 1 and length == 1 else 1)
-    return _repeated(b, x, factors)
+    return _repeat(b, x, factors)
 
 
-def _repeated(b: LayerBuilder, x: Value, factors: Sequence[int]) -> Value:
+def _repeat(b: LayerBuilder, x: Value, factors: Sequence[int]) -> Value:
     if min(factors) < 1 or (factors[N] != 1 and x.n is None):
-        raise b.unsupported(f"it repeats {list(factors)} times", "a policy has one row per agent")
+        raise b.unsupported_error(f"it repeats {list(factors)} times", "a policy has one row per agent")
     n, h, w, c = x.shape
     shape = (None if n is None else n * factors[N], h * factors[H], w * factors[W], c * factors[C])
     if shape == x.shape:
         return x
-    b.sized(*shape[1:])
-    return b.shaped(b.add("Tile", [b.as_image(x), b.ints(list(factors), "times")]), shape)
+    b.check_size(*shape[1:])
+    return b.as_shape(b.add("Tile", [b.as_image(x), b.ints(list(factors), "times")]), shape)
 
 
 def depth_to_space(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -252,14 +258,16 @@ def depth_to_space(b: LayerBuilder, args: Sequence[Value]) -> Value:
     across, down = _block(b)
     n, h, w, c = x.shape
     if c % (across * down) or b.layer.axis not in (0, 1):
-        raise b.damaged(f"blocks of {across}·{down} out of {c} channels, mode {b.layer.axis}", "they do not divide")
+        raise b.damaged_error(
+            f"blocks of {across}·{down} out of {c} channels, mode {b.layer.axis}", "they do not divide"
+        )
     deep, data = c // (across * down), b.as_image(x)
     if b.layer.axis == 1:
         data = b.take(data, np.arange(c).reshape(deep, -1).T.reshape(-1).tolist(), C)
     rows = -1 if n is None else n
     split = b.add("Reshape", [data, b.ints([rows, h, w, down, across * deep], "blocks")], name="blocks")
     turned = b.add("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])
-    return b.shaped(turned, (n, h * down, w * across, deep))
+    return b.as_shape(turned, (n, h * down, w * across, deep))
 
 
 def space_to_depth(b: LayerBuilder, args: Sequence[Value]) -> Value:
@@ -268,15 +276,15 @@ def space_to_depth(b: LayerBuilder, args: Sequence[Value]) -> Value:
     across, down = _block(b)
     n, h, w, c = x.shape
     if h % down or w % across:
-        raise b.damaged(f"blocks of {across}·{down} of {list(x.shape)}", "they do not divide the image")
+        raise b.damaged_error(f"blocks of {across}·{down} of {list(x.shape)}", "they do not divide the image")
     rows = -1 if n is None else n
     blocks = b.ints([rows, h // down, down, w // across, across * c], "blocks")
     split = b.add("Reshape", [b.as_image(x), blocks], name="blocks")
     turned = b.add("Transpose", [split, b.ints([0, 1, 3, 2, 4], "order")])
-    return b.shaped(turned, (n, h // down, w // across, down * across * c))
+    return b.as_shape(turned, (n, h // down, w // across, down * across * c))
 
 
 def _block(b: LayerBuilder) -> tuple[int, int]:
     if len(b.layer.pool) != 2 or min(b.layer.pool) < 1:
-        raise b.damaged(f"blocks of {list(b.layer.pool)}", "they have a width and a height")
+        raise b.damaged_error(f"blocks of {list(b.layer.pool)}", "they have a width and a height")
     return b.layer.pool[0], b.layer.pool[1]

@@ -56,7 +56,7 @@ def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
         f"put back ({', '.join(map(str, widths))}). Unity reads the first {int(total)} columns of the file's action: "
         "the same up to a constant per branch, so that it draws and chooses the same"
     )
-    return replace(model, layers=tuple(_placed(model.layers, readers, cuts))), (note,)
+    return replace(model, layers=tuple(_place_slices(model.layers, readers, cuts))), (note,)
 
 
 def _parts(layers: Mapping[str, Layer]) -> Sequence[str]:
@@ -92,7 +92,7 @@ def _slice(given: str, begin: int, width: int) -> Layer:
     )
 
 
-def _placed(layers: Sequence[Layer], readers: Mapping[str, Layer], cuts: Mapping[str, Layer]) -> Iterator[Layer]:
+def _place_slices(layers: Sequence[Layer], readers: Mapping[str, Layer], cuts: Mapping[str, Layer]) -> Iterator[Layer]:
     """The layers in the order in which they run, each slice in front of the first that reads it."""
     left = dict(cuts)
     for layer in layers:

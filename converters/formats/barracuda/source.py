@@ -32,11 +32,11 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         notes=(*_notes(model), *sliced, *reading.notes),
     )
     if model.metadata(EMBEDDED) is not None:
-        facts = _told(facts, contract_of(model))
+        facts = _facts_of_contract(facts, contract_of(model))
     return [SourceModel(reading.graph, (given.path,), facts)]
 
 
-def _told(facts: SourceFacts, signature: PolicySignature) -> SourceFacts:
+def _facts_of_contract(facts: SourceFacts, signature: PolicySignature) -> SourceFacts:
     """What the contract of a file of ours says that its layers do not."""
     return replace(
         facts,

@@ -40,7 +40,7 @@ def write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     return {f"{policy.name}.nn": Pieces(encode(replace(policy_model(policy), trailer=trailer)))}
 
 
-def held(path: Path) -> str:
+def embedded_contract(path: Path) -> str:
     """The contract that a ``.nn`` carries, empty where it has none. Raises OSError, DamagedFileError."""
     return parse(path.read_bytes()).metadata(EMBEDDED) or ""
 
@@ -50,10 +50,10 @@ def encode(model: NnModel) -> bytes:
     head = b"".join(
         (
             struct.pack("<q", model.version),
-            _listed(_text(i.name) + _ints(i.shape) for i in model.inputs),
-            _listed(_text(name) for name in model.outputs),
-            _listed(_ints(m.shape) + _text(m.input) + _text(m.output) for m in model.memories),
-            _listed(map(_layer, model.layers)),
+            _encode_list(_text(i.name) + _ints(i.shape) for i in model.inputs),
+            _encode_list(_text(name) for name in model.outputs),
+            _encode_list(_ints(m.shape) + _text(m.input) + _text(m.output) for m in model.memories),
+            _encode_list(map(_layer, model.layers)),
         )
     )
     if model.version >= TYPED_WEIGHTS:
@@ -77,8 +77,8 @@ def _layer(layer: Layer) -> bytes:
             _int(layer.axis),
             struct.pack("<ff", layer.alpha, layer.beta),
             _int(0),  # a third
-            _listed(_text(name) for name in layer.inputs),
-            _listed(map(_dataset, layer.datasets)),
+            _encode_list(_text(name) for name in layer.inputs),
+            _encode_list(map(_dataset, layer.datasets)),
         )
     )
 
@@ -90,9 +90,9 @@ def _dataset(dataset: Dataset) -> bytes:
 
 def _trailer(trailer: Trailer, version: int) -> bytes:
     data = b"".join(map(_text, (trailer.ir_source, trailer.ir_version, trailer.producer)))
-    data += _listed(_text(layer) + _text(message) for layer, message in trailer.warnings)
+    data += _encode_list(_text(layer) + _text(message) for layer, message in trailer.warnings)
     if version >= METADATA or trailer.metadata:
-        data += _listed(_text(key) + _text(value) for key, value in trailer.metadata)
+        data += _encode_list(_text(key) + _text(value) for key, value in trailer.metadata)
     return data
 
 
@@ -111,6 +111,6 @@ def _text(words: str) -> bytes:
     return _int(len(words.encode("utf-16-le")) // 2) + words.encode()
 
 
-def _listed(items: Iterable[bytes]) -> bytes:
+def _encode_list(items: Iterable[bytes]) -> bytes:
     found = list(items)
     return _int(len(found)) + b"".join(found)
