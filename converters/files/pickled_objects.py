@@ -95,12 +95,12 @@ class _Objects(Machine):
         self.opcodes = _OPCODES
         self._most_copied = most_copied
 
-    def imported(self, module: str, name: str) -> Any:
+    def import_name(self, module: str, name: str) -> Any:
         """Return what is known of an imported name. Raises NotAPolicyError for one that acts on the machine."""
         if (module, name) in self._names:
             return self._names[module, name]
         if (module, name) == ("_codecs", "encode"):
-            return Function("encode", self._encoded)
+            return Function("encode", self._encode_text)
         root = module.partition(".")[0]
         if root in SYSTEM and not (root in ("builtins", "__builtin__") and name in _PLAIN_TYPES):
             raise refusal(module, name)
@@ -131,7 +131,7 @@ class _Objects(Machine):
         elif not isinstance(target, dict | list):
             raise damaged_error("its pickle sets the state of something that has none")
 
-    def collected(self) -> Instance:
+    def collect_instance(self) -> Instance:
         """Return an object of its class and arguments, all above a mark."""
         maker, *arguments = self.items()
         return self.instance(maker, tuple(arguments))
@@ -149,7 +149,7 @@ class _Objects(Machine):
         target = self.top(dict)
         target.update({k: v for k, v in zip(items[::2], items[1::2], strict=True) if isinstance(k, KEYS)})
 
-    def _encoded(self, arguments: tuple[Any, ...]) -> bytes:
+    def _encode_text(self, arguments: tuple[Any, ...]) -> bytes:
         """Return ``_codecs.encode(text, "latin1")``, with which older protocols write bytes."""
         text, *coding = arguments
         if not isinstance(text, str) or coding not in (["latin1"], ["latin-1"]):

@@ -170,9 +170,9 @@ class Machine:
         module, name = self.last(2)
         if not isinstance(name, str) or not isinstance(module, str):
             raise damaged_error("its pickle imports something that has no name")
-        return self.imported(module, name)
+        return self.import_name(module, name)
 
-    def imported(self, module: str, name: str) -> Any:
+    def import_name(self, module: str, name: str) -> Any:
         """Return what an imported name stands for. Raises NotAPolicyError where it is not in the table."""
         return _global(module, name)
 
@@ -230,7 +230,7 @@ OPCODES: dict[str, Callable[[Machine, Any], object]] = {
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), lambda m, index: m.memo.update({index: m.stack[-1]})),
     "MEMOIZE": lambda m, _: m.memo.update({len(m.memo): m.stack[-1]}),
     **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda m, index: m.stack.append(m.memo[index])),
-    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(m.imported(*name.partition(" ")[::2]))),
+    **dict.fromkeys(("GLOBAL", "INST"), lambda m, name: m.stack.append(m.import_name(*name.partition(" ")[::2]))),
     "STACK_GLOBAL": lambda m, _: m.stack.append(m.stack_global()),
     "REDUCE": lambda m, _: m.stack.append(m.reduce()),
     "BUILD": lambda m, _: m.build(),

@@ -28,7 +28,7 @@ def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> 
     from exporter.tables import command_text, table
 
     if target == "help":
-        rows = [[t.name, t.title, t.needed] for t in TARGETS]
+        rows = [[t.name, t.title, t.formats_text] for t in TARGETS]
         if as_json:
             say_json({"targets": [dict(zip(("name", "title", "needs"), row, strict=True)) for row in rows]})
         else:

@@ -106,12 +106,12 @@ def equivalence(reference: np.ndarray, candidate: np.ndarray, margin: float) -> 
     elif abs(mean) - far > margin:
         verdict = DIFFERENT
     else:
-        verdict, needed = NOT_DECIDED, _needed(mean, deviation, margin, near)
+        verdict, needed = NOT_DECIDED, _episodes_needed(mean, deviation, margin, near)
     equal = int((differences == 0).sum())
     return Equivalence(verdict, mean, mean - near, mean + near, margin, deviation, count, equal, needed)
 
 
-def _needed(mean: float, deviation: float, margin: float, near: float) -> int | None:
+def _episodes_needed(mean: float, deviation: float, margin: float, near: float) -> int | None:
     """Return the number of episodes that would decide: of a right player where the interval holds 0, else of this."""
     inside, outside, power = (
         NormalDist().inv_cdf(1 - tail) for tail in ((1 - CONFIDENCE) / 2, FALSE_ALARM / 2, 1 - POWER)

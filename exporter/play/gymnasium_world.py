@@ -34,12 +34,12 @@ class GymnasiumWorld:
     ) -> None:
         self.name, self.notes = name, notes
         self._make, self._signature = make, signature
-        self._environments = [self._made()]
+        self._environments = [self._make_environment()]
         self._masked = any(s.role is Role.MASKS for s in signature.inputs)
         self._space = getattr(self._environments[0], "action_space", None)
         self._check_actions()
         seen, info = self._reset(self._environments[0], 0)
-        _observed(signature, seen, self.name)
+        _observations_of(signature, seen, self.name)
         if self._masked and self._masks_of(self._environments[0], seen, info) is None:
             raise UsageError(
                 f"--env {name}: the policy takes masks, and the environment gives none",
@@ -49,7 +49,7 @@ class GymnasiumWorld:
     def begin(self, episodes: int, seed: int) -> View:
         """Reset an environment for each episode."""
         while len(self._environments) < episodes:
-            self._environments.append(self._made())
+            self._environments.append(self._make_environment())
         seeds = np.random.SeedSequence(seed).generate_state(episodes) >> np.uint32(1)
         rows = [self._reset(env, int(s)) for env, s in zip(self._environments[:episodes], seeds, strict=True)]
         self._ended = np.zeros(episodes, bool)
@@ -73,7 +73,7 @@ class GymnasiumWorld:
         self._ended = ended
         return Outcome(self._view(), rewards, ended, success)
 
-    def _made(self) -> Any:
+    def _make_environment(self) -> Any:
         with _own_code(self.name, "making it"):
             return self._make()
 
@@ -84,7 +84,7 @@ class GymnasiumWorld:
 
     def _row(self, env: Any, seen: Any, info: Mapping[str, Any]) -> tuple[dict[str, Array], Array | None]:
         masks = self._masks_of(env, seen, info) if self._masked else None
-        return _observed(self._signature, seen, self.name), masks
+        return _observations_of(self._signature, seen, self.name), masks
 
     def _view(self) -> View:
         names = [s.name for s in self._signature.observations]
@@ -145,7 +145,7 @@ def _choices(space: Any) -> tuple[int, ...] | None:
     return (int(space.n),) if hasattr(space, "n") else None
 
 
-def _observed(signature: PolicySignature, seen: Any, name: str) -> dict[str, Array]:
+def _observations_of(signature: PolicySignature, seen: Any, name: str) -> dict[str, Array]:
     """Return one agent's observations by the policy's names. Raises UsageError where they do not fit."""
     specs = signature.observations
     if isinstance(seen, Mapping):
@@ -159,7 +159,7 @@ def _observed(signature: PolicySignature, seen: Any, name: str) -> dict[str, Arr
             if spec.name in given
             else next((k for k, v in given.items() if len(given) == len(specs) == 1), "")
         )
-        array = None if key not in given else _shaped(spec, given[key])
+        array = None if key not in given else _fit_shape(spec, given[key])
         if array is None:
             shapes = ", ".join(f"{k} {list(v.shape)}" for k, v in given.items())
             raise UsageError(
@@ -171,7 +171,7 @@ def _observed(signature: PolicySignature, seen: Any, name: str) -> dict[str, Arr
     return found
 
 
-def _shaped(spec: TensorSpec, array: Array) -> Array | None:
+def _fit_shape(spec: TensorSpec, array: Array) -> Array | None:
     """Return an observation in the policy's shape: as it is, flat, or one number of several as a vector with a 1."""
     wanted = spec.shape[1:]
     if len(wanted) == array.ndim and all(n in (None, m) for n, m in zip(wanted, array.shape, strict=True)):

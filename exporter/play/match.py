@@ -87,7 +87,7 @@ class Match:
         self._more: dict[int, Episodes] = {}
         self._progress: Progress = lambda text: None
 
-    def understood(self, policy: Policy) -> None:
+    def take_policy(self, policy: Policy) -> None:
         """Take the policy that is played. Raises UsageError where it does not fit the environment."""
         self.policy = policy
         self._world = self._make_world(policy.signature)

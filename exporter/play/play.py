@@ -68,7 +68,7 @@ def play_policy(
         first, *others = whole
         match = Match(make, options)
         if not others:
-            others = [first] if (first / POLICY).is_file() else [_exported(first, understanding, read, opened)]
+            others = [first] if (first / POLICY).is_file() else [_export_bundle(first, understanding, read, opened)]
         report = compare_artefacts(
             first,
             others,
@@ -78,7 +78,7 @@ def play_policy(
             understanding=understanding,
             read=read,
             progress=progress,
-            understood=match.understood,
+            understood=match.take_policy,
             pool=pool,
             judge=match.judge,
         )
@@ -99,7 +99,9 @@ def play_policy(
     )
 
 
-def _exported(source: Path, understanding: CompileOptions | None, read: ReadOptions | None, opened: ExitStack) -> Path:
+def _export_bundle(
+    source: Path, understanding: CompileOptions | None, read: ReadOptions | None, opened: ExitStack
+) -> Path:
     """Return a bundle of the formats that an export of a source writes, in a folder that goes when ``opened`` does."""
     folder = Path(opened.enter_context(scratch_folder()))
     options = ExportOptions(

@@ -38,11 +38,11 @@ class Recorder:
     def recording(self, run: Run) -> Run:
         """Return ``run``, with what it is fed kept."""
 
-        def recorded(feeds: Arrays, fetch: Sequence[str]) -> dict[str, np.ndarray]:
+        def record(feeds: Arrays, fetch: Sequence[str]) -> dict[str, np.ndarray]:
             self._keep(feeds)
             return run(feeds, fetch)
 
-        return recorded
+        return record
 
     def inputs(self) -> Inputs:
         """Return what was kept, for a verification."""

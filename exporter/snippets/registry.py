@@ -33,7 +33,7 @@ class Target:
         return [[f.key for f in need] if isinstance(need, tuple) else [need.key] for need in self.needs]
 
     @property
-    def needed(self) -> str:
+    def formats_text(self) -> str:
         """The formats that it needs, for people."""
         return " or ".join(map(" and ".join, self.alternatives))
 
@@ -99,7 +99,7 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
         raise UsageError(f"--for {name}: unknown target", fix=f"one of: help, {', '.join(t.name for t in TARGETS)}")
     has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
     able = {t.name for t in chosen if any(has.issuperset(keys) for keys in t.alternatives)}
-    lacking = {t.name: t.needed for t in chosen if t.name not in able}
+    lacking = {t.name: t.formats_text for t in chosen if t.name not in able}
     if len(lacking) == len(chosen):
         needed = next(iter(lacking.values()))
         raise BundleError(

@@ -182,11 +182,11 @@ def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
     places = tuple(None if i in axes else value.axes[i] for i in kept)
     name = b.stored_name(value)
     if long:
-        name = _reduced(b, value, name, [value.axes[i] for i in long], whole=not left)
+        name = _reduce(b, value, name, [value.axes[i] for i in long], whole=not left)
     return b.layer_value(name, shape, places)
 
 
-def _reduced(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
+def _reduce(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
     n, h, w, c = value.dims
     op, width = b.node.op, h * w * c
     summed, mean = op not in _REDUCED, traits(b.node).takes == "mean"

@@ -72,10 +72,12 @@ class Interpreter:
         for parameter in parameters:
             if parameter not in names:
                 if parameter not in defaults:
-                    raise _damaged(f"{function.name[:60]} is called without {parameter[:60]}")
+                    raise _damaged_error(f"{function.name[:60]} is called without {parameter[:60]}")
                 names[parameter] = self.value_of(defaults[parameter], frame)
         if len(given) > len(parameters):
-            raise _damaged(f"{function.name[:60]} is called with {len(given)} values, and takes {len(parameters)}")
+            raise _damaged_error(
+                f"{function.name[:60]} is called with {len(given)} values, and takes {len(parameters)}"
+            )
         try:
             self._run(function.body, frame)
         except _ReturnError as returned:
@@ -120,7 +122,7 @@ class Interpreter:
             case ast.Tuple(elts=parts):
                 items = self._items(value)
                 if len(items) != len(parts):
-                    raise _damaged(f"{len(items)} values are given to {len(parts)} names")
+                    raise _damaged_error(f"{len(items)} values are given to {len(parts)} names")
                 for part, item in zip(parts, items, strict=True):
                     self._assign(part, item, frame)
             case ast.Attribute(value=owner, attr=name):
@@ -138,7 +140,7 @@ class Interpreter:
     def _items(self, value: Any) -> Sequence[Any]:
         if isinstance(value, list | tuple | range):
             return value
-        raise _damaged(f"a {type(value).__name__} is taken apart")
+        raise _damaged_error(f"a {type(value).__name__} is taken apart")
 
     # ------------------------------------------------------------------ expressions
 
@@ -163,9 +165,9 @@ class Interpreter:
             case ast.Attribute(value=owner, attr=name):
                 return self.attribute_of(self.value_of(owner, frame), name)
             case ast.Tuple(elts=parts):
-                return self._weighed(tuple(self.value_of(p, frame) for p in parts))
+                return self._weigh(tuple(self.value_of(p, frame) for p in parts))
             case ast.List(elts=parts):
-                return self._weighed([self.value_of(p, frame) for p in parts])
+                return self._weigh([self.value_of(p, frame) for p in parts])
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 value = self.value_of(operand, frame)
                 if isinstance(value, int | float):
@@ -173,10 +175,10 @@ class Interpreter:
             case ast.Subscript(value=owner, slice=index):
                 return self._element(self.value_of(owner, frame), self.value_of(index, frame))
             case ast.Call(func=function, args=arguments, keywords=keywords):
-                return self._called(function, arguments, keywords, frame)
+                return self._value_of_call(function, arguments, keywords, frame)
         raise _refusal(f"an expression of the kind {type(expression).__name__}")
 
-    def _weighed(self, made: list[Any] | tuple[Any, ...]) -> list[Any] | tuple[Any, ...]:
+    def _weigh(self, made: list[Any] | tuple[Any, ...]) -> list[Any] | tuple[Any, ...]:
         """Return a list, once it is known how much is in it: lists of one list twice grow fast."""
         weight = 1 + sum(self._weights.get(id(part), (part, 1))[1] for part in made)
         if weight > MAX_ITEMS:
@@ -187,7 +189,7 @@ class Interpreter:
     def _element(self, owner: Any, index: Any) -> Any:
         if isinstance(owner, list | tuple) and isinstance(index, int) and -len(owner) <= index < len(owner):
             return owner[index]
-        raise _damaged(f"an element of a {type(owner).__name__} is asked for that it lacks")
+        raise _damaged_error(f"an element of a {type(owner).__name__} is asked for that it lacks")
 
     def attribute_of(self, owner: Any, name: str) -> Any:
         """Return an attribute of a module, or the name that is longer by one part. Raises DamagedFileError."""
@@ -197,22 +199,22 @@ class Interpreter:
             return Named(f"{owner.name}.{name}")
         if isinstance(owner, Module):
             return self._machine.attribute(owner, name)
-        raise _damaged(f"a {type(owner).__name__} is asked for its {name[:60]}")
+        raise _damaged_error(f"a {type(owner).__name__} is asked for its {name[:60]}")
 
     def _constant(self, name: str) -> Any:
         number = int(name[1:]) if name.startswith("c") and name[1:].isdecimal() and len(name) < 8 else -1
         if not 0 <= number < len(self._constants):
-            raise _damaged(f"its code asks for the constant {name[:60]}, which is not there")
+            raise _damaged_error(f"its code asks for the constant {name[:60]}, which is not there")
         return self._machine.constant(self._constants[number], name)
 
-    def _called(
+    def _value_of_call(
         self, function: ast.expr, arguments: Sequence[ast.expr], keywords: Sequence[ast.keyword], frame: _Frame
     ) -> Any:
         if isinstance(function, ast.Name) and function.id in _TYPED and function.id not in frame.names:
             return _TYPED[function.id](self, arguments, frame)
         if isinstance(function, ast.Attribute):
             owner = self.value_of(function.value, frame)
-            given, named = self._given(arguments, keywords, frame)
+            given, named = self._arguments(arguments, keywords, frame)
             if isinstance(owner, Module):
                 method = self._code.method(owner.type_name, function.attr)
                 with self._machine.inside(owner.path):
@@ -220,14 +222,14 @@ class Interpreter:
             called = self.attribute_of(owner, function.attr)
         else:
             called = self.value_of(function, frame)
-            given, named = self._given(arguments, keywords, frame)
+            given, named = self._arguments(arguments, keywords, frame)
         if not isinstance(called, Named):
-            raise _damaged(f"a {type(called).__name__} is called")
+            raise _damaged_error(f"a {type(called).__name__} is called")
         if called.name.startswith(f"{_OWN}."):
             return self._own(called.name, given, named, frame)
         return self._op(called.name, given, named)
 
-    def _given(
+    def _arguments(
         self, arguments: Sequence[ast.expr], keywords: Sequence[ast.keyword], frame: _Frame
     ) -> tuple[list[Any], dict[str, Any]]:
         named = {k.arg: self.value_of(k.value, frame) for k in keywords if k.arg is not None}
@@ -279,7 +281,7 @@ class Interpreter:
 def _last_argument(walk: Interpreter, arguments: Sequence[ast.expr], frame: _Frame) -> Any:
     """``annotate(T, x)``, ``unchecked_cast(T, x)``: x."""
     if len(arguments) != 2:
-        raise _damaged("a cast has a type and a value")
+        raise _damaged_error("a cast has a type and a value")
     return walk.value_of(arguments[1], frame)
 
 
@@ -288,7 +290,7 @@ def _of_module(walk: Interpreter, arguments: Sequence[ast.expr], frame: _Frame) 
     match arguments:
         case [owner, ast.Constant(value=str() as name)]:
             return walk.attribute_of(walk.value_of(owner, frame), name)
-    raise _damaged("getattr has a module and a name")
+    raise _damaged_error("getattr has a module and a name")
 
 
 #: Calls whose first operand is a type, or that are Python's own.
@@ -308,7 +310,7 @@ def _refusal(what: str) -> SourceError:
     )
 
 
-def _damaged(what: str) -> DamagedFileError:
+def _damaged_error(what: str) -> DamagedFileError:
     return DamagedFileError(
         what, why="its code does not fit together: the file is damaged", fix="copy or download it again"
     )

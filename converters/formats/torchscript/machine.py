@@ -106,7 +106,7 @@ class Machine:
         if known != length:
             raise UnsupportedOpError(f"an axis of {known} meets one of {length}", why="they must be equally long")
 
-    def written(self) -> dict[str, tuple[int, ...]]:
+    def written_buffers(self) -> dict[str, tuple[int, ...]]:
         """Return the buffers that the program writes to, in the order of the modules' attributes, and their shapes."""
         return {
             key: tuple(self.b.length(cell.read(), axis) for axis in range(self.b.rank(cell.read())))
@@ -238,7 +238,7 @@ class Machine:
                 if isinstance(symbol, str) and isinstance(length, int) and length > 1 and symbol in self._open:
                     raise LengthFoundError(symbol, length)
 
-    def known(self, value: Any, meaning: str) -> np.ndarray:
+    def constant_numbers(self, value: Any, meaning: str) -> np.ndarray:
         """Return the numbers of a tensor that is the same in every run: a weight. Raises UnsupportedOpError."""
         if not isinstance(value, Tensor):
             raise UnsupportedOpError(f"{meaning} is no tensor", why="a weight is expected")

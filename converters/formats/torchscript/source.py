@@ -57,7 +57,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
             number, axis = machine.place_of(found.symbol)
             shapes[number] = tuple(found.length if i == axis else d for i, d in enumerate(shapes[number]))
             continue
-        written = machine.written()
+        written = machine.written_buffers()
         if written.keys() <= memory.keys():
             return [_model(given, machine, result, memory)]
         memory |= written

@@ -24,13 +24,13 @@ def renormalised_mlp(net: Network, x: str, module: str, activation: Activation, 
             "a batch renormalisation, a linear layer and an activation by turns are expected",
         )
     for index in norms:
-        x = _renormalised(net, x, f"{module}.{index}", epsilon)
+        x = _batch_renorm(net, x, f"{module}.{index}", epsilon)
         if index != norms[-1]:
             x = activation(net, net.linear(x, f"{module}.{index + 1}"))
     return x
 
 
-def _renormalised(net: Network, x: str, module: str, epsilon: float) -> str:
+def _batch_renorm(net: Network, x: str, module: str, epsilon: float) -> str:
     """``BatchRenorm1d`` as ``predict`` runs it: by its running statistics, whatever its warm-up had reached."""
     net.at(module)
     scale, bias, mean, variance = (

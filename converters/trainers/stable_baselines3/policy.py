@@ -196,13 +196,13 @@ def _check_class(kwargs: Mapping[str, Any]) -> None:
 def _features(made: _Built, observed: Observed, module: str) -> str:
     """The features of all observations, side by side; ``module`` holds the extractor's weights."""
     if isinstance(observed, Space):
-        return _encoded(made, "observation", observed, module)
-    parts = [_encoded(made, key, space, f"{module}.extractors.{key}") for key, space in observed.items()]
+        return _encode(made, "observation", observed, module)
+    parts = [_encode(made, key, space, f"{module}.extractors.{key}") for key, space in observed.items()]
     made.net.at(module)
     return made.net.concat(parts, 1)
 
 
-def _encoded(made: _Built, key: str, space: Space, module: str) -> str:
+def _encode(made: _Built, key: str, space: Space, module: str) -> str:
     net = made.net
     name = re.sub(r"[^A-Za-z0-9_.]", "_", key).lstrip("_.") or "observation"
     name = f"{name}_observation" if name in _TAKEN or name in made.roles else name
@@ -294,7 +294,7 @@ def _actor(made: _Built, observed: Observed) -> None:
     _continuous(made, made.net.mlp(x, "actor.mu", made.activation, ends=True), None)
 
 
-def _searched(made: _Built, observed: Observed) -> None:
+def _ars_policy(made: _Built, observed: Observed) -> None:
     """``ARSPolicy``, and ``ARSLinearPolicy``, whose default is neither to squash nor to have hidden layers."""
     net = made.net
     x = _features(made, observed, "features_extractor")
@@ -302,7 +302,9 @@ def _searched(made: _Built, observed: Observed) -> None:
     out = net.mlp(x, "action_net", made.activation, ends=True, biased="action_net.0.bias" in net.state)
     if made.actions.kind == "Discrete":
         if net.width(out) != made.actions.size:
-            raise _mixed(f"its network has {net.width(out)} logits, and its space {made.actions.size} actions")
+            raise _mixed_models_error(
+                f"its network has {net.width(out)} logits, and its space {made.actions.size} actions"
+            )
         net.highest(out, None)
         made.outputs["action"] = Role.ACTION
         return
@@ -358,7 +360,7 @@ def _continuous(made: _Built, mean: str, spread: str | None) -> None:
     net = made.net
     net.at("action")
     if net.width(mean) != made.actions.size:
-        raise _mixed(f"its network has {net.width(mean)} actions, and its space {made.actions.size}")
+        raise _mixed_models_error(f"its network has {net.width(mean)} actions, and its space {made.actions.size}")
     value = mean
     if spread is not None:
         value = net.add("Add", [mean, net.add("Mul", [net.normals_like(mean, "action"), spread])])
@@ -369,18 +371,18 @@ def _continuous(made: _Built, mean: str, spread: str | None) -> None:
             half = net.add("Mul", [net.add("Add", [value, net.floats(1)]), net.floats(0.5)])
             value = net.add("Add", [net.add("Mul", [half, net.const(high - low, "range")]), net.const(low, "low")])
     else:
-        value = clip(net, value, _bound(net, low, "low"), _bound(net, high, "high"))
+        value = clip(net, value, _limit(net, low, "low"), _limit(net, high, "high"))
     if len(made.actions.shape) > 1:
         made.notes.append(f"its actions are {made.actions.shape} in the environment; here they stand in one row")
     net.output("action", value)
     made.outputs["action"] = Role.ACTION
 
 
-def _mixed(what: str) -> DamagedFileError:
+def _mixed_models_error(what: str) -> DamagedFileError:
     return DamagedFileError(what, why="they are of different models", fix="save the model again: model.save")
 
 
-def _bound(net: Network, limits: np.ndarray, name: str) -> str | None:
+def _limit(net: Network, limits: np.ndarray, name: str) -> str | None:
     """A bound as a constant; None where no action has one."""
     if not np.isfinite(limits).any():
         return None
@@ -398,7 +400,7 @@ def _categorical(made: _Built, logits: str) -> None:
     net.at("action")
     columns = 1 if bits and width == len(sizes) else 0
     if width != (len(sizes) if columns else sum(sizes)):
-        raise _mixed(f"its network has {width} logits, and its action space {sum(sizes)} actions")
+        raise _mixed_models_error(f"its network has {width} logits, and its action space {sum(sizes)} actions")
     parts, start = [], 0
     for size in sizes:
         step = columns or size
@@ -426,7 +428,9 @@ def _masks(made: _Built, count: int, logits: str) -> str:
 def _highest(made: _Built, values: str) -> None:
     net = made.net
     if made.actions.kind != "Discrete" or net.width(values) != made.actions.size:
-        raise _mixed(f"its network values {net.width(values)} actions, and its space has {made.actions.size}")
+        raise _mixed_models_error(
+            f"its network values {net.width(values)} actions, and its space has {made.actions.size}"
+        )
     net.highest(values)
     made.outputs |= {"action": Role.ACTION, "q_values": Role.Q_VALUES}
 
@@ -439,7 +443,7 @@ _FAMILIES = {
     "stable_baselines3.sac.policies": _Family("SAC", "ReLU", _gaussian_actor, True),
     "sb3_contrib.tqc.policies": _Family("TQC", "ReLU", _gaussian_actor, True),
     "sb3_contrib.crossq.policies": _Family("CrossQ", "ReLU", _gaussian_actor, True),
-    "sb3_contrib.ars.policies": _Family("ARS", "ReLU", _searched),
+    "sb3_contrib.ars.policies": _Family("ARS", "ReLU", _ars_policy),
     "stable_baselines3.td3.policies": _Family("TD3", "ReLU", _actor, True),
     "stable_baselines3.dqn.policies": _Family("DQN", "ReLU", _values),
     "sb3_contrib.qrdqn.policies": _Family("QRDQN", "ReLU", _quantiles),

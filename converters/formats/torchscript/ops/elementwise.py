@@ -27,7 +27,7 @@ def _op(name: str) -> Callable[..., Tensor]:
     return _unary(activations.of_op(name))
 
 
-def _kept(name: str) -> Callable[..., Tensor]:
+def _keep_type(name: str) -> Callable[..., Tensor]:
     """An op that keeps whole numbers whole."""
     return lambda m, x: Tensor(m.b.add(name, [m.ref(x)]))
 
@@ -63,7 +63,7 @@ def _binary(op: str, name: str) -> Callable[..., Any]:
     return translate
 
 
-def _scaled(op: str, name: str, *, swapped: bool = False) -> Callable[..., Any]:
+def _with_factor(op: str, name: str, *, swapped: bool = False) -> Callable[..., Any]:
     """``add(a, b, alpha)``: a + alpha·b."""
 
     def translate(m: Machine, a: Any, b: Any, alpha: Any = 1) -> Any:
@@ -83,7 +83,7 @@ def _times(m: Machine, value: Any, factor: Any) -> Any:
     return Tensor(m.b.add("Mul", list(m.pair(value, factor)))) if isinstance(value, Tensor) else value * factor
 
 
-def _divided(m: Machine, a: Any, b: Any, rounding_mode: Any = None) -> Any:
+def _divide(m: Machine, a: Any, b: Any, rounding_mode: Any = None) -> Any:
     if not _tensors(a, b):
         return m.number(a / b)
     left, right = (m.b.cast(r, FLOAT32) for r in m.pair(a, b))
@@ -96,7 +96,7 @@ def _divided(m: Machine, a: Any, b: Any, rounding_mode: Any = None) -> Any:
 
 
 def _floor_divided(m: Machine, a: Any, b: Any) -> Any:
-    return _divided(m, a, b, "floor") if _tensors(a, b) else m.number(a // b)
+    return _divide(m, a, b, "floor") if _tensors(a, b) else m.number(a // b)
 
 
 def _power(m: Machine, x: Any, exponent: Any) -> Any:
@@ -138,7 +138,7 @@ def _masked_fill(m: Machine, x: Any, mask: Any, value: Any) -> Tensor:
     return _where(m, mask, value, x)
 
 
-def _negated(m: Machine, x: Any) -> Any:
+def _negate(m: Machine, x: Any) -> Any:
     return Tensor(m.b.add("Neg", [m.ref(x)])) if isinstance(x, Tensor) else -x
 
 
@@ -160,7 +160,7 @@ def _softplus(m: Machine, x: Any, beta: Any = 1, threshold: Any = 20) -> Tensor:
     return Tensor(activations.scale_and_shift(m.b, m.b.add("Softplus", [value]), 1 / float(beta)))
 
 
-def _bounded(low: float | None, high: float | None) -> Callable[..., Tensor]:
+def _clip(low: float | None, high: float | None) -> Callable[..., Tensor]:
     return lambda m, x: Tensor(activations.clip(m.b, _floats(m, x), low, high))
 
 
@@ -175,7 +175,7 @@ def _copy(m: Machine, target: Any, source: Any, non_blocking: Any = False) -> Te
     return source if isinstance(source, Tensor) else Tensor(m.ref(source, m.ref(target)))
 
 
-def _filled(m: Machine, x: Any, value: Any = 0) -> Tensor:
+def _fill_like(m: Machine, x: Any, value: Any = 0) -> Tensor:
     like = m.ref(x)
     return Tensor(m.b.broadcast(m.b.number(like, float(value)), m.b.shape(like)))
 
@@ -192,9 +192,9 @@ OPS: Mapping[str, Callable[..., Any]] = {
     **{name: _op(op) for name, op in (("cos", "Cos"), ("tan", "Tan"), ("floor", "Floor"), ("ceil", "Ceil"))},
     **{name: _op(op) for name, op in (("round", "Round"), ("reciprocal", "Reciprocal"), ("log1p", "Log1p"))},
     **{name: _op(op) for name, op in (("expm1", "Expm1"), ("erf", "Erf"), ("softsign", "Softsign"))},
-    **{name: _kept(op) for name, op in (("abs", "Abs"), ("sign", "Sign"), ("square", "Square"))},
-    "neg": _negated,
-    "relu6": _bounded(0, 6),
+    **{name: _keep_type(op) for name, op in (("abs", "Abs"), ("sign", "Sign"), ("square", "Square"))},
+    "neg": _negate,
+    "relu6": _clip(0, 6),
     "selu": _unary(activations.selu),
     "silu": _unary(activations.swish),
     "mish": _unary(activations.mish),
@@ -212,12 +212,12 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "clip": _clamp,
     "clamp_min": lambda m, x, low: _clamp(m, x, low),
     "clamp_max": lambda m, x, high: _clamp(m, x, None, high),
-    "add": _scaled("Add", "add"),
-    "sub": _scaled("Sub", "sub"),
-    "rsub": _scaled("Sub", "sub", swapped=True),
+    "add": _with_factor("Add", "add"),
+    "sub": _with_factor("Sub", "sub"),
+    "rsub": _with_factor("Sub", "sub", swapped=True),
     "mul": _binary("Mul", "mul"),
-    "div": _divided,
-    "true_divide": _divided,
+    "div": _divide,
+    "true_divide": _divide,
     "floor_divide": _floor_divided,
     "pow": _power,
     "maximum": lambda m, a, b: Tensor(m.b.add("Maximum", list(m.pair(a, b)))),
@@ -239,7 +239,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "dropout": _dropout,
     "feature_dropout": _dropout,
     "copy": _copy,
-    "fill": _filled,
-    "zero": _filled,
+    "fill": _fill_like,
+    "zero": _fill_like,
     **dict.fromkeys(("randn", "randn_like", "rand", "rand_like", "normal", "multinomial", "bernoulli"), _random),
 }

@@ -77,7 +77,7 @@ def _from_image(m: Machine, image: str, axes: int) -> Tensor:
 def _convolution(
     m: Machine, x: Any, weight: Any, bias: Any, stride: Any, padding: Any, dilation: Any, groups: Any
 ) -> Tensor:
-    kernel = m.known(weight, "the kernel")
+    kernel = m.constant_numbers(weight, "the kernel")
     axes = kernel.ndim - 2
     if axes not in (1, 2):
         raise UnsupportedOpError(f"a kernel of {kernel.ndim} axes", why="one and two axes are known")
@@ -188,9 +188,9 @@ def _batch_norm(
 ) -> Tensor:
     if training:
         raise UnsupportedOpError("batch normalisation of a module in training", why="call eval() before it is saved")
-    centre, spread = (m.known(v, "its statistics") for v in (mean, variance))
-    scale = np.ones_like(centre) if weight is None else m.known(weight, "its scale")
-    shift = np.zeros_like(centre) if bias is None else m.known(bias, "its bias")
+    centre, spread = (m.constant_numbers(v, "its statistics") for v in (mean, variance))
+    scale = np.ones_like(centre) if weight is None else m.constant_numbers(weight, "its scale")
+    shift = np.zeros_like(centre) if bias is None else m.constant_numbers(bias, "its bias")
     value = m.b.cast(m.ref(x), FLOAT32)
     m.expect(value, 1, len(centre))
     with np.errstate(all="ignore"):

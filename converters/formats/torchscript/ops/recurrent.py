@@ -70,7 +70,7 @@ def _layers(step: _Step, states: int) -> Callable[..., Any]:
         each = 4 if has_biases else 2
         if not isinstance(params, list) or len(params) != each * layers:
             raise UnsupportedOpError(f"{layers} layers have {len(params)} weights", why="projections are not known")
-        weights = [m.known(p, "a weight of a recurrent layer") for p in params]
+        weights = [m.constant_numbers(p, "a weight of a recurrent layer") for p in params]
         held = [m.ref(h) for h in (hx if isinstance(hx, list | tuple) else [hx])]
         if len(held) != states or any(m.b.rank(h) != 3 or m.b.length(h, 0) != layers for h in held):
             raise UnsupportedOpError("its states are not [layers, batch, hidden]", why="the layers need one each")
@@ -107,7 +107,7 @@ def _cell(step: _Step) -> Callable[..., Any]:
     """``lstm_cell(input, hx, w_ih, w_hh, b_ih, b_hh)`` and its kin."""
 
     def translate(m: Machine, x: Any, hx: Any, *params: Any) -> Any:
-        weights = [m.known(p, "a weight of a recurrent cell") for p in params if p is not None]
+        weights = [m.constant_numbers(p, "a weight of a recurrent cell") for p in params if p is not None]
         held = [m.ref(h) for h in (hx if isinstance(hx, list | tuple) else [hx])]
         made = [Tensor(r) for r in step(m, m.ref(x), held, weights)]
         return tuple(made) if len(made) > 1 else made[0]

@@ -18,7 +18,7 @@ def _axes(m: Machine, x: str, dim: Any) -> list[int]:
     return [m.b.axis(x, axis) for axis in wanted]
 
 
-def _reduced(op: str) -> Callable[..., Tensor]:
+def _reduce(op: str) -> Callable[..., Tensor]:
     def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False, dtype: Any = None) -> Tensor:
         value = m.b.cast(m.ref(x), FLOAT32)
         return Tensor(m.b.reduce(op, value, _axes(m, value, dim), keep=bool(keepdim)))
@@ -83,14 +83,14 @@ def _best(kind: str) -> Callable[..., Any]:
     def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False) -> Any:
         if isinstance(dim, Tensor):
             return Tensor(m.b.add(f"{kind}imum", list(m.pair(x, dim))))
-        values = _reduced(kind)(m, x, dim, keepdim)
+        values = _reduce(kind)(m, x, dim, keepdim)
         return values if dim is None else (values, _best_place(f"Arg{kind}")(m, x, dim, keepdim))
 
     return translate
 
 
 OPS: Mapping[str, Callable[..., Any]] = {
-    **{name: _reduced(op) for name, op in (("sum", "Sum"), ("mean", "Mean"), ("amax", "Max"), ("amin", "Min"))},
+    **{name: _reduce(op) for name, op in (("sum", "Sum"), ("mean", "Mean"), ("amax", "Max"), ("amin", "Min"))},
     "norm": _norm,
     "frobenius_norm": lambda m, x, dim=None, keepdim=False: _norm(m, x, 2, dim, keepdim),
     "linalg_vector_norm": _norm,

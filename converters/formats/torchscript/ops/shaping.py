@@ -125,7 +125,7 @@ def _unbind(m: Machine, x: Any, dim: Any = 0) -> list[Tensor]:
 
 def _index_select(m: Machine, x: Any, dim: Any, index: Any) -> Tensor:
     value = m.ref(x)
-    places = [int(n) for n in m.known(index, "which elements are taken").reshape(-1)]
+    places = [int(n) for n in m.constant_numbers(index, "which elements are taken").reshape(-1)]
     length = m.b.length(value, dim)
     if any(not -length <= n < length for n in places):
         raise UnsupportedOpError(f"an element beyond {length} is taken", why="there is none")
@@ -137,7 +137,7 @@ def _index(m: Machine, x: Any, indices: Any) -> Tensor:
     given = [(axis, i) for axis, i in enumerate(indices) if i is not None]
     if len(given) != 1 or m.b.rank(m.ref(given[0][1])) != 1:
         raise UnsupportedOpError("elements are taken by several lists, or by a mask", why="one list is known")
-    if m.known(given[0][1], "which elements are taken").dtype.kind == "b":
+    if m.constant_numbers(given[0][1], "which elements are taken").dtype.kind == "b":
         raise UnsupportedOpError("elements are taken by a mask", why="how many there are must be known")
     return _index_select(m, x, *given[0])
 
@@ -213,7 +213,7 @@ def _transpose(m: Machine, x: Any, first: Any, second: Any) -> Tensor:
     return _permute(m, x, order)
 
 
-def _turned(m: Machine, x: Any) -> Tensor:
+def _swap_axes(m: Machine, x: Any) -> Tensor:
     given = _tensor(x)
     return _transpose(m, given, 0, 1) if m.b.rank(given.read()) > 1 else given
 
@@ -279,7 +279,7 @@ def _like(value: float) -> Callable[..., Tensor]:
     return translate
 
 
-def _made(m: Machine, value: Any, dtype: Any = None, *rest: Any, **named: Any) -> Tensor:
+def _tensor_of(m: Machine, value: Any, dtype: Any = None, *rest: Any, **named: Any) -> Tensor:
     """``torch.tensor`` of numbers."""
     array = np.array(value)
     if array.dtype.kind not in "biuf" or array.size > _MAX_PARTS:
@@ -329,7 +329,7 @@ def _same(m: Machine, x: Any, *given: Any, **named: Any) -> Any:
     return x
 
 
-def _copied(m: Machine, x: Any, *given: Any, **named: Any) -> Tensor:
+def _copy(m: Machine, x: Any, *given: Any, **named: Any) -> Tensor:
     return Tensor(m.ref(x))
 
 
@@ -352,7 +352,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "squeeze": _squeeze,
     "permute": _permute,
     "transpose": _transpose,
-    "t": _turned,
+    "t": _swap_axes,
     "numpy_T": lambda m, x: _permute(m, x, range(m.b.rank(_tensor(x).read()))[::-1]),
     "cat": _cat,
     "concat": _cat,
@@ -366,7 +366,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "ones": _zeros(1),
     "zeros_like": _like(0),
     "ones_like": _like(1),
-    "tensor": _made,
+    "tensor": _tensor_of,
     "arange": _arange,
     "to": _to,
     "type_as": lambda m, x, other: _cast(m, _tensor(x), m.b.dtype(m.ref(other))),
@@ -374,7 +374,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "dim": lambda m, x: m.b.rank(_tensor(x).read()),
     "numel": lambda m, x: math.prod(_size(m, x)),
     **dict.fromkeys(("contiguous", "detach", "alias", "cpu", "cuda", "lift_fresh"), _same),
-    "clone": _copied,
+    "clone": _copy,
     "is_cuda": lambda m, x: False,
     "ops.prim.is_cuda": lambda m, x: False,
 }
