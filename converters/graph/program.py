@@ -26,8 +26,8 @@ from converters.graph.ops.loops.base import (
     Number,
     Reduced,
     Tensor,
+    loop_error,
     number,
-    refused,
 )
 from converters.graph.ops.table import is_fed, op_of
 from converters.graph.shapes import infer_types
@@ -142,7 +142,7 @@ class _Builder:
     def _check(self, dtype: np.dtype) -> None:
         if dtype not in DTYPES:
             assert self.node is not None
-            raise refused(self.node, f"programs compute in float32, int32, int64 and bool, not in {dtype}")
+            raise loop_error(self.node, f"programs compute in float32, int32, int64 and bool, not in {dtype}")
 
     def _counters(self, lengths: Sequence[int]) -> tuple[tuple[Counter, ...], tuple[Expression, ...]]:
         made, at = list[Counter](), list[Expression]()
@@ -161,7 +161,7 @@ class _Builder:
         assert self.node is not None
         self._check(dtype)
         if 0 in shape:
-            raise refused(self.node, "a tensor of it is empty")
+            raise loop_error(self.node, "a tensor of it is empty")
         counters, at = self._counters(shape)
         place = Place("computed", self.node.name, dtype, int(np.prod(shape, dtype=np.int64)))
         result = Tensor(place, dtype, tuple(int(n) for n in shape))
@@ -220,13 +220,13 @@ def program_of(graph: Graph, feeds: Mapping[str, str], fetches: Mapping[str, str
         if is_fed(node):
             shape = tuple(n for n in kind.shape or () if isinstance(n, int))
             if kind.shape is None or len(shape) < len(kind.shape) or kind.dtype not in DTYPES:
-                raise refused(node, "its type and length must be known: float32, int32, int64 or bool")
+                raise loop_error(node, "its type and length must be known: float32, int32, int64 or bool")
             place = Place("input", names[node.name], kind.dtype, int(np.prod(shape, dtype=np.int64)))
             builder.tensors[node.name] = inputs[names[node.name]] = Tensor(place, kind.dtype, shape)
         elif kind.constant is None:
             loops = op_of(node).loops
             if loops is None:
-                raise refused(node, "it has no loops yet")
+                raise loop_error(node, "it has no loops yet")
             made = loops(node, builder)
             for i, tensor in enumerate(made if isinstance(made, tuple) else (made,)):
                 builder.tensors[ref(node.name, i)] = tensor

@@ -78,7 +78,7 @@ def _usual(b: NnBuilder, shape: tuple[Dim, ...]) -> Axes:
 def transpose(b: NnBuilder, args: Sequence[Value]) -> Value:
     """The axes stay where they lie; the graph counts them in another order."""
     value = b.flatten_if_due(args[0])
-    order = [int(i) for i in b.known(1, "the order of the axes")]
+    order = [int(i) for i in b.constant_operand(1, "the order of the axes")]
     return replace(value, shape=tuple(value.shape[i] for i in order), axes=tuple(value.axes[i] for i in order))
 
 
@@ -87,7 +87,7 @@ def transpose(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 def concat(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Tensors one after the other."""
-    axis = int(b.known(len(b.node.inputs) - 1, "the axis"))
+    axis = int(b.constant_operand(len(b.node.inputs) - 1, "the axis"))
     return join_along(b, args, axis, b.shape_of(b.node.name))
 
 
@@ -177,7 +177,7 @@ def split(b: NnBuilder, args: Sequence[Value]) -> tuple[Value, ...]:
     """Split and SplitV: pieces one after the other along an axis."""
     axis_at = 0 if b.node.op == "Split" else 2
     value = b.flatten_if_due(args[0])
-    axis = int(b.known(axis_at, "the axis")) % len(value.shape)
+    axis = int(b.constant_operand(axis_at, "the axis")) % len(value.shape)
     start, results = 0, []
     for index in range(int(b.node.attrs["num_split"])):
         length = b.shape_of(ref(b.node.name, index))[axis]
@@ -229,7 +229,7 @@ def _drop_axes(value: Value, axes: Sequence[int]) -> Value:
 def slice_(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Slice: a beginning and a size for each axis."""
     value = b.flatten_if_due(args[0])
-    begin, size = (b.known(i, "the bounds of a slice").tolist() for i in (1, 2))
+    begin, size = (b.constant_operand(i, "the bounds of a slice").tolist() for i in (1, 2))
     for axis, (first, count) in enumerate(zip(begin, size, strict=True)):
         length = value.shape[axis]
         if isinstance(length, str):
@@ -243,7 +243,7 @@ def slice_(b: NnBuilder, args: Sequence[Value]) -> Value:
 def strided_slice(b: NnBuilder, args: Sequence[Value]) -> Value:
     """StridedSlice: bounds, new axes and axes that are dropped; steps other than 1 take element by element."""
     value = b.flatten_if_due(args[0])
-    operands = [b.known(i, "the bounds of a slice").tolist() for i in (1, 2, 3)]
+    operands = [b.constant_operand(i, "the bounds of a slice").tolist() for i in (1, 2, 3)]
     axis, gone = 0, []
     for step in strided_steps(b.node, len(value.shape), *operands):
         if step[0] == "new":
@@ -285,7 +285,7 @@ def take_indices(b: NnBuilder, value: Value, axis: int, indices: Sequence[int]) 
 def gather(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Elements of an axis by constant indices."""
     value, indices = args
-    axis = 0 if len(b.node.inputs) < 3 else int(b.known(2, "the axis"))
+    axis = 0 if len(b.node.inputs) < 3 else int(b.constant_operand(2, "the axis"))
     if indices.array is not None and value.array is None:
         value = b.flatten_if_due(value)
         axis %= len(value.shape)
@@ -306,7 +306,7 @@ def tile(b: NnBuilder, args: Sequence[Value]) -> Value:
     value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
     if value.array is not None:
         return _tile(b, value.array, shape)
-    times = b.known(1, "the numbers of repetitions").tolist()
+    times = b.constant_operand(1, "the numbers of repetitions").tolist()
     for axis, count in enumerate(times):
         if count == 1:
             continue
@@ -349,7 +349,7 @@ def fill_constant(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Fill, ZerosLike, OnesLike: a constant with a row per agent."""
     shape = b.shape_of(b.node.name)
     if b.node.op == "Fill":
-        number = b.known(1, "what it fills with")
+        number = b.constant_operand(1, "what it fills with")
     else:
         number = np.array(0 if b.node.op == "ZerosLike" else 1, b.type_of(b.node.inputs[0]).dtype)
     return constant_of(b, number, shape)
@@ -365,8 +365,8 @@ def constant_of(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Valu
 def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A border around the image; numbers in front of or behind the channels are joined on."""
     value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
-    pairs = [(int(x), int(y)) for x, y in b.known(1, "the widths of the border").tolist()]
-    fill = 0.0 if b.node.op == "Pad" else float(b.known(2, "the number that it fills with").reshape(()))
+    pairs = [(int(x), int(y)) for x, y in b.constant_operand(1, "the widths of the border").tolist()]
+    fill = 0.0 if b.node.op == "Pad" else float(b.constant_operand(2, "the number that it fills with").reshape(()))
     edges = dict.fromkeys((H, W), (0, 0))
     for axis, (low, high) in enumerate(pairs):
         place = value.axes[axis]

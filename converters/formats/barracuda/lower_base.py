@@ -85,7 +85,7 @@ class NnBuilder:
             )
         return shape
 
-    def known(self, position: int, meaning: str) -> npt.NDArray[np.generic]:
+    def constant_operand(self, position: int, meaning: str) -> npt.NDArray[np.generic]:
         """The constant operand of the current node, or UnsupportedOpError."""
         value = self.types[self.node.inputs[position]].constant
         if value is None:

@@ -172,7 +172,7 @@ REDUCED = tuple(_REDUCED)
 def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Sum, mean, largest, smallest, product: over everything that an agent has, over the channels, or over an image."""
     value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
-    axes = {int(a) % len(value.shape) for a in np.atleast_1d(b.known(1, "the axes"))}
+    axes = {int(a) % len(value.shape) for a in np.atleast_1d(b.constant_operand(1, "the axes"))}
     long = [i for i in axes if value.shape[i] != 1]
     if any(value.shape[i] == BATCH for i in long):
         raise b.nn_error("it reduces over the batch", "an agent's action would depend on the other agents")
@@ -245,7 +245,7 @@ def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
     largest, and before which there is no other.
     """
     value = b.flatten_if_due(args[0])
-    axis = int(b.known(1, "the axis").reshape(())) % len(value.shape)
+    axis = int(b.constant_operand(1, "the axis").reshape(())) % len(value.shape)
     width, row = value.size, [i for i, d in enumerate(value.shape) if d not in (1, BATCH)]
     if BATCH not in value.shape or (width > 1 and row != [axis]):
         raise b.nn_error(f"the best of {list(value.shape)} along axis {axis}", "it takes one row of scores per agent")
@@ -266,7 +266,7 @@ def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 def drawn_class(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A class of each row, drawn by its log-probabilities."""
-    count = int(b.known(1, "the number of draws").reshape(()))
+    count = int(b.constant_operand(1, "the number of draws").reshape(()))
     x = b.rows(b.flatten_if_due(args[0]))
     name = b.layer(LayerType.MULTINOMIAL, [x], (b.dims_of(x)[N], 1, 1, count), pool=(count,))
     return b.layer_value(name, b.shape_of(b.node.name), (N, None if count == 1 else C))

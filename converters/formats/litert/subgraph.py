@@ -18,7 +18,7 @@ from converters.formats.litert.flatbuffer import Table
 from converters.formats.litert.schema import ACTIVATIONS, BUILTINS, OPTIONS, PADDINGS, TABLES, TYPES
 from converters.formats.litert.tensors import UNNAMED
 from converters.graph.nodes import Graph, NameScope, Node, ref
-from converters.graph.ops.litert.base import NONE, Value, refused, reshaped
+from converters.graph.ops.litert.base import NONE, Value, emit_reshape, litert_error
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH, TensorType, of_array
@@ -122,7 +122,7 @@ class Subgraph:
         version = builtin.version(TYPES[dtype][1], axes) if dtype in TYPES else None
         if version is None:
             wide = f" that is broadcast over {axes} axes" if axes > 4 else ""
-            raise refused(self._node, f"its {op} does not take {dtype}{wide}")
+            raise litert_error(self._node, f"its {op} does not take {dtype}{wide}")
         if op == "DEPTHWISE_CONV_2D" and (options["dilation_h_factor"], options["dilation_w_factor"]) != (1, 1):
             version = 2
         return self.shared.operator(op, version)
@@ -161,7 +161,7 @@ class Subgraph:
 
     def _tensor(self, kind: TensorType, buffer: int = 0) -> Value:
         if kind.dtype not in TYPES:
-            raise refused(self._node, f"LiteRT has no {kind.dtype}")
+            raise litert_error(self._node, f"LiteRT has no {kind.dtype}")
         if self.batch is not None and kind.shape is not None:
             kind = replace(kind, shape=tuple(self.batch if d == BATCH else d for d in kind.shape))
         entry: Table = {"type": TYPES[kind.dtype][0], "buffer": buffer}
@@ -203,7 +203,7 @@ class Subgraph:
             return
         entry = op_of(node)
         if entry.litert is None:
-            raise refused(node, "LiteRT has no operator that computes it")
+            raise litert_error(node, "LiteRT has no operator that computes it")
         self.result = self.types[node.name]
         found = entry.litert(node, self)
         for index, value in enumerate(found if isinstance(found, tuple) else (found,)):
@@ -221,7 +221,7 @@ class Subgraph:
         if value in self._made and value not in taken:
             return value
         self._node, self.result = self.graph.producer(reference), self.types[reference]
-        copied = reshaped(self, value, self.result)
+        copied = emit_reshape(self, value, self.result)
         if copied is None:
             copied = self.emit("CAST", [value], in_data_type=self.result.dtype, out_data_type=self.result.dtype)
         self.tensors[copied]["name"] = self._names.fresh(spec.name)

@@ -167,7 +167,7 @@ OPS = (
         direct("Expand", 1, 0, shape_at=0),
         (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
         litert=litert.fill,
-        loops=loops.repeated(1),
+        loops=loops.broadcast_operand(1),
         precision="exact",
     ),
     OpDef(

@@ -29,7 +29,7 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, refused
+from converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, litert_error
 from converters.graph.ops.litert.layers import matmul as litert_matmul
 from converters.graph.ops.loops import layers as loops
 from converters.graph.ops.loops.base import simple
@@ -219,7 +219,7 @@ def _litert_reduction(op: str) -> Callable[[Node, LitertBuilder], Any]:
     def lower(node: Node, builder: LitertBuilder) -> Any:
         rank, axes = builder.type_of(node.inputs[0]).rank, builder.type_of(node.inputs[1]).constant
         if axes is None or rank is None:
-            raise refused(node, "the axes that it reduces over are computed while the graph runs")
+            raise litert_error(node, "the axes that it reduces over are computed while the graph runs")
         value, chosen = builder.value(node.inputs[0]), _axes(axes, rank)
         return (
             builder.emit(op, [value, ints(builder, *chosen)], keep_dims=bool(node.attrs["keep_dims"]))

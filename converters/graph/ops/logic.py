@@ -74,8 +74,10 @@ def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorTy
 
 
 OPS = (
-    _comparison("Less", np.less, direct("Less"), builtin("LESS"), loops.compared("less")),
-    _comparison("LessEqual", np.less_equal, direct("LessOrEqual"), builtin("LESS_EQUAL"), loops.compared("less_equal")),
+    _comparison("Less", np.less, direct("Less"), builtin("LESS"), loops.comparison_loops("less")),
+    _comparison(
+        "LessEqual", np.less_equal, direct("LessOrEqual"), builtin("LESS_EQUAL"), loops.comparison_loops("less_equal")
+    ),
     _comparison("Greater", np.greater, direct("Greater"), builtin("GREATER"), elementwise(loops.greater)),
     # The other way round: Barracuda has no GreaterOrEqual.
     _comparison(
@@ -85,7 +87,7 @@ OPS = (
         builtin("GREATER_EQUAL"),
         elementwise(loops.greater_equal),
     ),
-    _comparison("Equal", np.equal, direct("Equal"), builtin("EQUAL"), loops.compared("equal")),
+    _comparison("Equal", np.equal, direct("Equal"), builtin("EQUAL"), loops.comparison_loops("equal")),
     _comparison(
         "NotEqual",
         np.not_equal,
@@ -100,7 +102,7 @@ OPS = (
             plain(function),
             direct(onnx),
             litert=builtin(f"LOGICAL_{onnx.upper()}"),
-            loops=loops.compared(onnx.lower()),
+            loops=loops.comparison_loops(onnx.lower()),
             precision="exact",
             elementwise=True,
         )

@@ -277,7 +277,7 @@ def _loops_strided_slice(node: Node, builder: LoopBuilder) -> Tensor:
     operands, rank = _strided_operands([builder.type_of(r) for r in node.inputs]), builder.type_of(node.inputs[0]).rank
     if operands is None or rank is None:
         raise not_constant(node, "the bounds of a slice")
-    return loops.strided(node, builder, strided_steps(node, rank, *operands))
+    return loops.strided_slice(node, builder, strided_steps(node, rank, *operands))
 
 
 def _gather(node: Node, x: np.ndarray, indices: np.ndarray, axis: np.ndarray | None = None) -> np.ndarray:

@@ -10,9 +10,9 @@ from converters.graph.ops.litert.base import (
     LitertBuilder,
     Value,
     as_int32,
+    emit_reshape,
     ints,
-    refused,
-    reshaped,
+    litert_error,
     with_axis,
 )
 from converters.graph.types import FLOAT32, INT32, INT64, TensorType
@@ -36,7 +36,7 @@ def reshape(node: Node, builder: LitertBuilder) -> Value:
     value, target = builder.value(node.inputs[0]), builder.type_of(node.inputs[1])
     if target.shape == (0,):
         return builder.emit("SQUEEZE", [value])
-    found = reshaped(builder, value, builder.result) if target.constant is None else None
+    found = emit_reshape(builder, value, builder.result) if target.constant is None else None
     return builder.emit("RESHAPE", [value, as_int32(builder, node.inputs[1])]) if found is None else found
 
 
@@ -44,7 +44,7 @@ def expand_dims(node: Node, builder: LitertBuilder) -> Value:
     """RESHAPE, where the result's shape is known well enough."""
     axis = builder.type_of(node.inputs[1]).constant
     if axis is None:
-        raise refused(node, "the axis that it puts in is computed while the graph runs")
+        raise litert_error(node, "the axis that it puts in is computed while the graph runs")
     return with_axis(builder, builder.value(node.inputs[0]), builder.result, int(axis.reshape(())))
 
 
@@ -59,7 +59,7 @@ def concat(node: Node, builder: LitertBuilder) -> Value:
     """CONCATENATION."""
     axis, rank = builder.type_of(node.inputs[-1]).constant, builder.result.rank
     if axis is None or rank is None:
-        raise refused(node, "the axis that it joins along is computed while the graph runs")
+        raise litert_error(node, "the axis that it joins along is computed while the graph runs")
     values = [builder.value(r) for r in node.inputs[:-1]]
     return values[0] if len(values) == 1 else builder.emit("CONCATENATION", values, axis=int(axis) % rank)
 
@@ -110,7 +110,7 @@ def gather(node: Node, builder: LitertBuilder) -> Value:
     axis = builder.type_of(node.inputs[2]).constant if len(node.inputs) > 2 else np.array(0)
     rank = builder.type_of(node.inputs[0]).rank
     if axis is None or rank is None:
-        raise refused(node, "the axis that it looks up along is computed while the graph runs")
+        raise litert_error(node, "the axis that it looks up along is computed while the graph runs")
     return builder.emit("GATHER", [builder.value(r) for r in node.inputs[:2]], axis=int(axis) % rank)
 
 
@@ -149,7 +149,7 @@ def random(op: str) -> Litert:
 
     def lower(node: Node, builder: LitertBuilder) -> Value:
         if node.attrs["dtype"] != FLOAT32:
-            raise refused(node, f"LiteRT's {op} draws float32 only")
+            raise litert_error(node, f"LiteRT's {op} draws float32 only")
         return builder.emit(op, [as_int32(builder, node.inputs[0])])
 
     return lower
@@ -158,5 +158,5 @@ def random(op: str) -> Litert:
 def multinomial(node: Node, builder: LitertBuilder) -> Value:
     """MULTINOMIAL."""
     if node.attrs["output_dtype"] not in (INT32, INT64):
-        raise refused(node, "LiteRT's MULTINOMIAL gives int32 or int64")
+        raise litert_error(node, "LiteRT's MULTINOMIAL gives int32 or int64")
     return builder.emit("MULTINOMIAL", [builder.value(node.inputs[0]), as_int32(builder, node.inputs[1])])

@@ -96,7 +96,7 @@ def ints(builder: LitertBuilder, *numbers: int) -> Value:
     return builder.const(np.array(numbers, np.int32))
 
 
-def reshaped(builder: LitertBuilder, value: Value, kind: TensorType) -> Value | None:
+def emit_reshape(builder: LitertBuilder, value: Value, kind: TensorType) -> Value | None:
     """A RESHAPE to a type of which no more than one axis is free; None where more are."""
     shape = kind.shape
     if shape is None or 0 in shape or sum(isinstance(d, str) for d in shape) > 1:
@@ -111,19 +111,19 @@ def without(builder: LitertBuilder, value: Value, dtype: np.dtype, shape: Sequen
     if not axes:
         return value
     kind = TensorType(dtype, tuple(d for i, d in enumerate(shape) if i not in axes))
-    found = reshaped(builder, value, kind)
+    found = emit_reshape(builder, value, kind)
     return builder.emit("SQUEEZE", [value], kind, squeeze_dims=list(axes)) if found is None else found
 
 
 def with_axis(builder: LitertBuilder, value: Value, kind: TensorType, axis: int) -> Value:
     """A value with an axis of length 1 put in at ``axis``; ``kind`` is what comes of it."""
-    found = reshaped(builder, value, kind)
+    found = emit_reshape(builder, value, kind)
     return (
         builder.emit("EXPAND_DIMS", [value, builder.const(np.array(axis, np.int32))], kind) if found is None else found
     )
 
 
-def refused(node: Node, why: str) -> UnsupportedOpError:
+def litert_error(node: Node, why: str) -> UnsupportedOpError:
     """The error of a node that LiteRT has no operator for as it is."""
     return UnsupportedOpError(
         f"node {node.name!r} ({node.op}) is not written to .tflite",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops.litert.base import NONE, Litert, LitertBuilder, Value, as_int32, refused
+from converters.graph.ops.litert.base import NONE, Litert, LitertBuilder, Value, as_int32, litert_error
 
 #: The axes of a kernel as LiteRT has them.
 _FIRST = (3, 0, 1, 2)
@@ -27,14 +27,14 @@ def matmul(node: Node, builder: LitertBuilder) -> Value:
         bias = builder.value(node.inputs[2]) if len(node.inputs) > 2 else NONE
         rows = builder.value(node.inputs[1]) if turned[1] else builder.const(weights.T, node.inputs[1], (1, 0))
         values = [builder.value(node.inputs[0]), rows, bias]
-        return _activated(node, builder, "FULLY_CONNECTED", values)
+        return _emit_activated(node, builder, "FULLY_CONNECTED", values)
     value = builder.emit("BATCH_MATMUL", [builder.value(r) for r in node.inputs[:2]], adj_x=turned[0], adj_y=turned[1])
     if len(node.inputs) > 2:
-        return _activated(node, builder, "ADD", [value, builder.value(node.inputs[2])])
+        return _emit_activated(node, builder, "ADD", [value, builder.value(node.inputs[2])])
     return value
 
 
-def _activated(node: Node, builder: LitertBuilder, op: str, values: Sequence[Value], **options: Any) -> Value:
+def _emit_activated(node: Node, builder: LitertBuilder, op: str, values: Sequence[Value], **options: Any) -> Value:
     """An operator and the activations that the fused op carries."""
     names = list(node.attrs.get("fused_ops", ())[1:])
     first = _APPLIED[names.pop(0)] if names and names[0] in _APPLIED else ""
@@ -47,7 +47,7 @@ def _activated(node: Node, builder: LitertBuilder, op: str, values: Sequence[Val
 def _kernel(node: Node, builder: LitertBuilder) -> np.ndarray:
     kernel = builder.type_of(node.inputs[1]).constant
     if kernel is None:
-        raise refused(node, "its kernel is computed while the graph runs")
+        raise litert_error(node, "its kernel is computed while the graph runs")
     return kernel
 
 
@@ -57,7 +57,7 @@ def _windows(node: Node) -> dict[str, Any]:
     return {**found, "dilation_h_factor": int(down), "dilation_w_factor": int(across)}
 
 
-def _convolved(
+def _emit_convolution(
     node: Node, builder: LitertBuilder, op: str, weights: np.ndarray, axes: Sequence[int] = (), **options: Any
 ) -> Value:
     """Its operator asks for a bias: a policy's layer without one is given zeros."""
@@ -67,19 +67,19 @@ def _convolved(
         bias = builder.const(np.zeros(weights.shape[0 if op == "CONV_2D" else -1], weights.dtype), own=True)
     kernel = builder.const(weights, node.inputs[1] if axes else "", axes)
     values = [builder.value(node.inputs[0]), kernel, bias]
-    return _activated(node, builder, op, values, **_windows(node), **options)
+    return _emit_activated(node, builder, op, values, **_windows(node), **options)
 
 
 def conv2d(node: Node, builder: LitertBuilder) -> Value:
     """CONV_2D, whose kernel begins with the results' axis."""
-    return _convolved(node, builder, "CONV_2D", _kernel(node, builder).transpose(_FIRST), _FIRST)
+    return _emit_convolution(node, builder, "CONV_2D", _kernel(node, builder).transpose(_FIRST), _FIRST)
 
 
 def depthwise(node: Node, builder: LitertBuilder) -> Value:
     """DEPTHWISE_CONV_2D."""
     kernel = _kernel(node, builder)
     weights = kernel.reshape(1, *kernel.shape[:2], -1)
-    return _convolved(node, builder, "DEPTHWISE_CONV_2D", weights, depth_multiplier=kernel.shape[3])
+    return _emit_convolution(node, builder, "DEPTHWISE_CONV_2D", weights, depth_multiplier=kernel.shape[3])
 
 
 def pool(op: str) -> Litert:

@@ -17,27 +17,27 @@ from converters.graph.ops.loops.base import (
     Number,
     Tensor,
     apply,
-    chosen,
     element,
     holds,
+    loop_error,
     number,
-    refused,
+    select_expression,
     shape_of,
 )
 from converters.graph.types import INT32
 
 
-def known(node: Node, builder: LoopBuilder, position: int) -> np.ndarray:
+def constant_operand(node: Node, builder: LoopBuilder, position: int) -> np.ndarray:
     """The value of an operand that says how. Raises UnsupportedOpError where it is computed while the graph runs."""
     value = builder.type_of(node.inputs[position]).constant
     if value is None:
-        raise refused(node, "an operand that says which elements are taken is computed while the graph runs")
+        raise loop_error(node, "an operand that says which elements are taken is computed while the graph runs")
     return value
 
 
 def transpose(node: Node, builder: LoopBuilder) -> Tensor:
     """Axes in another order."""
-    x, order = builder.value(node.inputs[0]), [int(i) for i in known(node, builder, 1)]
+    x, order = builder.value(node.inputs[0]), [int(i) for i in constant_operand(node, builder, 1)]
     back = [order.index(i) for i in range(len(order))]
     return builder.compute(shape_of(node, builder), lambda at: Element(x, tuple(at[i] for i in back)), x.dtype)
 
@@ -56,11 +56,11 @@ def cut(builder: LoopBuilder, x: Tensor, shape: Sequence[int], begin: Sequence[i
 
 def slice_(node: Node, builder: LoopBuilder) -> Tensor:
     """A piece of every axis."""
-    x, begin = builder.value(node.inputs[0]), [int(i) for i in known(node, builder, 1)]
+    x, begin = builder.value(node.inputs[0]), [int(i) for i in constant_operand(node, builder, 1)]
     return cut(builder, x, shape_of(node, builder), begin, [1] * len(begin))
 
 
-def strided(node: Node, builder: LoopBuilder, steps: Sequence[tuple[Any, ...]]) -> Tensor:
+def strided_slice(node: Node, builder: LoopBuilder, steps: Sequence[tuple[Any, ...]]) -> Tensor:
     """A strided slice, by what its masks were resolved to."""
     x = builder.value(node.inputs[0])
     taken = [s for s in steps if s[0] != "new"]
@@ -87,7 +87,7 @@ def split(node: Node, builder: LoopBuilder) -> tuple[Tensor, ...]:
     """Pieces of one axis."""
     axis_at, data_at = (0, 1) if node.op == "Split" else (2, 0)
     x = builder.value(node.inputs[data_at])
-    axis = int(known(node, builder, axis_at)) % len(x.shape)
+    axis = int(constant_operand(node, builder, axis_at)) % len(x.shape)
     return _pieces(node, builder, x, axis, int(node.attrs["num_split"]))
 
 
@@ -106,7 +106,7 @@ def unpack(node: Node, builder: LoopBuilder) -> tuple[Tensor, ...]:
     return tuple(piece(i) for i in range(int(node.attrs["num"])))
 
 
-def _joined(builder: LoopBuilder, parts: Sequence[Tensor], axis: int, shape: Sequence[int]) -> Tensor:
+def _join(builder: LoopBuilder, parts: Sequence[Tensor], axis: int, shape: Sequence[int]) -> Tensor:
     """Parts one after the other along an axis."""
 
     def one(at: Index) -> Expression:
@@ -115,7 +115,11 @@ def _joined(builder: LoopBuilder, parts: Sequence[Tensor], axis: int, shape: Seq
         def of(i: int) -> Expression:
             index = apply("sub", at[axis], number(ends[i] - parts[i].shape[axis]))
             found = Element(parts[i], (*at[:axis], index, *at[axis + 1 :]))
-            return found if i == len(parts) - 1 else chosen(holds("less", at[axis], number(ends[i])), found, of(i + 1))
+            return (
+                found
+                if i == len(parts) - 1
+                else select_expression(holds("less", at[axis], number(ends[i])), found, of(i + 1))
+            )
 
         return of(0)
 
@@ -126,8 +130,8 @@ def concat(node: Node, builder: LoopBuilder) -> Tensor:
     """Parts one after the other."""
     shape = shape_of(node, builder)
     parts = [builder.value(r) for r in node.inputs[:-1]]
-    axis = int(known(node, builder, len(node.inputs) - 1)) % len(shape)
-    return _joined(builder, [p for p in parts if p.shape[axis]] or parts[:1], axis, shape)
+    axis = int(constant_operand(node, builder, len(node.inputs) - 1)) % len(shape)
+    return _join(builder, [p for p in parts if p.shape[axis]] or parts[:1], axis, shape)
 
 
 def pack(node: Node, builder: LoopBuilder) -> Tensor:
@@ -135,13 +139,13 @@ def pack(node: Node, builder: LoopBuilder) -> Tensor:
     shape = shape_of(node, builder)
     axis = int(node.attrs["axis"]) % len(shape)
     one = (*shape[:axis], 1, *shape[axis + 1 :])
-    return _joined(builder, [Tensor(v.place, v.dtype, one) for v in map(builder.value, node.inputs)], axis, shape)
+    return _join(builder, [Tensor(v.place, v.dtype, one) for v in map(builder.value, node.inputs)], axis, shape)
 
 
 def gather(node: Node, builder: LoopBuilder) -> Tensor:
     """Rows by their number; one outside is an error, as in TensorFlow."""
     x, rows = (builder.value(r) for r in node.inputs[:2])
-    axis = int(known(node, builder, 2)) % len(x.shape) if len(node.inputs) > 2 else 0
+    axis = int(constant_operand(node, builder, 2)) % len(x.shape) if len(node.inputs) > 2 else 0
     many = len(rows.shape)
 
     def one(at: Index) -> Expression:
@@ -170,7 +174,7 @@ def range_(node: Node, builder: LoopBuilder) -> Tensor:
 
 def places_found(node: Node, builder: LoopBuilder) -> Tensor:
     """Raise UnsupportedOpError: a program's lengths are known when it is written."""
-    raise refused(node, "how many places it finds is known only while it runs")
+    raise loop_error(node, "how many places it finds is known only while it runs")
 
 
 def sparse_to_dense(node: Node, builder: LoopBuilder) -> Tensor:
@@ -191,24 +195,26 @@ def sparse_to_dense(node: Node, builder: LoopBuilder) -> Tensor:
         at = [(*rows, number(a)) for a in range(len(shape))] if len(places.shape) == 2 else [rows]
         return flat([_index(Element(places, i), n) for i, n in zip(at, shape, strict=True)])
 
-    def checked(k: Expression) -> Expression:
+    def checked_place(k: Expression) -> Expression:
         if not ordered or count == 1:
             return place(k)
         first, before = holds("less", k, number(1)), apply("sub", k, number(1))
-        rising = chosen(first, number(1), apply("cast", holds("less", place(before), place(k)), dtype=INT32))
-        right = chosen(holds("less", number(0), rising), place(k), number(-1))
+        rising = select_expression(first, number(1), apply("cast", holds("less", place(before), place(k)), dtype=INT32))
+        right = select_expression(holds("less", number(0), rising), place(k), number(-1))
         return apply("within", right, number(int(np.prod(shape, dtype=np.int64))))
 
     def one(at: Index) -> Expression:
         def hit(k: Index) -> Expression:
-            return chosen(holds("equal", checked(k[0]), flat(at)), apply("add", k[0], number(1)), number(0))
+            return select_expression(
+                holds("equal", checked_place(k[0]), flat(at)), apply("add", k[0], number(1)), number(0)
+            )
 
         if not count:
             return element(default, ())
         last = builder.reduce("max", [count], hit, INT32)
         which = apply("sub", last, number(1)) if count > 1 else number(0)
         value = Element(values, (which,) * len(values.shape))
-        return chosen(holds("less", number(0), last), value, element(default, ()))
+        return select_expression(holds("less", number(0), last), value, element(default, ()))
 
     return builder.compute(shape, one, values.dtype)
 
@@ -222,7 +228,7 @@ def one_hot(node: Node, builder: LoopBuilder) -> Tensor:
     def one(at: Index) -> Expression:
         place = at[axis] if x.dtype == INT32 else apply("cast", at[axis], dtype=x.dtype)
         hit = holds("equal", Element(x, (*at[:axis], *at[axis + 1 :])), place)
-        return chosen(hit, element(on, ()), element(off, ()))
+        return select_expression(hit, element(on, ()), element(off, ()))
 
     return builder.compute(shape, one, on.dtype)
 
@@ -238,7 +244,7 @@ def tile(node: Node, builder: LoopBuilder) -> Tensor:
     return builder.compute(shape_of(node, builder), one, x.dtype)
 
 
-def repeated(position: int) -> Loops:
+def broadcast_operand(position: int) -> Loops:
     """An operand, broadcast to the shape of the result."""
 
     def loops(node: Node, builder: LoopBuilder) -> Tensor:
@@ -250,7 +256,7 @@ def repeated(position: int) -> Loops:
 
 def pad(node: Node, builder: LoopBuilder) -> Tensor:
     """Elements around, zeros or a number."""
-    x, amounts = builder.value(node.inputs[0]), known(node, builder, 1).tolist()
+    x, amounts = builder.value(node.inputs[0]), constant_operand(node, builder, 1).tolist()
     fill = builder.value(node.inputs[2]) if len(node.inputs) > 2 else None
 
     def one(at: Index) -> Expression:
@@ -259,9 +265,9 @@ def pad(node: Node, builder: LoopBuilder) -> Tensor:
         outside = Number(0, x.dtype) if fill is None else element(fill, ())
         for i, n, (before, after) in zip(index, x.shape, amounts, strict=True):
             if after:
-                result = chosen(holds("less", i, number(n)), result, outside)
+                result = select_expression(holds("less", i, number(n)), result, outside)
             if before:
-                result = chosen(holds("less_equal", number(0), i), result, outside)
+                result = select_expression(holds("less_equal", number(0), i), result, outside)
         return result
 
     return builder.compute(shape_of(node, builder), one, x.dtype)

@@ -153,7 +153,7 @@ def holds(function: str, a: Expression, b: Expression) -> Expression:
     return apply(function, a, b, dtype=BOOL)
 
 
-def chosen(condition: Expression, a: Expression, b: Expression) -> Expression:
+def select_expression(condition: Expression, a: Expression, b: Expression) -> Expression:
     """``a`` where the condition holds, else ``b``; the other is not computed."""
     return apply("select", condition, a, b, dtype=a.dtype)
 
@@ -168,7 +168,7 @@ def shape_of(node: Node, builder: LoopBuilder, output: str = "") -> tuple[int, .
     """The lengths of a node's result. Raises UnsupportedOpError where one is not known."""
     shape = builder.type_of(output or node.name).shape
     if shape is None or not all(isinstance(n, int) for n in shape):
-        raise refused(node, "its shape is not known before it runs")
+        raise loop_error(node, "its shape is not known before it runs")
     return tuple(int(n) for n in shape)
 
 
@@ -196,7 +196,7 @@ def view(node: Node, builder: LoopBuilder) -> Tensor:
     return Tensor(value.place, value.dtype, shape_of(node, builder))
 
 
-def refused(node: Node, why: str) -> UnsupportedOpError:
+def loop_error(node: Node, why: str) -> UnsupportedOpError:
     """The error of a node that has no loops as it is."""
     return UnsupportedOpError(
         f"node {node.name!r} ({node.op}) is not written as source code",

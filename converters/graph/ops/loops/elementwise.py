@@ -10,10 +10,10 @@ from converters.graph.ops.loops.base import (
     Number,
     Tensor,
     apply,
-    chosen,
     element,
     elementwise,
     holds,
+    select_expression,
     shape_of,
 )
 from converters.graph.types import BOOL
@@ -26,8 +26,10 @@ def _like(x: Expression, value: float) -> Number:
 def sign(x: Expression) -> Expression:
     """-1, 0, 1, or NaN as it is."""
     zero = _like(x, 0)
-    return chosen(
-        holds("less", zero, x), _like(x, 1), chosen(holds("less", x, zero), _like(x, -1), apply("mul", x, zero))
+    return select_expression(
+        holds("less", zero, x),
+        _like(x, 1),
+        select_expression(holds("less", x, zero), _like(x, -1), apply("mul", x, zero)),
     )
 
 
@@ -54,23 +56,23 @@ def sigmoid(x: Expression) -> Expression:
 
 def relu(x: Expression) -> Expression:
     """0 where x is below."""
-    return chosen(holds("less", x, _like(x, 0)), _like(x, 0), x)
+    return select_expression(holds("less", x, _like(x, 0)), _like(x, 0), x)
 
 
 def relu6(x: Expression) -> Expression:
     """From 0 to 6."""
-    return chosen(holds("less", _like(x, 6), x), _like(x, 6), relu(x))
+    return select_expression(holds("less", _like(x, 6), x), _like(x, 6), relu(x))
 
 
 def elu(x: Expression) -> Expression:
     """exp(x) - 1 below 0."""
-    return chosen(holds("less", _like(x, 0), x), x, apply("expm1", x))
+    return select_expression(holds("less", _like(x, 0), x), x, apply("expm1", x))
 
 
 def selu(x: Expression) -> Expression:
     """Elu, scaled."""
     below = apply("mul", _like(x, 1.6732632423543772), apply("expm1", x))
-    return apply("mul", _like(x, 1.0507009873554805), chosen(holds("less", _like(x, 0), x), x, below))
+    return apply("mul", _like(x, 1.0507009873554805), select_expression(holds("less", _like(x, 0), x), x, below))
 
 
 def softplus(x: Expression) -> Expression:
@@ -115,7 +117,7 @@ def not_equal(a: Expression, b: Expression) -> Expression:
     return apply("not", holds("equal", a, b), dtype=BOOL)
 
 
-def compared(function: str) -> Loops:
+def comparison_loops(function: str) -> Loops:
     """A comparison, or one of truths."""
     return elementwise(lambda a, b: holds(function, a, b))
 
@@ -124,7 +126,7 @@ def compared(function: str) -> Loops:
 ACTIVATIONS = {"Relu": relu, "Relu6": relu6, "Elu": elu, "Sigmoid": sigmoid}
 
 
-def activated(node: Node, x: Expression) -> Expression:
+def apply_activations(node: Node, x: Expression) -> Expression:
     """What the activations of a fused op make of an element."""
     for name in node.attrs.get("fused_ops", ())[1:]:
         x = ACTIVATIONS[name](x)
@@ -135,12 +137,12 @@ def cast(node: Node, builder: LoopBuilder) -> Tensor:
     """To bool: what is not 0."""
     target = builder.type_of(node.name).dtype
 
-    def turned(x: Expression) -> Expression:
+    def convert(x: Expression) -> Expression:
         if x.dtype == target:
             return x
         return not_equal(x, _like(x, 0)) if target == BOOL else apply("cast", x, dtype=target)
 
-    made: Tensor = elementwise(turned)(node, builder)
+    made: Tensor = elementwise(convert)(node, builder)
     return made
 
 
@@ -160,6 +162,6 @@ def select(node: Node, builder: LoopBuilder) -> Tensor:
     rows = len(condition.shape) == 1 and len(a.shape) > 1
     return builder.compute(
         shape_of(node, builder),
-        lambda at: chosen(element(condition, at[:1] if rows else at), element(a, at), element(b, at)),
+        lambda at: select_expression(element(condition, at[:1] if rows else at), element(a, at), element(b, at)),
         a.dtype,
     )

@@ -19,14 +19,14 @@ from converters.graph.ops.loops.base import (
     Number,
     Tensor,
     apply,
-    chosen,
     element,
     holds,
+    loop_error,
     number,
-    refused,
+    select_expression,
     shape_of,
 )
-from converters.graph.ops.loops.elementwise import activated
+from converters.graph.ops.loops.elementwise import apply_activations
 from converters.graph.types import BOOL, INT32
 
 
@@ -48,7 +48,7 @@ def matmul(node: Node, builder: LoopBuilder) -> Tensor:
             return _mul(element(a, (*at[:-2], *left)), element(b, (*at[:-2], *right)))
 
         total = builder.reduce("sum", [inner], product, a.dtype)
-        return activated(node, total if bias is None else apply("add", total, element(bias, at)))
+        return apply_activations(node, total if bias is None else apply("add", total, element(bias, at)))
 
     return builder.compute(shape_of(node, builder), one, a.dtype)
 
@@ -99,11 +99,11 @@ def convolution(node: Node, builder: LoopBuilder) -> Tensor:
         def product(k: Index) -> Expression:
             where, inside = place(at, k)
             x: Expression = Element(image, (at[0], *where, k[2]))
-            x = x if inside is None else chosen(inside, x, Number(0, image.dtype))
+            x = x if inside is None else select_expression(inside, x, Number(0, image.dtype))
             return _mul(x, Element(kernel, (*k, at[3])))
 
         total = builder.reduce("sum", kernel.shape[:3], product, image.dtype)
-        return activated(node, total if bias is None else apply("add", total, element(bias, at)))
+        return apply_activations(node, total if bias is None else apply("add", total, element(bias, at)))
 
     return builder.compute(shape_of(node, builder), one, image.dtype)
 
@@ -120,7 +120,7 @@ def depthwise(node: Node, builder: LoopBuilder) -> Tensor:
         def product(k: Index) -> Expression:
             where, inside = place(at, k)
             x: Expression = Element(image, (at[0], *where, channel))
-            x = x if inside is None else chosen(inside, x, Number(0, image.dtype))
+            x = x if inside is None else select_expression(inside, x, Number(0, image.dtype))
             return _mul(x, Element(kernel, (k[0], k[1], channel, which)))
 
         return builder.reduce("sum", kernel.shape[:2], product, image.dtype)
@@ -141,7 +141,7 @@ def pool(kind: Kind) -> Loops:
                 x: Expression = Element(image, (at[0], *where, at[3]))
                 x = Number(1, image.dtype) if counted else x
                 outside = Number(-np.inf if kind == "max" else 0, image.dtype)
-                return x if inside is None else chosen(inside, x, outside)
+                return x if inside is None else select_expression(inside, x, outside)
 
             result = builder.reduce(kind, window, part, image.dtype)
             if kind == "max":
@@ -162,12 +162,12 @@ def reduction(kind: Kind, mean: bool = False) -> Loops:
     def loops(node: Node, builder: LoopBuilder) -> Tensor:
         x, axes = builder.value(node.inputs[0]), builder.type_of(node.inputs[1]).constant
         if axes is None:
-            raise refused(node, "the axes that it reduces over are computed while the graph runs")
+            raise loop_error(node, "the axes that it reduces over are computed while the graph runs")
         chosen_axes = sorted({int(a) % len(x.shape) for a in np.atleast_1d(axes)} if x.shape else set())
         keep = bool(node.attrs["keep_dims"])
         lengths = [x.shape[a] for a in chosen_axes]
         if 0 in lengths:
-            raise refused(node, "it reduces an axis that is empty")
+            raise loop_error(node, "it reduces an axis that is empty")
 
         def one(at: Index) -> Expression:
             def part(k: Index) -> Expression:
@@ -191,7 +191,7 @@ def arg(kind: Kind) -> Loops:
     def loops(node: Node, builder: LoopBuilder) -> Tensor:
         x, axis = builder.value(node.inputs[0]), builder.type_of(node.inputs[1]).constant
         if axis is None:
-            raise refused(node, "its axis is computed while the graph runs")
+            raise loop_error(node, "its axis is computed while the graph runs")
         along, dtype = int(axis) % len(x.shape), builder.type_of(node.name).dtype
 
         def one(at: Index) -> Expression:
@@ -220,12 +220,12 @@ def softmax(log: bool) -> Loops:
 
         shifted = builder.compute(x.shape, lambda at: less_top(at) if log else apply("exp", less_top(at)), x.dtype)
 
-        def summed(k: Expression, at: Index) -> Expression:
+        def summand(k: Expression, at: Index) -> Expression:
             one = Element(shifted, (*at, k))
             return apply("exp", one) if log else one
 
         total = builder.compute(
-            rows, lambda at: builder.reduce("sum", [length], lambda k: summed(k[0], at), x.dtype), x.dtype
+            rows, lambda at: builder.reduce("sum", [length], lambda k: summand(k[0], at), x.dtype), x.dtype
         )
 
         def one(at: Index) -> Expression:
