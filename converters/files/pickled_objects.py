@@ -164,8 +164,8 @@ _OPCODES = {
     **OPCODES,
     "NEWOBJ": lambda m, _: m.stack.append(m.instance(*m.last(2))),
     "NEWOBJ_EX": lambda m, _: m.stack.append(m.instance(*m.last(3)[:2])),
-    "OBJ": lambda m, _: m.stack.append(m.collected()),
-    "INST": lambda m, name: m.stack.append(m.instance(m.imported(*name.partition(" ")[::2]), tuple(m.items()))),
+    "OBJ": lambda m, _: m.stack.append(m.collect_instance()),
+    "INST": lambda m, name: m.stack.append(m.instance(m.import_name(*name.partition(" ")[::2]), tuple(m.items()))),
     "BYTEARRAY8": lambda m, value: m.stack.append(bytes(value)),
     **dict.fromkeys(("STRING", "BINSTRING", "SHORT_BINSTRING"), lambda m, value: m.stack.append(value)),
     # Sets hold no statistics: what goes into one is forgotten.
