@@ -63,7 +63,7 @@ class BarracudaModel(CheckedModel):
             )
         return truncate(found[0])
 
-    _deprecated = _first_of_shape = _first
+    _deprecated_number = _first_of_shape = _first
     _shape = constant
 
     @property
