@@ -31,6 +31,9 @@ MODULES = ROOT / "converters/runtimes/javascript/js/node_modules"
 def furnish(folder: Path) -> None:
     """Make what the pages take for given: see each line."""
     shutil.copytree(TRAINED, folder / "results/first_run/3DBall")
+    (folder / "results/second_run/3DBall").mkdir(parents=True)
+    for name in ("3DBall-250000.pt", "3DBall-500000.pt", "checkpoint.pt"):
+        shutil.copy(ROOT / "fixtures/torch_checkpoint/ppo_1_1.pt", folder / "results/second_run/3DBall" / name)
     shutil.copy(TRAINED / "frozen_graph_def.pb", folder / "3DBall.bytes")
     shutil.copy(TRAINED / "frozen_graph_def.pb", folder / "frozen_graph_def.pb")
     shutil.copy(fixture("recurrent"), folder / "runner.bytes")
