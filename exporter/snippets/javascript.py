@@ -1,4 +1,4 @@
-"""Snippets in JavaScript: policy.mjs, plain TensorFlow.js and onnxruntime-web, each a page of its own.
+"""Snippets in JavaScript: policy.mjs, plain TensorFlow.js and onnxruntime-web, each a page of its own, or for Node.
 
 A page lies beside the bundle's folder and takes its runtime from ``node_modules`` there: no network is needed.
 """
@@ -46,6 +46,11 @@ def acting_tfjs(bundle: Bundle) -> str:
     return _page(bundle, _TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle))
 
 
+def acting_node(bundle: Bundle) -> str:
+    """policy.mjs with TensorFlow.js, for Node."""
+    return _program(bundle, _TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle), "node.mjs")
+
+
 def acting_ort(bundle: Bundle) -> str:
     """policy.mjs with onnxruntime-web."""
     return _page(bundle, _ORT, "acting_ort.mjs", f"{bundle.name}.onnx", _agents(bundle))
@@ -66,8 +71,12 @@ def plain_ort(bundle: Bundle) -> str:
 
 
 def _page(bundle: Bundle, runtime: tuple[str, str], frame: str, model: str, play: str) -> str:
+    return _program(bundle, runtime, frame, model, play, "page.html")
+
+
+def _program(bundle: Bundle, runtime: tuple[str, str], frame: str, model: str, play: str, whole: str) -> str:
     code = fill_template(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play)
-    return fill_template("page.html", name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
+    return fill_template(whole, name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
 
 
 def _url(bundle: Bundle, relative: str) -> str:

@@ -46,6 +46,7 @@ TARGETS: tuple[Target, ...] = (
     Target("serving-rest", "TensorFlow Serving, REST with curl", "sh", (SAVED_MODEL,), serving.rest),
     Target("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", (SAVED_MODEL,), serving.grpc),
     Target("policy-tfjs", "A page, policy.mjs with TensorFlow.js", "html", (TFJS,), javascript.acting_tfjs),
+    Target("policy-node", "Node, policy.mjs with TensorFlow.js", "js", (TFJS,), javascript.acting_node),
     Target("policy-ort", "A page, policy.mjs with onnxruntime-web", "html", ((TFJS, ONNX),), javascript.acting_ort),
     Target("tfjs", "A page, tf.loadGraphModel", "html", (TFJS,), javascript.plain_tfjs),
     Target("onnxruntime-web", "A page, onnxruntime-web", "html", (ONNX,), javascript.plain_ort),

@@ -242,7 +242,9 @@ def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> Non
     (tmp_path / "recurrent").symlink_to(out / "recurrent")
     page = code_of(out, "recurrent", target)
     tell = "(what) => navigator.sendBeacon('/told', JSON.stringify(what))"
-    told = f"<script>const tell = {tell}; console.log = (...v) => tell(v); onerror = (m) => tell('error: ' + m);"
+    told = f"<script>const tell = {tell}; let logs = 0; onerror = (m) => tell('error: ' + m);"
+    told += "const shown = () => tell(document.getElementById('answer').textContent);"
+    told += "console.log = (...v) => { tell(v); if (++logs === 3) setTimeout(shown, 500); };"
     told += "onunhandledrejection = (e) => tell('error: ' + e.reason);</script>"
     (tmp_path / "index.html").write_text(page.replace('<meta charset="utf-8">', f'<meta charset="utf-8">{told}'))
     answers: queue.Queue[Any] = queue.Queue()
@@ -267,13 +269,34 @@ def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> Non
             stderr=subprocess.DEVNULL,
         )
         try:
-            logged = [answers.get(timeout=600) for _ in range(3)]
+            *logged, shown = [answers.get(timeout=600) for _ in range(4)]
         finally:
             browser.kill()
             browser.wait()
             server.shutdown()
     for (values,) in logged:
         assert np.size(values) == 2, logged
+    assert [json.loads(line) for line in shown.splitlines()] == [values for (values,) in logged]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["recurrent", "continuous"])
+def test_node_runs_what_is_printed_for_it(name: str, out: Path, tmp_path: Path) -> None:
+    """As it is printed, with paths: nothing is fetched."""
+    node, home = node_executable(), js_home()
+    if node is None or not (home / "node_modules/@tensorflow/tfjs").is_dir():
+        pytest.skip("Node or @tensorflow/tfjs is not here: make install")
+    (tmp_path / "node_modules").symlink_to((home / "node_modules").resolve())
+    shutil.copytree(out / name, tmp_path / name)
+    (tmp_path / "play.mjs").write_text(code_of(out, name, "policy-node"), encoding="utf-8")
+    done = subprocess.run([node, "play.mjs"], cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    agents = load_policy(out / name, runtime="numpy", seed=0).agent()
+    zeros = {s.name: np.zeros([n or 1 for n in s.shape], s.dtype) for s in agents.policy.signature.observations}
+    lines = [line for line in done.stdout.splitlines() if line.startswith("[")]
+    assert len(lines) == (3 if name == "recurrent" else 1)
+    for line in lines:
+        np.testing.assert_allclose(json.loads(line), agents.decide(zeros).action, atol=1e-5, rtol=1e-5)
 
 
 # ------------------------------------------------------------------ C#, Unity, shell
