@@ -5,6 +5,7 @@ exported to four formats and verified in all runtimes that are installed; in bro
 says nothing that depends on the machine's place or speed.
 ``python -m tests.figures --profiles`` counts what each profile of ``--for`` holds and refuses, and runs what is held
 (tests/targets/sweep.py, 35 minutes of a processor),
+``python -m tests.figures --litert`` counts what is written as .tflite, and runs it (tests/litert/sweep.py, 15 minutes),
 ``python -m tests.figures --page`` writes the page anew from the figures that are there.
 """
 
@@ -244,6 +245,7 @@ def page(content: Mapping[str, Any]) -> str:
         "",
         *_table(["runtime", "version"], [[r, v] for r, v in content["runtimes"].items()]),
         *(_profiles(content["unity"]) if "unity" in content else []),
+        *(_litert(content["litert"]) if "litert" in content else []),
     ]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -278,6 +280,29 @@ def _profiles(counted: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _litert(counted: Mapping[str, Any]) -> list[str]:
+    """The section on ``--to litert``."""
+    refused = "; ".join(f"{what}: {n}" for what, n in counted["refused"].items()) or "none"
+    return [
+        "## LiteRT",
+        "",
+        f"Counted on {counted['date']} by `python -m tests.figures --litert`: {counted['files']} files (public models, "
+        "genuine trainings, other trainers), without those that are not read as a policy.",
+        "",
+        *_table(
+            [
+                "policies written as ONNX",
+                "as `.tflite`",
+                "agree in LiteRT, with XNNPACK and without",
+                "the same bytes when read and written again",
+            ],
+            [[counted["onnx"], counted["written"], counted["agree"], counted["same"]]],
+        ),
+        f"Refused: {refused}. Not in agreement: {', '.join(counted['failed']) or 'none'}.",
+        "",
+    ]
+
+
 def _spread(found: Sequence[Mapping[str, Any]]) -> list[object]:
     counts: dict[float, int] = defaultdict(int)
     for cell in found:
@@ -296,6 +321,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only files whose path holds this; nothing is written to docs/")
     parser.add_argument("--page", action="store_true", help="only the page, from the figures that are there")
     parser.add_argument("--profiles", action="store_true", help="only what each profile of --for holds")
+    parser.add_argument("--litert", action="store_true", help="only what is written as .tflite")
     options = parser.parse_args()
     before = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.is_file() else {}
     if options.profiles:
@@ -304,6 +330,13 @@ def main() -> int:
         with RuntimePool() as pool:
             counted = {"date": _today(), **sweep.swept(sweep.sources(), pool)}
         FIGURES.write_text(json.dumps({**before, "unity": counted}, indent=1) + "\n", encoding="utf-8")
+    elif options.litert:
+        from tests import known
+        from tests.litert import sweep as litert
+
+        with RuntimePool() as pool:
+            found = {"date": _today(), **litert.sweep(known.sources(), pool)}
+        FIGURES.write_text(json.dumps({**before, "litert": found}, indent=1) + "\n", encoding="utf-8")
     elif not options.page:
         files = [(origin, f) for origin, f in sources() if options.only in str(f)]
         if not files or not SHARED.is_dir():
@@ -314,7 +347,7 @@ def main() -> int:
         if options.only:
             print(page(content))
             return 1 if content["failed"] else 0
-        kept = {"unity": before["unity"]} if "unity" in before else {}
+        kept = {key: before[key] for key in ("unity", "litert") if key in before}
         FIGURES.write_text(json.dumps({**content, **kept}, indent=1) + "\n", encoding="utf-8")
     content = json.loads(FIGURES.read_text(encoding="utf-8"))
     PAGE.write_text(page(content), encoding="utf-8")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +13,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.formats.format import WriteOptions
 from converters.formats.litert.flatbuffer import Table, decode, encode
 from converters.formats.litert.importer.table import TABLE as OPERATORS
 from converters.formats.litert.reader import read_litert
 from converters.formats.litert.schema import BUILTINS, OPTIONS, TYPES
-from converters.formats.registry import WRITTEN
-from converters.formats.source import ReadOptions
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
-from exporter.export.job import contract_of
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.inspect.inspection import inspect_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
-from signatures.contract import safe_name
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
 from tests import known
 from tests.commands import ROOT
@@ -38,6 +32,7 @@ from tests.conftest import Chosen
 from tests.graph.harness import policy_of
 from tests.graph.samples import SAMPLES
 from tests.litert import make_models
+from tests.litert.sweep import round_trips, written
 
 interpreter = pytest.importorskip("ai_edge_litert.interpreter", reason="pip install 'export-model[litert]'")
 pytestmark = pytest.mark.xdist_group("litert-reader")
@@ -51,32 +46,9 @@ SIMPLER = {
 }
 
 
-def again(file: Path, text: str) -> bytes:
-    """What is written of a file of ours, with a contract."""
-    (policy,) = read_source(file).policies()
-    return written(policy, text)
-
-
-def written(policy: Any, text: str) -> bytes:
-    (pieces,) = WRITTEN["litert"].artifact(policy, WriteOptions(text)).files.values()
-    return pieces.to_bytes()
-
-
-def _trip(source: Path, folder: Path) -> list[tuple[bytes, bytes]]:
-    """Of each policy: its file, and what is written of that file under the same contract."""
-    found, place = read_source(source), folder / "policy.tflite"
-    trips = []
-    for model, policy in found.compile_models(None):
-        named = replace(policy, name=safe_name(policy.name))
-        text = contract_of(named, found, model, ReadOptions()).compact()
-        place.write_bytes(written(named, text))
-        trips.append((place.read_bytes(), again(place, text)))
-    return trips
-
-
 @pytest.mark.parametrize("name", FIXTURES)
 def test_a_round_trip_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
-    for first, second in _trip(path(name), tmp_path):
+    for first, second in round_trips(path(name), tmp_path):
         assert first == second
 
 
@@ -86,7 +58,7 @@ def test_a_round_trip_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
 def test_every_policy_gives_the_same_bytes(source: Path, tmp_path: Path, is_new: Chosen) -> None:
     if not is_new("litert", known.policies_or_skip(source)):  # type: ignore[call-arg, arg-type]
         return
-    for first, second in _trip(source, tmp_path):
+    for first, second in round_trips(source, tmp_path):
         assert (first == second) is (source.name not in SIMPLER)
 
 
