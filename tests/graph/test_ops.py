@@ -93,7 +93,10 @@ def test_litert(op: str, runtime: str, runtimes: Runtimes) -> None:
                 runtimes.litert(runtime, policy_of(sample.graph, sample.fetches), sample.feeds)
         return
     found = problems(
-        op, runtime, lambda sample: runtimes.litert(runtime, policy_of(sample.graph, sample.fetches), sample.feeds)
+        op,
+        runtime,
+        lambda sample: runtimes.litert(runtime, policy_of(sample.graph, sample.fetches), sample.feeds),
+        narrowed=True,
     )
     assert found == []
 

@@ -29,5 +29,6 @@ FORMATS = (
         inner=_artifact.inner,
         runtimes=("litert", "litert-plain"),
         signatures=True,
+        dtypes=frozenset(("float32", "int32", "bool", "uint8")),
     ),
 )

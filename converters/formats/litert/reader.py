@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from converters.compiler.options import MAX_PORTS
+from converters.formats.bundle.embed import contract_of
 from converters.formats.litert.artifact import note, operator_of
 from converters.formats.litert.flatbuffer import Table, decode
 from converters.formats.litert.importer.importer import Importer
@@ -19,7 +22,8 @@ from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
 from converters.formats.saved_model.signature import ModelSignature, Tensor
 from converters.graph.builder import MAX_NODES
 from converters.graph.nodes import Graph, TensorShape
-from signatures.contract import EMBEDDED
+from converters.graph.types import INT64
+from signatures.contract import EMBEDDED, Contract
 from signatures.errors import NotAPolicyError
 from signatures.records import dataclass
 
@@ -45,7 +49,7 @@ class LitertModel:
     function: int
     others: tuple[str, ...]
     description: str = ""
-    contract: str | None = None
+    contract: Contract | None = None
     widened: bool = False
     narrowed: bool = False
 
@@ -65,6 +69,13 @@ def read_litert(data: bytes) -> LitertModel:
     subgraph = entry_of(model, "subgraphs", called.get("subgraph_index", 0))
     tensors = Tensors(model, subgraph, len(data))
     inputs, outputs = (_ports(subgraph, called, side, tensors) for side in ("inputs", "outputs"))
+    text, stored = note(model, EMBEDDED), None
+    contract = None if text is None else contract_of(text)
+    if contract is not None:
+        views = loads(note(model, TENSORS_KEY) or "").values.values()
+        stored = {v.name for v in views if v is not None and v.axes}
+        wide = {s.name for s in contract.signature.outputs if np.dtype(s.dtype) == INT64}
+        outputs |= {n: _wide(model, subgraph, tensors, outputs[n]) for n in outputs.keys() & wide}
     if not outputs:
         raise NotAPolicyError("the model gives nothing", fix="give the model that training exported")
     operators = needed(subgraph, outputs.values(), inputs.values())
@@ -74,9 +85,6 @@ def read_litert(data: bytes) -> LitertModel:
             why="a policy has some hundreds",
             fix="convert the policy alone",
         )
-    views = loads(note(model, TENSORS_KEY) or "").values.values()
-    contract = note(model, EMBEDDED)
-    stored = None if contract is None else {v.name for v in views if v is not None and v.axes}
     importer = Importer(tensors, {number: name for name, number in inputs.items()}, stored)
     for operator in operators:
         code = entry_of(model, "operator_codes", operator.get("opcode_index", 0))
@@ -102,6 +110,17 @@ def read_litert(data: bytes) -> LitertModel:
         importer.widened,
         importer.narrowed,
     )
+
+
+def _wide(model: Table, subgraph: Table, tensors: Tensors, number: int) -> int:
+    """The tensor of int64 that this tool gave as int32, the number of it (``Subgraph.output``)."""
+    for operator in subgraph.get("operators", ()):
+        if number in operator.get("outputs", ()) and len(operator.get("inputs", ())) == 1:
+            kind = operator_of(entry_of(model, "operator_codes", operator.get("opcode_index", 0)))
+            operand = int(operator["inputs"][0])
+            if kind == "CAST" and operand != -1 and tensors.dtype(operand) == INT64:
+                return operand
+    return number
 
 
 def _ports(subgraph: Table, called: Table, side: str, tensors: Tensors) -> dict[str, int]:

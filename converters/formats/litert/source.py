@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from converters.files.fetch import Fetched
-from converters.formats.bundle.embed import contract_of, facts_of, redrawn
+from converters.formats.bundle.embed import facts_of, redrawn
 from converters.formats.litert.reader import LitertModel, read_litert
 from converters.formats.saved_model.signature import expose_signature
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
@@ -23,7 +23,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         run = {"numbers": dict(model.tensors), "ports": dict(model.ports), "function": model.function}
         original = OriginalRun("litert-plain", given.path, run)
     if model.contract is not None:
-        contract = contract_of(model.contract)
+        contract = model.contract
         graph = redrawn(model.graph, contract)
         return [SourceModel(graph, (given.path,), facts_of(graph, contract), contract.name, original)]
     graph, facts = expose_signature(model.graph, model.signature, _notes(model))

@@ -21,7 +21,7 @@ from converters.graph.nodes import Graph, NameScope, Node, ref
 from converters.graph.ops.litert.base import NONE, Value, emit_reshape, litert_error
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
-from converters.graph.types import BATCH, TensorType, of_array
+from converters.graph.types import BATCH, INT32, INT64, TensorType, of_array
 from signatures.spec import TensorSpec
 
 
@@ -216,8 +216,17 @@ class Subgraph:
         return value
 
     def output(self, spec: TensorSpec, reference: str, taken: Iterable[Value]) -> Value:
-        """A tensor that is given, of its own: what is fed, a constant or another output as well is copied."""
+        """A tensor that is given, of its own: what is fed, a constant or another output as well is copied.
+
+        int64 is given as int32: LiteRT.js takes and gives float32, int32 and uint8 alone.
+        """
         value = self.value(reference)
+        if self.types[reference].dtype == INT64:
+            self._node = self.graph.producer(reference)
+            narrow = TensorType(INT32, self.types[reference].shape)
+            value = self.emit("CAST", [value], narrow, in_data_type=INT64, out_data_type=INT32)
+            self.tensors[value]["name"] = self._names.fresh(spec.name)
+            return value
         if value in self._made and value not in taken:
             return value
         self._node, self.result = self.graph.producer(reference), self.types[reference]
