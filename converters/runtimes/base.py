@@ -51,6 +51,8 @@ class Runtime:
     products_per_second: float = 1e9
     #: The word that takes it: ``auto`` where it is installed, ``full``, or its own name alone.
     taken_by: Literal["auto", "full", "name"] = "auto"
+    #: It loads files for a fixed number of agents alone (``--batch``).
+    fixed: bool = False
     #: It runs in a browser (the word ``browser``).
     browser: bool = False
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.

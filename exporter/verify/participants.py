@@ -14,7 +14,7 @@ from converters.files.children.process import LoadedModel, RunFailedError
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.source import OriginalRun
 from converters.graph.nodes import Graph
-from converters.runtimes.pool import RuntimePool
+from converters.runtimes.pool import FIXED, RuntimePool
 from exporter.verify.findings import Finding
 from signatures.batches import batches_of, put_together, rows_of
 from signatures.records import dataclass
@@ -139,7 +139,11 @@ class Participant:
 def needed_runtimes(tested: PolicyUnderTest, runtimes: Sequence[str]) -> list[str]:
     """Those of ``runtimes`` that run something of this policy, the reference's first."""
     source = () if tested.source is None else (tested.source.runtime,)
-    useful = ["numpy", *source, *(r for kind in tested.artefacts for r in WRITTEN[kind].runtimes)]
+    useful = [
+        "numpy",
+        *source,
+        *(r for kind in tested.artefacts for r in WRITTEN[kind].runtimes if tested.batch or r not in FIXED),
+    ]
     return [r for r in dict.fromkeys(useful) if r == "numpy" or r in runtimes]
 
 
@@ -157,7 +161,7 @@ def participants_of(
     outputs = [s.name for s in tested.signature.outputs]
     if reference.original is not None:  # else it would be held against itself
         yield reference.participant("reference", reference.asked, path=tested.reference)
-    pairs = [(kind, runtime) for kind in tested.artefacts for runtime in WRITTEN[kind].runtimes]
+    pairs = [(kind, r) for kind in tested.artefacts for r in WRITTEN[kind].runtimes if tested.batch or r not in FIXED]
     # A .bytes in numpy is the reference; what runs nowhere else does so there.
     alone = [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]
     taking_part = [(k, r) for k, r in pairs if (r in runtimes and r != "numpy") or k in alone]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
-from converters.runtimes.pool import INDEPENDENT, RuntimePool
+from converters.runtimes.pool import FIXED, INDEPENDENT, RuntimePool
 from converters.runtimes.registry import RuntimeInfo
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
@@ -137,8 +137,11 @@ def _report(
     tried = {f.runtime for f in findings}  # one that died has no version any more, but it ran
     states: dict[str, dict[str, str | None]] = {}
     for info in known:
-        ran = info.name in runtimes and (info.name in versions or info.name in tried)
+        unfit = info.name in FIXED and tested.batch is None
+        ran = info.name in runtimes and (info.name in versions or info.name in tried) and not unfit
         reason = None if ran else "not asked for" if info.installed else f"not installed; {info.how}"
+        if unfit and info.name in runtimes:
+            reason = "takes files for a fixed number of agents alone (--batch)"
         states[info.name] = {
             "version": versions.get(info.name, info.version),
             "status": "ran" if ran else "not run",

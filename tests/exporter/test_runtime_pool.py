@@ -68,11 +68,13 @@ def test_full_leaves_out_what_the_system_cannot_have(monkeypatch: pytest.MonkeyP
 def test_words_stand_for_several_and_may_be_combined(monkeypatch: pytest.MonkeyPatch) -> None:
     every = tuple(RuntimeInfo(r.name, True, "1", "") for r in RUNTIMES)
     monkeypatch.setattr(pools, "available_runtimes", lambda: every)
-    browser = ("tfjs-webgl", "tfjs-cpu@chromium", "tfjs-wasm@chromium", "onnxruntime-web@chromium")
+    browser = ("tfjs-webgl", "tfjs-cpu@chromium", "tfjs-wasm@chromium", "onnxruntime-web@chromium", "litert-web")
     assert set(names("browser")) == {"numpy", *browser}
     assert set(names("onnxruntime,browser")) == {"numpy", "onnxruntime", *browser}
     assert set(names("auto,browser")) == {*names("auto"), *browser}
-    assert {"c", "litert", "openvino"}.isdisjoint(names("full"))  # they run none of these, or are asked by name alone
+    assert {"c", "litert", "litert-web", "openvino"}.isdisjoint(
+        names("full")
+    )  # they run none of these, or are asked by name alone
     assert {"c", "litert"} <= set(names("full", "c", "litert"))
     assert "openvino" in names("full,openvino")
 

@@ -24,6 +24,8 @@ LOADED = {
     "@tensorflow/tfjs-backend-webgpu": ("dist/tf-backend-webgpu.es2017.min.js",),
     "@tensorflow/tfjs": ("dist/tf.min.js", "dist/tf.es2017.min.js"),
     "onnxruntime-web": ("dist/ort.wasm.min.js", "dist/ort.wasm.min.mjs", "dist/ort-wasm-simd-threaded.*"),
+    "@litertjs/core": ("dist/index.js", "wasm/litert_wasm_*"),
+    "@litertjs/wasm-utils": ("dist/index.js",),
     "seedrandom": ("*.js", "lib/*.js"),
     "playwright-core": ("**/*.js", "**/*.mjs", "browsers.json"),
 }

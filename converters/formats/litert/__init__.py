@@ -27,7 +27,7 @@ FORMATS = (
         ports=_artifact.ports,
         vetted=_artifact.vetted,
         inner=_artifact.inner,
-        runtimes=("litert", "litert-plain"),
+        runtimes=("litert", "litert-plain", "litert-web"),
         signatures=True,
         dtypes=frozenset(("float32", "int32", "bool", "uint8")),
     ),

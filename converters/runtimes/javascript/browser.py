@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,6 +54,7 @@ _USUAL_PLACES = {
 _TFJS = "@tensorflow/tfjs"
 _TFJS_WASM = "@tensorflow/tfjs-backend-wasm"
 _ORT = "onnxruntime-web"
+_LITERT = "@litertjs/core"
 _DRIVER = "playwright-core"
 
 
@@ -111,4 +113,5 @@ RUNTIMES = (
     _runtime("tfjs-cpu@chromium", _TFJS),
     _runtime("tfjs-wasm@chromium", _TFJS, _TFJS_WASM),
     _runtime("onnxruntime-web@chromium", _ORT, alike=True),
+    replace(_runtime("litert-web", _LITERT), fixed=True),
 )

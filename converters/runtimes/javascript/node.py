@@ -36,7 +36,7 @@ _CPU = "@tensorflow/tfjs-backend-cpu"
 _WASM = "@tensorflow/tfjs-backend-wasm"
 _ONNXRUNTIME_WEB = "onnxruntime-web"
 #: What a whole installation has: the packages of package.json, and those of @tensorflow/tfjs that Node loads.
-_PACKAGES = (_CORE, _CONVERTER, _CPU, _WASM, "@tensorflow/tfjs", _ONNXRUNTIME_WEB, "playwright-core")
+_PACKAGES = (_CORE, _CONVERTER, _CPU, _WASM, "@tensorflow/tfjs", _ONNXRUNTIME_WEB, "@litertjs/core", "playwright-core")
 
 #: Multiplications a second, about, where they are fewer than elsewhere (a convolutional network, on one core).
 SPEEDS = {"tfjs-cpu": 1e8, "onnxruntime-web": 3e8}

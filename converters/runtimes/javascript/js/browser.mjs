@@ -30,7 +30,7 @@ import { onlyKnown } from "./installed.mjs";
 import { serve } from "./serve.mjs";
 import { readArtifacts } from "./tfjs_node.mjs";
 
-const RUNTIMES = ["tfjs-cpu@chromium", "tfjs-wasm@chromium", "tfjs-webgl", "onnxruntime-web@chromium"];
+const RUNTIMES = ["tfjs-cpu@chromium", "tfjs-wasm@chromium", "tfjs-webgl", "onnxruntime-web@chromium", "litert-web"];
 const FOLDER_PREFIX = "export-model-browser-";
 const STALE_MILLISECONDS = 24 * 3600 * 1000;
 
@@ -141,14 +141,14 @@ class Browser {
   }
 
   /** The page reads no files, so the model travels in the request. */
-  async load({ path: place }) {
+  async load({ path: place, signature }) {
     const id = ++this.#loaded;
-    const { inputs, outputs } = await this.#ask(...(await this.#loading(id, place)));
+    const { inputs, outputs } = await this.#ask(...(await this.#loading(id, place, signature)));
     return { id, inputs, outputs };
   }
 
-  async #loading(id, place) {
-    if (this.name === "onnxruntime-web@chromium") return [{ call: "load", id }, [await readFile(place)]];
+  async #loading(id, place, signature) {
+    if (!this.name.startsWith("tfjs")) return [{ call: "load", id, signature }, [await readFile(place)]];
     const { weightData, ...artifacts } = await readArtifacts(place);
     return [{ call: "load", id, artifacts }, [new Uint8Array(weightData)]];
   }

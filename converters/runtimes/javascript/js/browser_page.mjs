@@ -48,6 +48,7 @@ const RUNTIMES = {
   "tfjs-wasm@chromium": () => startTfjs("wasm"),
   "tfjs-webgl": () => startTfjs("webgl"),
   "onnxruntime-web@chromium": startOnnx,
+  "litert-web": async () => [await (await import("../litert/web.mjs")).start(MODULES), null],
 };
 
 function script(src) {
@@ -71,10 +72,10 @@ const CALLS = {
     [runtime, device] = await RUNTIMES[new URLSearchParams(location.search).get("runtime")]();
     return [{ version: runtime.version, device }];
   },
-  async load({ id, artifacts }, [bytes]) {
+  async load({ id, artifacts, signature }, [bytes]) {
     const own = bytes.slice(); // a buffer that holds nothing else: tfjs reads it from its start
     const content = artifacts === undefined ? own : { ...artifacts, weightData: own.buffer };
-    const model = await runtime.load({ path: content });
+    const model = await runtime.load({ path: content, signature });
     models.set(id, model);
     return [{ inputs: model.inputs, outputs: model.outputs }];
   },

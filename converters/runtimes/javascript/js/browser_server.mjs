@@ -15,8 +15,12 @@ import { fileURLToPath } from "node:url";
 import { pack, unpack } from "./envelope.mjs";
 
 const SCRIPTS = path.dirname(fileURLToPath(import.meta.url));
+const LITERT = path.resolve(SCRIPTS, "../../litert");
 const TYPES = { ".js": "text/javascript", ".mjs": "text/javascript", ".wasm": "application/wasm" };
+/** LiteRT.js names its other package as a bundler would find it. */
+const IMPORTS = { "@litertjs/wasm-utils": "./modules/@litertjs/wasm-utils/dist/index.js" };
 const PAGE = `<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><title>export-model</title>
+<script type="importmap">${JSON.stringify({ imports: IMPORTS })}</script>
 <script type="module" src="scripts/browser_page.mjs"></script>`;
 
 export class PageServer {
@@ -91,7 +95,7 @@ export class PageServer {
       if (token !== this.#token) throw new Error("not this page's address");
       if (kind === "exchange" && request.method === "POST") return await this.#exchange(request, response);
       if (kind === "page") return void response.writeHead(200, { "content-type": "text/html" }).end(PAGE);
-      const root = { scripts: SCRIPTS, modules: this.#modules }[kind];
+      const root = { scripts: SCRIPTS, litert: LITERT, modules: this.#modules }[kind];
       if (root === undefined) throw new Error(`nothing called ${kind}`);
       const file = path.resolve(root, ...rest);
       if (!file.startsWith(root + path.sep)) throw new Error("outside of the packages");
