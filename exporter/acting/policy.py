@@ -62,8 +62,9 @@ class LoadedPolicy:
     ) -> None:
         """``draws_itself``: the noise is inside the file (``--noise keep``, ``--for``)."""
         self.name, self.signature, self.runtime = name, signature, runtime
-        self._draws_itself = draws_itself
-        self._run = run
+        self.draws_itself = draws_itself
+        #: runs the file itself: feeds by the names of the inputs, and the outputs that are wanted
+        self.run = run
         self._generator = Generator(seed)
         self._scores = signature.log_probs
         # A mean beside its spread is drawn from here, unless the graph has drawn already.
@@ -144,13 +145,13 @@ class LoadedPolicy:
         for spec in self.signature.noise:
             shape = tuple(count if n is None else n for n in spec.shape)
             feeds[spec.name] = np.zeros(shape, np.float32) if deterministic else self._generator.normals(shape)
-        return self._decision(self._run(feeds, [s.name for s in self.signature.outputs]), deterministic)
+        return self._decision(self.run(feeds, [s.name for s in self.signature.outputs]), deterministic)
 
     def _check_plain(self) -> None:
         """Raise UsageError where an action is drawn inside the graph, and there is none without chance."""
         for head in self.signature.heads:
             sampled = head.spec.role is Role.SAMPLED and self._scores is None
-            drawn = head.spec.role is Role.CONTINUOUS and self._draws_itself
+            drawn = head.spec.role is Role.CONTINUOUS and self.draws_itself
             if head.plain is None and (sampled or drawn):
                 raise UsageError(
                     f"{head.name!r} cannot be had without chance",

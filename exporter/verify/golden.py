@@ -40,7 +40,7 @@ class Golden:
 
 def read_golden(path: Path, signature: PolicySignature) -> Golden:
     """The recording in ``path``, in batches. Raises UsageError on whatever does not fit the policy."""
-    arrays = _arrays(path)
+    arrays = read_arrays(path, "--golden")
     specs = {**_by_name(signature.outputs), **_by_name(signature.inputs)}
     given: dict[str, np.ndarray] = {}
     noiseless: set[str] = set()
@@ -71,16 +71,17 @@ def read_golden(path: Path, signature: PolicySignature) -> Golden:
     return Golden(tuple(cases), tuple(answers), frozenset(noiseless))
 
 
-def read_recording(path: Path) -> bytes:
+def read_recording(path: Path, option: str = "--golden") -> bytes:
     """The content of a recording. Raises UsageError where it cannot be read."""
     try:
         return read_bytes(path)
     except SourceError as error:
-        raise _recording_error(path, error.what, error.fix, error.why) from error
+        raise _recording_error(path, error.what, error.fix, error.why, option) from error
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    data = read_recording(path)
+def read_arrays(path: Path, option: str) -> dict[str, np.ndarray]:
+    """The arrays of an .npz archive that was given to ``option``, by name. Raises UsageError."""
+    data = read_recording(path, option)
     try:
         with open_archive(data) as archive:
             names = archive.namelist()
@@ -92,11 +93,12 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"its {len(data)} bytes unpack to {whole}")
             return {name.removesuffix(".npy"): read_array(entry_of(archive, name, whole)) for name in names}
     except (*ZIP_ERRORS, TypeError, RecursionError) as error:
-        raise _recording_error(path, "cannot be read as an .npz archive", "numpy.savez(FILE, …)", str(error)) from error
+        fix = "numpy.savez(FILE, …)"
+        raise _recording_error(path, "cannot be read as an .npz archive", fix, str(error), option) from error
 
 
-def _recording_error(path: Path, what: str, fix: str | None, why: str | None = None) -> UsageError:
-    return UsageError(f"--golden: {what}", where=str(path), why=why, fix=fix)
+def _recording_error(path: Path, what: str, fix: str | None, why: str | None = None, option: str = "--golden") -> UsageError:
+    return UsageError(f"{option}: {what}", where=str(path), why=why, fix=fix)
 
 
 def _by_name(specs: tuple[TensorSpec, ...]) -> dict[str, TensorSpec]:

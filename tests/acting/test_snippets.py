@@ -75,7 +75,7 @@ def same(found: dict[str, Any], expected: dict[str, np.ndarray], policy: LoadedP
 def in_numpy(policy: LoadedPolicy, feeds: dict[str, Any]) -> dict[str, np.ndarray]:
     arrays = {s.name: np.array(feeds[s.name], s.dtype) for s in policy.signature.inputs}
     assert set(arrays) == set(feeds)
-    return policy._run(arrays, [s.name for s in policy.signature.outputs])
+    return policy.run(arrays, [s.name for s in policy.signature.outputs])
 
 
 # ------------------------------------------------------------------ Python

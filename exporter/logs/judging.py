@@ -1,0 +1,267 @@
+"""Which steps of a recording fit what the policy answers: numbers, choices, and draws by their likelihood."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from exporter.logs.recording import Array, Arrays, Recording
+from exporter.verify.tolerances import Tolerance
+from signatures.records import dataclass
+from signatures.roles import Role
+from signatures.spec import ActionHead, PolicySignature, TensorSpec
+
+#: What a log and the policy may differ by: one is of another machine, often of a GPU, and passed through text.
+LOG_TOLERANCE = Tolerance(1e-4, 1e-4, "a log is of another machine")
+#: A share of what is allowed that stands for "beyond all": a choice without scores, a NaN.
+BEYOND = 1e12
+#: Of draws: how many standard deviations their log-likelihood may be from what is expected (two-sided p = 6e-7).
+SIGMAS = 5.0
+#: A class that the policy gives less than this log-probability is never drawn.
+NEVER = -18.4
+#: A Gaussian whose mean is so many deviations within the bounds is as good as never clipped (1e-4).
+CLIP_SIGMAS = 3.7
+#: Noise that is fed to measure the spread of an action that the graph draws.
+NOISE_STEP = 0.25
+
+
+@dataclass(frozen=True)
+class Target:
+    """A logged output and what it is held against.
+
+    ``answer`` is the policy's output; ``scores`` what a choice is the largest of (None: choices have to be equal);
+    ``branches`` are those of a choice, empty for numbers. ``head``: it is an action, which may have been drawn.
+    """
+
+    name: str
+    answer: str
+    branches: tuple[int, ...] = ()
+    scores: str | None = None
+    head: bool = False
+    #: output that has the spread of a drawn action, and whether as its logarithm
+    spread: tuple[str, bool] | None = None
+    #: the graph takes the noise that the action is drawn with
+    noisy: bool = False
+
+    @property
+    def drawable(self) -> bool:
+        """Whether the odds of a draw are known."""
+        return self.head and (self.scores is not None if self.branches else self.noisy or self.spread is not None)
+
+    @property
+    def fetched(self) -> tuple[str, ...]:
+        """The policy's outputs that it takes to judge it."""
+        parts = [self.scores if self.branches and self.scores else self.answer, self.spread and self.spread[0]]
+        return tuple(p for p in parts if p)
+
+
+def targets_of(signature: PolicySignature, recording: Recording, *, draws_itself: bool) -> list[Target]:
+    """What of ``recording`` can be held against the policy."""
+    heads = {h.name: h for h in signature.heads}
+    deviation = next((s for s in signature.outputs if s.role in (Role.STD, Role.LOG_STD)), None)
+    found = []
+    for spec in signature.outputs:
+        logged = recording.outputs.get(spec.name)
+        if logged is None:
+            continue
+        head = heads.get(spec.name)
+        if head is not None and logged.dtype.kind == "i":
+            found.append(_choice(signature, head))
+        elif logged.dtype.kind == "i":
+            found.append(Target(spec.name, spec.name, tuple(signature.branches) or (0,), _scores(signature)))
+        elif head is None or not head.is_continuous:
+            found.append(Target(spec.name, spec.name))
+        else:
+            answer = head.plain.name if draws_itself and head.plain is not None else head.name
+            spread = None if deviation is None else (deviation.name, deviation.role is Role.LOG_STD)
+            noisy = bool(signature.noise) and not any(s.name in recording.logged for s in signature.noise)
+            found.append(Target(spec.name, answer, head=True, spread=None if noisy else spread, noisy=noisy))
+    return found
+
+
+def _choice(signature: PolicySignature, head: ActionHead) -> Target:
+    answer = head.name if head.spec.role is Role.DETERMINISTIC or head.plain is None else head.plain.name
+    scores = head.name if head.spec.role in (Role.PROBS, Role.LOG_PROBS) else _scores(signature)
+    return Target(head.name, answer, head.branches or (0,), scores, head=head.spec.role is not Role.DETERMINISTIC)
+
+
+def _scores(signature: PolicySignature) -> str | None:
+    wanted = (Role.LOG_PROBS, Role.Q_VALUES, Role.PROBS)
+    found: list[TensorSpec] = [s for role in wanted for s in signature.outputs if s.role is role]
+    return found[0].name if found else None
+
+
+def shares(
+    target: Target, logged: Array, answers: Arrays, tolerance: Tolerance, explained: Mapping[str, Array]
+) -> Array:
+    """How far each element of ``logged`` is from the answer, as a share of what is allowed there: [steps, columns].
+
+    ``explained``: by output, [steps], what rounding of the inputs makes.
+    """
+    if target.branches:
+        return _choice_shares(target, logged, answers, tolerance, explained)
+    wanted = _flat(answers[target.answer]).astype(np.float64)
+    given = _flat(logged).astype(np.float64)
+    allowed = tolerance.atol + tolerance.rtol * np.abs(wanted) + explained.get(target.answer, np.zeros(1))[:, None]
+    with np.errstate(invalid="ignore"):
+        found = np.abs(given - wanted) / allowed
+    return np.minimum(np.where(np.isnan(found), BEYOND, found), BEYOND)
+
+
+def _choice_shares(
+    target: Target, logged: Array, answers: Arrays, tolerance: Tolerance, explained: Mapping[str, Array]
+) -> Array:
+    given = _flat(logged)
+    if target.scores is None:
+        wanted = _flat(answers[target.answer])
+        return np.where(given == wanted, 0.0, BEYOND)
+    scores = _flat(answers[target.scores]).astype(np.float64)
+    more = explained.get(target.scores, np.zeros(1))
+    columns = []
+    for part, chosen in _by_branch(target, scores, given):
+        best = part.max(axis=1)
+        gap = best - np.take_along_axis(part, chosen[:, None], axis=1)[:, 0]
+        allowed = 2 * (tolerance.atol + tolerance.rtol * np.abs(best) + more)
+        columns.append(np.where(np.isfinite(gap), np.minimum(gap / allowed, BEYOND), BEYOND))
+    return np.stack(columns, axis=1)
+
+
+def ties(target: Target, scores: Array) -> Array:
+    """Bool [steps, branches]: the two best scores are so close that every choice between them fits."""
+    found = []
+    flat = _flat(scores).astype(np.float64)
+    for part, _ in _by_branch(target, flat, np.zeros((len(flat), len(target.branches)), np.int64)):
+        top = np.sort(part, axis=1)[:, -2:]
+        found.append(top[:, -1] - top[:, 0] < 1e-3 * np.maximum(1.0, np.abs(top[:, -1])))
+    return np.stack(found, axis=1)
+
+
+def _by_branch(target: Target, scores: Array, choices: Array) -> list[tuple[Array, Array]]:
+    """(its scores, what was chosen) per branch; a choice beyond the branch takes the last."""
+    sizes = target.branches if sum(target.branches) == scores.shape[1] else (scores.shape[1],)
+    edges = np.cumsum((0, *sizes))
+    return [(scores[:, a:b], np.clip(choices[:, i], 0, b - a - 1)) for i, (a, b) in enumerate(pairwise(edges.tolist()))]
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Of each step, float64 [steps]: the log-likelihood of what was drawn, what is expected of it, and its variance;
+    of choices also whether the likeliest was taken, less its odds, and the variance of that.
+    """
+
+    found: Array
+    expected: Array
+    variance: Array
+    likeliest: Array
+    likeliest_variance: Array
+
+    @property
+    def sigmas(self) -> float:
+        """How many standard deviations the sum is from what is expected of it."""
+        both = (
+            _sigmas(float((self.found - self.expected).sum()), float(self.variance.sum())),
+            _sigmas(float(self.likeliest.sum()), float(self.likeliest_variance.sum())),
+        )
+        return max(both, key=abs)
+
+    @property
+    def fits(self) -> bool:
+        """Whether it can have been drawn so."""
+        return abs(self.sigmas) <= SIGMAS and bool((self.found > 2 * NEVER).all())
+
+    def without(self, rows: Array) -> Likelihood:
+        """The same, with nothing said of the steps ``rows``, bool [steps]."""
+        parts = (self.found, self.expected, self.variance, self.likeliest, self.likeliest_variance)
+        return Likelihood(*(np.where(rows, 0.0, part) for part in parts))
+
+
+def _sigmas(apart: float, variance: float) -> float:
+    if not math.isfinite(apart):
+        return -BEYOND
+    if variance < 1e-9:
+        return 0.0 if abs(apart) < 1e-3 else math.copysign(BEYOND, apart)
+    return apart / math.sqrt(variance)
+
+
+def likelihood(
+    target: Target, logged: Array, answers: Arrays, moved: Sequence[Arrays], bounds: Array | None
+) -> Likelihood:
+    """Of draws. ``moved``: the answers with the noise at ±``NOISE_STEP``, for an action that the graph draws;
+    ``bounds``: [2, columns], between which the graph clips it.
+    """
+    if target.branches:
+        assert target.scores is not None
+        return _of_classes(target, _flat(logged), _flat(answers[target.scores]).astype(np.float64))
+    mean = _flat(answers[target.answer]).astype(np.float64)
+    if target.spread is not None:
+        spread = _flat(answers[target.spread[0]]).astype(np.float64)
+        std = np.broadcast_to(np.exp(spread) if target.spread[1] else spread, mean.shape)
+    else:
+        steps = [np.abs(_flat(m[target.answer]) - mean) for m in moved]
+        std = np.max(steps, axis=0) / NOISE_STEP
+    return _of_numbers(_flat(logged).astype(np.float64), mean, std, bounds)
+
+
+def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
+    found, expected, variance, likeliest, spread = (np.zeros(len(scores)) for _ in range(5))
+    for part, chosen in _by_branch(target, scores, choices):
+        shifted = part - part.max(axis=1, keepdims=True)
+        logs = np.maximum(shifted - np.log(np.exp(shifted).sum(axis=1, keepdims=True)), 4 * NEVER)
+        odds = np.exp(logs)
+        mean = (odds * logs).sum(axis=1)
+        found += np.take_along_axis(logs, chosen[:, None], axis=1)[:, 0]
+        expected += mean
+        variance += (odds * logs**2).sum(axis=1) - mean**2
+        most = odds.max(axis=1)
+        likeliest += (odds.argmax(axis=1) == chosen) - most
+        spread += most * (1 - most)
+    return Likelihood(found, expected, np.maximum(variance, 0.0), likeliest, spread)
+
+
+def _of_numbers(drawn: Array, mean: Array, std: Array, bounds: Array | None) -> Likelihood:
+    """Of Gaussians; what lies on a bound was clipped, and counts with the odds of lying beyond it.
+
+    Where the mean itself is clipped its spread cannot be measured: it takes that of the column's other steps, and the
+    bound as its mean.
+    """
+    low, high = (np.full(mean.shape[1], -np.inf), np.full(mean.shape[1], np.inf)) if bounds is None else bounds
+    known = (std > 1e-9) & (mean > low + 1e-6) & (mean < high - 1e-6)
+    usual = [float(np.median(s[k])) if k.any() else 0.0 for s, k in zip(std.T, known.T, strict=True)]
+    std = np.where(known, std, usual)
+    free = std > 1e-9
+    std = np.where(free, std, 1.0)
+    clipped = (drawn <= low + 1e-6) | (drawn >= high - 1e-6)
+    z = (drawn - mean) / std
+    density = -0.5 * z**2 - np.log(std) - 0.5 * math.log(2 * math.pi)
+    beyond = np.where(drawn <= low + 1e-6, _log_tail((mean - low) / std), _log_tail((high - mean) / std))
+    found = np.where(free, np.where(clipped, beyond, density), 0.0)
+    # Where clipping is likely, the test leaves an element out whether it was clipped or not; weighing causes does not.
+    counted = known & ((high - mean) / std > CLIP_SIGMAS) & ((mean - low) / std > CLIP_SIGMAS)
+    expected = np.where(counted, -np.log(std) - 0.5 * math.log(2 * math.pi) - 0.5, found)
+    none = np.zeros(len(mean))
+    return Likelihood(found.sum(axis=1), expected.sum(axis=1), 0.5 * counted.sum(axis=1).astype(np.float64), none, none)
+
+
+def _log_tail(x: Array) -> Array:
+    """Log P(N > x), to three digits."""
+    with np.errstate(over="ignore"):
+        near = np.log(np.maximum(0.5 * _erfc(np.minimum(x, 5.0) / math.sqrt(2)), 1e-300))
+        far = -0.5 * x**2 - np.log(np.maximum(x, 1.0)) - 0.5 * math.log(2 * math.pi)
+    found: Array = np.where(x > 5.0, far, near)
+    return found
+
+
+def _erfc(x: Array) -> Array:
+    """The complementary error function: Abramowitz and Stegun 7.1.26, 1.5e-7."""
+    t = 1 / (1 + 0.3275911 * np.abs(x))
+    series = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
+    value = series * np.exp(-(x**2))
+    found: Array = np.where(x < 0, 2 - value, value)
+    return found
+
+
+def _flat(array: Array) -> Array:
+    return array.reshape(len(array), -1)

@@ -1,0 +1,105 @@
+"""A policy's answers for the steps of a recording: all at once, or step after step where it has a memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+
+from exporter.logs.recording import NONE, Array, Arrays
+from signatures.batches import Run
+from signatures.records import dataclass
+from signatures.roles import Role
+from signatures.spec import PolicySignature
+
+#: Elements of one input that are run at once.
+CHUNK_ELEMENTS = 1 << 21
+
+
+class MemoryUse(StrEnum):
+    """What an agent does with the memory that the policy gave it."""
+
+    KEPT = "fed back, zero when an episode begins"
+    NOT_RESET = "fed back, never reset"
+    LATE = "fed back one step late"
+    DROPPED = "always zero"
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Runs a policy over rows. ``fetch`` are the outputs that are wanted."""
+
+    run: Run
+    signature: PolicySignature
+    fetch: tuple[str, ...]
+
+    def answers(self, inputs: Arrays, before: Array, last: Array, use: MemoryUse = MemoryUse.KEPT) -> dict[str, Array]:
+        """The outputs, [rows, …]. ``inputs`` that hold the memory are fed as they are; without, it is fed back as
+        ``use`` says, along ``before`` (or ``last``).
+        """
+        pair = self.signature.recurrence
+        if pair is None or pair[0] in inputs:
+            return self._at_once(inputs, self.fetch)
+        return self._step_by_step(inputs, last if use is MemoryUse.NOT_RESET else before, use, *pair)
+
+    def _at_once(self, inputs: Arrays, fetch: Sequence[str]) -> dict[str, Array]:
+        batched = {s.name for s in self.signature.inputs if s.batched}
+        rows = next(len(a) for n, a in inputs.items() if n in batched)
+        widest = max(a[0].size if len(a) else 1 for n, a in inputs.items() if n in batched)
+        size = max(1, CHUNK_ELEMENTS // max(widest, 1))
+        parts = []
+        for first in range(0, rows, size):
+            feeds = {n: np.ascontiguousarray(a[first : first + size]) if n in batched else a for n, a in inputs.items()}
+            parts.append(self.run(feeds, fetch))
+        return {n: np.concatenate([p[n] for p in parts]) for n in fetch}
+
+    def _step_by_step(self, inputs: Arrays, before: Array, use: MemoryUse, taken: str, given: str) -> dict[str, Array]:
+        spec = self.signature.input(taken)
+        rows = len(before)
+        memory = np.zeros((rows + 1, *(n or 1 for n in spec.shape[1:])), np.float32)  # the last row is what NONE finds
+        fetch = tuple(dict.fromkeys([*self.fetch, given]))
+        found: dict[str, Array] = {}
+        for level in _levels(before):
+            source = before[level]
+            if use is MemoryUse.LATE:
+                source = np.where(source == NONE, NONE, before[source])
+            fed = np.zeros_like(memory[source]) if use is MemoryUse.DROPPED else memory[source]
+            answer = self._at_once({**{n: a[level] for n, a in inputs.items()}, taken: fed}, fetch)
+            memory[level] = answer[given]
+            for name, array in answer.items():
+                if name not in found:
+                    found[name] = np.zeros((rows, *array.shape[1:]), array.dtype)
+                found[name][level] = array
+        return found
+
+
+def _levels(before: Array) -> list[Array]:
+    """Rows that can be run at once, in order: those whose step before is in an earlier part."""
+    depth = np.zeros(len(before) + 1, np.int64)
+    depth[NONE] = -1
+    for row, source in enumerate(before.tolist()):
+        depth[row] = depth[source] + 1
+    order = np.argsort(depth[:-1], kind="stable")
+    edges = np.flatnonzero(np.diff(depth[:-1][order])) + 1
+    return np.split(order, edges)
+
+
+def complete(inputs: Arrays, outputs: Arrays, before: Array, signature: PolicySignature) -> dict[str, Array]:
+    """``inputs`` with what an agent always has: no noise, nothing masked, the discrete action of the step before.
+
+    The memory is left to the replay.
+    """
+    found = dict(inputs)
+    rows = len(before)
+    for spec in signature.inputs:
+        if spec.name in found or spec.role is Role.MEMORY_IN:
+            continue
+        shape = tuple(rows if n is None else n for n in spec.shape)
+        array = np.full(shape, 1 if spec.role is Role.MASKS else 0, spec.dtype)
+        taken = next((outputs[h.name] for h in signature.heads if not h.is_continuous and h.name in outputs), None)
+        if spec.role is Role.PREV_ACTION and taken is not None:
+            known = before != NONE
+            array[known] = taken.reshape(rows, -1)[before[known]].reshape(array[known].shape)
+        found[spec.name] = array
+    return found
