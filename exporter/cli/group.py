@@ -41,7 +41,7 @@ GROUPS = {
     "How to play": ("env", "episodes", "most", "likeliest", "margin", "strict", "partner"),
     "How to verify": (
         *("runtimes", "allow_unverified", "samples", "seed", "steps", "atol", "rtol", "tolerances", "golden", "sizes"),
-        "required",
+        *("required", "log"),
     ),
     "Many sources": ("jobs", "cluster", "again", "fail_fast"),
     "The server": ("host", "port", "opens", "no_open"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from exporter.cli.console import Console, reporting
-from exporter.cli.group import PATH, command
+from exporter.cli.group import FILE, PATH, command
 from exporter.cli.options import JUDGING, as_given, comparing, located, trusting
 from exporter.cli.terminal import say_lines
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
@@ -29,13 +29,26 @@ if TYPE_CHECKING:
     ("export-model verify exported/3DBall", "one bundle"),
     ("export-model verify exported --junit parity.xml", "all in a folder"),
     ("export-model verify out/3DBall --source 3DBall.bytes", "against the original"),
-    core=("source", "runtimes", "allow_unverified", "trust_source", "html", "junit", "as_json", "verbose", "quiet"),
+    ("export-model verify out/3DBall --log run.npz", "what an agent did with it"),
+    core=(
+        "source",
+        "runtimes",
+        "log",
+        "allow_unverified",
+        "trust_source",
+        "html",
+        "junit",
+        "as_json",
+        "verbose",
+        "quiet",
+    ),
 )
 @click.argument("bundles", nargs=-1, required=True, type=PATH, metavar="BUNDLE...")
 @click.option("--source", type=PATH, help="The file the bundle was exported from.")
 @click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
 @trusting
 @located
+@click.option("--log", type=FILE, metavar="FILE", help="A log of an agent to explain: .npz, .csv, .jsonl.")
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if no independent runtime is installed.")
 @reporting
 @comparing
@@ -45,13 +58,15 @@ def verify_command(
     step: int | None,
     trust_source: bool,
     runtimes: str,
+    log: Path | None,
     allow_unverified: bool,
     console: Console,
     options: VerifyOptions,
 ) -> None:
     """Verify bundles again: hashes first, then every format in the runtimes.
 
-    Given a folder of bundles, it verifies all of them.
+    Given a folder of bundles, it verifies all of them. With --log, it computes
+    the steps of a log again and says what explains those that differ.
     """
     from converters.files.fetch import path_text
     from converters.formats.bundle.bundle import bundles_in, other_folders_in
@@ -60,6 +75,11 @@ def verify_command(
     from exporter.remote.fetching import nearby
 
     console.prepare()
+    if log is not None:
+        from exporter.cli.logs import check_log_of
+
+        check_log_of(bundles, log, source, options, console)
+        return
     reports: list[ParityReport] = []
     refused: list[ExportModelError] = []
     with ExitStack() as fetched, console.progress() as progress:

@@ -147,6 +147,16 @@ def _by_branch(target: Target, scores: Array, choices: Array) -> list[tuple[Arra
 
 
 @dataclass(frozen=True)
+class Clip:
+    """``bounds``, [2, columns], between which a graph clips the action that it draws (infinite where it does not), and
+    the standard deviation that is ``usual`` for each column.
+    """
+
+    bounds: Array
+    usual: Array
+
+
+@dataclass(frozen=True)
 class Likelihood:
     """Of each step, float64 [steps]: the log-likelihood of what was drawn, what is expected of it, and its variance;
     of choices also whether the likeliest was taken, less its odds, and the variance of that.
@@ -187,10 +197,10 @@ def _sigmas(apart: float, variance: float) -> float:
 
 
 def likelihood(
-    target: Target, logged: Array, answers: Arrays, moved: Sequence[Arrays], bounds: Array | None
+    target: Target, logged: Array, answers: Arrays, moved: Sequence[Arrays], clip: Clip | None
 ) -> Likelihood:
     """Of draws. ``moved``: the answers with the noise at ±``NOISE_STEP``, for an action that the graph draws;
-    ``bounds``: [2, columns], between which the graph clips it.
+    ``clip``: how the graph clips it.
     """
     if target.branches:
         assert target.scores is not None
@@ -202,7 +212,7 @@ def likelihood(
     else:
         steps = [np.abs(_flat(m[target.answer]) - mean) for m in moved]
         std = np.max(steps, axis=0) / NOISE_STEP
-    return _of_numbers(_flat(logged).astype(np.float64), mean, std, bounds)
+    return _of_numbers(_flat(logged).astype(np.float64), mean, std, clip)
 
 
 def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
@@ -221,17 +231,28 @@ def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
     return Likelihood(found, expected, np.maximum(variance, 0.0), likeliest, spread)
 
 
-def _of_numbers(drawn: Array, mean: Array, std: Array, bounds: Array | None) -> Likelihood:
+def measured_spread(target: Target, answers: Arrays, moved: Sequence[Arrays], bounds: Array) -> Array:
+    """The usual standard deviation of each column: the median over the steps at which the mean is not clipped, or 0."""
+    mean = _flat(answers[target.answer]).astype(np.float64)
+    std = np.max([np.abs(_flat(m[target.answer]) - mean) for m in moved], axis=0) / NOISE_STEP
+    known = (std > 1e-9) & (mean > bounds[0] + 1e-6) & (mean < bounds[1] - 1e-6)
+    return np.asarray([float(np.median(s[k])) if k.any() else 0.0 for s, k in zip(std.T, known.T, strict=True)])
+
+
+def _of_numbers(drawn: Array, mean: Array, std: Array, clip: Clip | None) -> Likelihood:
     """Of Gaussians; what lies on a bound was clipped, and counts with the odds of lying beyond it.
 
-    Where the mean itself is clipped its spread cannot be measured: it takes that of the column's other steps, and the
-    bound as its mean.
+    Where the mean itself is clipped its spread cannot be measured: it takes what is usual, and the bound as its mean.
+    A column that is always clipped says nothing.
     """
-    low, high = (np.full(mean.shape[1], -np.inf), np.full(mean.shape[1], np.inf)) if bounds is None else bounds
+    columns = mean.shape[1]
+    low, high = (np.full(columns, -np.inf), np.full(columns, np.inf)) if clip is None else clip.bounds
     known = (std > 1e-9) & (mean > low + 1e-6) & (mean < high - 1e-6)
-    usual = [float(np.median(s[k])) if k.any() else 0.0 for s, k in zip(std.T, known.T, strict=True)]
-    std = np.where(known, std, usual)
-    free = std > 1e-9
+    if clip is None:
+        free = known
+    else:
+        std = np.where(known, std, clip.usual)
+        free = np.broadcast_to(clip.usual > 1e-9, mean.shape)
     std = np.where(free, std, 1.0)
     clipped = (drawn <= low + 1e-6) | (drawn >= high - 1e-6)
     z = (drawn - mean) / std
@@ -239,7 +260,7 @@ def _of_numbers(drawn: Array, mean: Array, std: Array, bounds: Array | None) -> 
     beyond = np.where(drawn <= low + 1e-6, _log_tail((mean - low) / std), _log_tail((high - mean) / std))
     found = np.where(free, np.where(clipped, beyond, density), 0.0)
     # Where clipping is likely, the test leaves an element out whether it was clipped or not; weighing causes does not.
-    counted = known & ((high - mean) / std > CLIP_SIGMAS) & ((mean - low) / std > CLIP_SIGMAS)
+    counted = known & free & ((high - mean) / std > CLIP_SIGMAS) & ((mean - low) / std > CLIP_SIGMAS)
     expected = np.where(counted, -np.log(std) - 0.5 * math.log(2 * math.pi) - 0.5, found)
     none = np.zeros(len(mean))
     return Likelihood(found.sum(axis=1), expected.sum(axis=1), 0.5 * counted.sum(axis=1).astype(np.float64), none, none)

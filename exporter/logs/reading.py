@@ -138,6 +138,8 @@ def _known_names(signature: PolicySignature) -> dict[str, TensorSpec]:
 
 def _fitted(path: Path, name: str, spec: TensorSpec, array: Array, signature: PolicySignature) -> Array:
     """``array`` as the replay takes it; choices as int64 [steps, branches]."""
+    if not array.size:
+        raise refused(path, f"holds no steps of {name!r}", fix="log at least one step")
     if array.dtype.kind not in "fiub":
         raise refused(path, f"{name!r} must hold numbers", why=f"it is {array.dtype}")
     if array.dtype.kind == "f":
@@ -179,7 +181,9 @@ def _choices(spec: TensorSpec, array: Array, signature: PolicySignature) -> Arra
 
 
 def _numbers_of_steps(path: Path, name: str, array: Array) -> Array:
-    flat = array.reshape(len(array), -1) if array.ndim else array.reshape(1, 1)
+    if not array.size:
+        raise refused(path, f"holds no steps of {name!r}", fix="log at least one step")
+    flat = array.reshape(len(array), -1)
     if flat.shape[1] != 1 or flat.dtype.kind not in "fiub" or not np.isfinite(flat).all():
         raise refused(path, f"{name!r} must have one whole number for each step")
     if (flat != np.round(flat)).any():

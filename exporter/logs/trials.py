@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from exporter.logs.causes import Cause
-from exporter.logs.judging import BEYOND, NOISE_STEP, Likelihood, Target, likelihood, shares
+from exporter.logs.judging import BEYOND, NOISE_STEP, Clip, Likelihood, Target, likelihood, measured_spread, shares
 from exporter.logs.recording import NONE, Array, Arrays, Recording
 from exporter.logs.replay import CHUNK_ELEMENTS, MemoryUse, Replay
 from exporter.verify.tolerances import Tolerance
@@ -19,6 +19,8 @@ MOVED = 2.0**-21
 MOVES, FACTOR = 2, 4
 #: Noise beyond what any graph leaves unclipped.
 FAR_NOISE = 1e6
+#: Steps that clipping and the usual spread are measured at.
+MEASURED_STEPS = 500
 
 Chain = Sequence[Cause]
 
@@ -69,7 +71,7 @@ class Trials:
         self.replay, self.recording, self.targets, self.tolerance = replay, recording, tuple(targets), tolerance
         self.drawn = drawn and any(t.drawable for t in targets)
         self._noise = [s.name for s in replay.signature.noise]
-        self._bounds = self._clip_bounds() if self.drawn else {}
+        self._clips = self._measured_clips() if self.drawn else {}
 
     @property
     def _noises(self) -> tuple[float, ...]:
@@ -79,7 +81,7 @@ class Trials:
     def on(self, recording: Recording) -> Trials:
         """The same for other rows."""
         other = Trials(self.replay, recording, self.targets, self.tolerance, drawn=False)
-        other.drawn, other._bounds = self.drawn, self._bounds
+        other.drawn, other._clips = self.drawn, self._clips
         return other
 
     def verdict(self, chain: Chain = ()) -> Verdict:
@@ -158,7 +160,7 @@ class Trials:
             blank = _blank_rows(own, target) if chain else np.zeros(len(logged), bool)
             if self.drawn and target.drawable:
                 other = [self._answered(chain, target, answers) for answers in noisy]
-                odds = likelihood(target, logged, own, other, self._bounds.get(target.name))
+                odds = likelihood(target, logged, own, other, self._clips.get(target.name))
                 draws[target.name] = odds.without(blank)
                 by_target[target.name] = np.zeros((len(logged), 1))
                 continue
@@ -177,22 +179,31 @@ class Trials:
                 found = {**found, **changed}
         return found
 
-    def _clip_bounds(self) -> dict[str, Array]:
-        """By target: [2, columns], between which the graph clips a drawn action; infinite where it does not."""
+    def _measured_clips(self) -> dict[str, Clip]:
+        """By target, how the graph clips what it draws."""
         if not self._noise:
             return {}
-        few = self.recording.rows(np.arange(min(self.recording.steps, 4)))
-        found: dict[str, Array] = {}
+        rows = self.recording.rows(np.arange(min(self.recording.steps, MEASURED_STEPS)))
+
+        def answers(noise: float) -> Arrays:
+            fed = {n: np.full_like(rows.inputs[n], noise) for n in self._noise}
+            return self.replay.answers({**rows.inputs, **fed}, rows.before, rows.last)
+
+        plain, *moved = [answers(noise) for noise in (0.0, NOISE_STEP, -NOISE_STEP)]
+        far = [answers(-FAR_NOISE), answers(FAR_NOISE)]
+        found = {}
         for target in self.targets:
-            ends = []
-            for sign in (-1, 1):
-                far = {n: np.full_like(few.inputs[n], sign * FAR_NOISE) for n in self._noise}
-                answer = self.replay.answers({**few.inputs, **far}, few.before, few.last)[target.answer]
-                value = _rows(answer).astype(np.float64)
-                spread = value.max(axis=0) - value.min(axis=0)
-                ends.append(np.where((spread < 1e-6) & (np.abs(value[0]) < FAR_NOISE / 100), value[0], sign * np.inf))
-            found[target.name] = np.stack(ends)
+            if target.noisy:
+                bounds = np.stack([_end(_rows(a[target.answer]), sign) for a, sign in zip(far, (-1, 1), strict=True)])
+                found[target.name] = Clip(bounds, measured_spread(target, plain, moved, bounds))
         return found
+
+
+def _end(answers: Array, sign: int) -> Array:
+    """Where an action ends that was moved as far as noise can: the same value at all steps, else infinite."""
+    spread = answers.max(axis=0) - answers.min(axis=0)
+    clipped = (spread < 1e-6) & (np.abs(answers[0]) < FAR_NOISE / 100)
+    return np.where(clipped, answers[0].astype(np.float64), sign * np.inf)
 
 
 def _use(chain: Chain) -> MemoryUse:

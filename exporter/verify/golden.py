@@ -97,7 +97,9 @@ def read_arrays(path: Path, option: str) -> dict[str, np.ndarray]:
         raise _recording_error(path, "cannot be read as an .npz archive", fix, str(error), option) from error
 
 
-def _recording_error(path: Path, what: str, fix: str | None, why: str | None = None, option: str = "--golden") -> UsageError:
+def _recording_error(
+    path: Path, what: str, fix: str | None, why: str | None = None, option: str = "--golden"
+) -> UsageError:
     return UsageError(f"{option}: {what}", where=str(path), why=why, fix=fix)
 
 

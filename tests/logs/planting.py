@@ -48,6 +48,7 @@ def recorded(
     whole = observations(policy, episodes * length, seed)
     actions = []
     kept: list[Array | None] = [None, None]
+    previous: Array | None = None
     policy.seed(seed)
     for step in range(episodes * length):
         if step % length == 0 and fault.memory != "not reset":
@@ -58,9 +59,9 @@ def recorded(
         masks = next((given.pop(s.name) for s in policy.signature.inputs if s.role is Role.MASKS), None)
         recurrent = {"memory": memory} if policy.takes(Role.MEMORY_IN) else {}
         if policy.takes(Role.PREV_ACTION):
-            recurrent["previous"] = np.zeros((1, len(policy.signature.branches))) if step % length == 0 else previous
+            recurrent["previous"] = None if step % length == 0 else previous
         decision = policy.decide(given, masks=masks, deterministic=not drawn, **recurrent)
-        previous = decision.discrete if fault.previous else np.zeros_like(decision.action)
+        previous = decision.discrete if fault.previous else None
         kept = [*kept, decision.memory][-2:]
         actions.append(decision.action[0])
     head = policy.signature.heads[0].name

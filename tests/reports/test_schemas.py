@@ -16,7 +16,7 @@ from tests.reports.made import FAILING, PASSING, UNVERIFIED
 from tests.reports.validation import check_parity, check_policy, schema
 
 
-@pytest.mark.parametrize("name", ["parity", "play", "policy"])
+@pytest.mark.parametrize("name", ["log", "parity", "play", "policy"])
 def test_a_schema_is_one(name: str) -> None:
     found = schema(name)
     Draft202012Validator.check_schema(found)

@@ -12,7 +12,7 @@ from tests.commands import ROOT
 
 
 def schema(name: str) -> Any:
-    """The schema of parity.json, policy.json or what play prints."""
+    """The schema of parity.json, policy.json, or what play or verify --log prints."""
     return json.loads((ROOT / "exporter" / "reports" / f"{name}.schema.json").read_text(encoding="utf-8"))
 
 
