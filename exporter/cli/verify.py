@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     ("export-model verify exported/3DBall", "one bundle"),
     ("export-model verify exported --junit parity.xml", "all in a folder"),
     ("export-model verify out/3DBall --source 3DBall.bytes", "against the original"),
-    ("export-model verify out/3DBall --log run.npz", "what an agent did with it"),
+    ("export-model verify out/3DBall --log run.npz", "an agent's log"),
     core=(
         "source",
         "runtimes",
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 @click.option("--step", type=int, metavar="N", help="The source's checkpoint (default: the one of the export).")
 @trusting
 @located
-@click.option("--log", type=FILE, metavar="FILE", help="A log of an agent to explain: .npz, .csv, .jsonl.")
+@click.option("--log", type=FILE, metavar="FILE", help="Explain an agent's log instead: .npz, .csv, .jsonl.")
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if no independent runtime is installed.")
 @reporting
 @comparing
@@ -65,8 +65,7 @@ def verify_command(
 ) -> None:
     """Verify bundles again: hashes first, then every format in the runtimes.
 
-    Given a folder of bundles, it verifies all of them. With --log, it computes
-    the steps of a log again and says what explains those that differ.
+    Given a folder of bundles, it verifies all of them.
     """
     from converters.files.fetch import path_text
     from converters.formats.bundle.bundle import bundles_in, other_folders_in
