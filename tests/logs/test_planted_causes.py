@@ -155,8 +155,6 @@ def test_a_planted_cause_is_named(name: str, number: int, tmp_path: Path) -> Non
 def test_a_log_without_a_fault_raises_no_alarm(name: str, seed: int, drawn: bool, tmp_path: Path) -> None:
     """Recorded in onnxruntime, checked in our own kernels."""
     policy = policy_of(name)
-    if drawn and policy.signature.heads[0].spec.role is Role.DETERMINISTIC:
-        pytest.skip("its action is not drawn")
     log = recorded(policy, Fault(), episodes=3, length=20, seed=seed, drawn=drawn)
     report = explained(policy_of(name, "numpy"), log, tmp_path)
     assert report.fits, (report.causes, report.sigmas)
