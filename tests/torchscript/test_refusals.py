@@ -1,4 +1,4 @@
-"""TorchScript modules that are outside of what is known, hostile or damaged: refused by name, and nothing is run."""
+"""TorchScript modules of other versions, and those outside of what is known, hostile or damaged: nothing is run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from converters.formats.source import ReadOptions
+from converters.graph.run import run_graph
 from exporter.export.sources import read_source
+from fixtures.goldens import read_npz
 from fixtures.torchscript import FOLDER
 from signatures.errors import ExportModelError, UnsupportedOpError, UsageError
 from tests.commands import export_model
@@ -120,3 +122,22 @@ def test_a_module_that_is_cut_off_is_refused(percent: int, tmp_path: Path) -> No
     (tmp_path / "cut.pt").write_bytes(data[: len(data) * percent // 100])
     with pytest.raises(ExportModelError):
         read_source(tmp_path / "cut.pt")
+
+
+def test_code_of_older_pytorch_gives_the_same(tmp_path: Path) -> None:
+    """As PyTorch 1.5 to 1.8 printed it: a product with the transposed weight, every operand that has a default."""
+    older = (
+        "    if torch.eq(torch.dim(input), 2):\n      _0 = torch.__isnot__(bias, None)\n    else:\n      _0 = False\n"
+        "    if _0:\n      bias0 = unchecked_cast(Tensor, bias)\n"
+        "      ret = torch.addmm(bias0, input, torch.t(weight), beta=1, alpha=1)\n"
+        "    else:\n      output = torch.matmul(input, torch.t(weight))\n"
+        "      ret = torch.add_(output, bias, alpha=1)\n"
+        "    return torch.to(torch.slice(ret, 0, 0, 9223372036854775807, 1), 6, False, False, None)\n"
+    )
+    path = changed("mlp_script", tmp_path, "    return torch.linear(input, weight, bias)\n", older)
+    (policy,) = read_source(path).policies()
+    golden = read_npz(FOLDER / "mlp_script.npz")
+    given = golden["in/input"][:, 0]
+    (name,) = [s.name for s in policy.signature.inputs]
+    made = run_graph(policy.graph, {name: given}, ["action"])["action"]
+    assert made == pytest.approx(golden["out"][:, 0], abs=2e-6, rel=2e-5)
